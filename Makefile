@@ -1,0 +1,35 @@
+# Each target sets up its own .venv from the pinned versions in requirements/dev.txt.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test lint format lock clean
+
+.venv/.ready: requirements/dev.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit("tofuse needs Python 3.11 or newer, and $(PYTHON) is %s; try: make PYTHON=python3.12 ..." % sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/dev.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: .venv/.ready          ## simulate a recording, reconstruct it, leave a model and a report in demo/
+	$(BIN)/tofuse demo --out demo --overwrite
+
+test: .venv/.ready          ## run the tests
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+lint: .venv/.ready          ## formatting, style, strict types, and who may import whom
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: .venv/.ready        ## put the code into its standard form
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lock: .venv/.ready          ## pin the newest versions that pyproject.toml allows
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group dev pyproject.toml requirements/build.in -o requirements/dev.txt --upgrade
+
+clean:
+	rm -rf .venv build dist

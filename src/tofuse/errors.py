@@ -1,0 +1,37 @@
+"""What a person is told when something from outside can't be used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class TofuseError(Exception):
+    """Base of every error that the package raises on purpose.
+
+    Says where the problem is, what it is, and what to do about it, on one line.
+    """
+
+    def __init__(
+        self, problem: str, *, where: str | Path | None = None, remedy: str | None = None
+    ) -> None:
+        self.problem = problem
+        self.where = None if where is None else str(where)
+        self.remedy = remedy
+        parts = [f"{self.where}: " if self.where else "", problem, f"; {remedy}" if remedy else ""]
+        super().__init__(" ".join("".join(parts).split()))
+
+
+class InputError(TofuseError):
+    """A recording, file, option or array from outside can't be used."""
+
+
+class UnreadableFrameError(InputError):
+    """One frame of a recording can't be read; the others may be fine."""
+
+
+class OutputError(TofuseError):
+    """A result can't be written where it was asked for."""
+
+
+class RegistrationError(TofuseError):
+    """Two views can't be registered (no points, no overlap)."""

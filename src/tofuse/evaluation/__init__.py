@@ -1,0 +1,1 @@
+"""How good a trajectory is: against a reference, and by how well the images agree."""

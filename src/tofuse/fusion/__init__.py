@@ -1,0 +1,1 @@
+"""From poses and views to one model."""

@@ -1,0 +1,1 @@
+"""Rigid motions and cameras: the frames that everything else is expressed in."""

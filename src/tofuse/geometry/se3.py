@@ -1,0 +1,178 @@
+"""Rigid motions: SE(3) as (..., 4, 4) float64 matrices, vectorised over leading axes.
+
+Twists are (..., 6) vectors (tx, ty, tz, rx, ry, rz) in metres and radians. Perturbations act on
+the right, ``T * exp(xi)``, that is in the source frame of ``T_target_source``. The exponential is
+the full one (Barfoot, State Estimation for Robotics, eqs 7.86 to 7.95), not the pseudo-exponential
+that leaves the translation alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError
+
+Array = NDArray[np.float64]
+
+_SMALL = 1e-4  # rad; below it the series are exact to float64
+
+
+def hat(w: ArrayLike) -> Array:
+    """Return the (..., 3, 3) matrix with ``hat(w) @ v == cross(w, v)``."""
+    w = np.asarray(w, float)
+    out = np.zeros((*w.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -w[..., 2], w[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = w[..., 2], -w[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -w[..., 1], w[..., 0]
+    return out
+
+
+def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
+    """Return sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3, without cancellation near zero."""
+    small = angle < _SMALL
+    a = np.where(small, 1.0, angle)
+    a2 = angle * angle
+    half = np.sin(a / 2)
+    s1 = np.where(small, 1 - a2 / 6, np.sin(a) / a)
+    s2 = np.where(small, 0.5 - a2 / 24, 2 * half * half / (a * a))
+    s3 = np.where(small, 1 / 6 - a2 / 120, (a - np.sin(a)) / a**3)
+    # (a - sin a) / a^3 cancels below about 0.02 rad; the series carries on to there.
+    middle = (~small) & (angle < 0.02)
+    s3 = np.where(middle, 1 / 6 - a2 / 120 + a2 * a2 / 5040, s3)
+    return s1, s2, s3
+
+
+def so3_exp(w: ArrayLike) -> Array:
+    """Rotation matrix (..., 3, 3) of a rotation vector (..., 3) in radians (Rodrigues)."""
+    w = np.asarray(w, float)
+    s1, s2, _ = _coefficients(np.linalg.norm(w, axis=-1))
+    W = hat(w)
+    return np.eye(3) + s1[..., None, None] * W + s2[..., None, None] * (W @ W)
+
+
+def so3_log(R: ArrayLike) -> Array:
+    """Rotation vector (..., 3), of length 0 to pi, of a rotation matrix (..., 3, 3)."""
+    from tofuse.geometry.quaternion import from_matrix
+
+    q = from_matrix(R)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    vector, s = q[..., :3], q[..., 3]
+    norm = np.linalg.norm(vector, axis=-1)
+    angle = 2 * np.arctan2(norm, s)
+    scale = np.where(norm < 1e-10, 2.0, angle / np.where(norm < 1e-10, 1.0, norm))
+    return scale[..., None] * vector
+
+
+def left_jacobian(w: ArrayLike) -> Array:
+    """Left Jacobian of SO(3), (..., 3, 3): translation part of the SE(3) exponential."""
+    w = np.asarray(w, float)
+    _, s2, s3 = _coefficients(np.linalg.norm(w, axis=-1))
+    W = hat(w)
+    return np.eye(3) + s2[..., None, None] * W + s3[..., None, None] * (W @ W)
+
+
+def left_jacobian_inverse(w: ArrayLike) -> Array:
+    """Inverse of `left_jacobian`, (..., 3, 3)."""
+    w = np.asarray(w, float)
+    angle = np.linalg.norm(w, axis=-1)
+    small = angle < 0.02
+    a = np.where(small, 1.0, angle)
+    a2 = angle * angle
+    c = np.where(
+        small,
+        1 / 12 + a2 / 720 + a2 * a2 / 30240,
+        1 / (a * a) - (1 + np.cos(a)) / (2 * a * np.where(small, 1.0, np.sin(a))),
+    )
+    # At pi the quotient is 0 / 0 with limit 0.
+    c = np.where(np.abs(a - np.pi) < 1e-7, 1 / np.pi**2, c)
+    W = hat(w)
+    return np.eye(3) - 0.5 * W + c[..., None, None] * (W @ W)
+
+
+def exp(xi: ArrayLike) -> Array:
+    """Rigid motion (..., 4, 4) of a twist (..., 6): the full SE(3) exponential."""
+    xi = np.asarray(xi, float)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = so3_exp(xi[..., 3:])
+    T[..., :3, 3] = (left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    T[..., 3, 3] = 1
+    return T
+
+
+def log(T: ArrayLike) -> Array:
+    """Twist (..., 6) of a rigid motion (..., 4, 4); the inverse of `exp` for angles below pi."""
+    T = np.asarray(T, float)
+    w = so3_log(T[..., :3, :3])
+    t = (left_jacobian_inverse(w) @ T[..., :3, 3, None])[..., 0]
+    return np.concatenate([t, w], axis=-1)
+
+
+def inverse(T: ArrayLike) -> Array:
+    """Inverse of rigid motions (..., 4, 4): ``T_b_a`` from ``T_a_b``."""
+    T = np.asarray(T, float)
+    out = np.zeros_like(T)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1
+    return out
+
+
+def adjoint(T: ArrayLike) -> Array:
+    """Adjoint (..., 6, 6): ``T exp(xi) T^-1 == exp(adjoint(T) @ xi)`` in the (t, r) order."""
+    T = np.asarray(T, float)
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = R
+    out[..., 3:, 3:] = R
+    out[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    return out
+
+
+def transform(T: ArrayLike, points: ArrayLike) -> Array:
+    """Map points (..., N, 3) by ``T_a_b`` (..., 4, 4): points of frame b, in frame a."""
+    T = np.asarray(T, float)
+    return np.asarray(points) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: ArrayLike) -> Array:
+    """Motion from T_a (share 0) to T_b (share 1) at constant body velocity (a screw)."""
+    T_a = np.asarray(T_a, float)
+    share = np.asarray(share, float)
+    return T_a @ exp(share[..., None] * log(inverse(T_a) @ np.asarray(T_b, float)))
+
+
+def orthonormalise(T: ArrayLike) -> Array:
+    """Replace the rotation by the nearest one (SVD), against the drift of long products."""
+    T = np.array(T, float)
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    T[..., :3, :3] = U @ Vt
+    return T
+
+
+def angle(R: ArrayLike) -> Array:
+    """Screw-axis angle, 0 to pi rad, of rotations (..., 3, 3) or motions (..., 4, 4).
+
+    Computed from both sine and cosine, so it is accurate at 0 and at pi (Soderkvist and Wedin).
+    """
+    R = np.asarray(R, float)
+    axis = np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    return np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1)
+
+
+def check_pose(T: ArrayLike, *, where: str = "pose") -> Array:
+    """Return T as a float64 (4, 4) array, or raise InputError if it is no rigid motion."""
+    T = np.asarray(T, float)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError("is not a finite 4x4 matrix", where=where)
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise InputError("has no rotation in its upper left 3x3 block", where=where)
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise InputError("has a last row other than 0 0 0 1", where=where)
+    return T

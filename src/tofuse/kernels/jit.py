@@ -1,0 +1,62 @@
+"""Compilation of kernels, with a cache that can neither go stale nor stop a run.
+
+Numba's on-disk cache does not notice a changed callee in another file, and fails where it can't
+write. The cache folder is therefore keyed by the hash of all kernel sources, and a private
+temporary folder stands in where the home is read-only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import numba
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@cache
+def source_hash() -> str:
+    """Hash of every source file of this package and of the versions that compile it."""
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def cache_folder() -> str:
+    """Return a folder that can be written, the same in every run where the machine allows it."""
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        base = Path(os.environ["NUMBA_CACHE_DIR"])
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", tempfile.gettempdir())) / "tofuse"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tofuse"
+    folder = base / f"kernels-{source_hash()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return str(folder)
+    except (OSError, RuntimeError):
+        # Private to this process: compiled code must never be loaded from a folder others own.
+        return tempfile.mkdtemp(prefix="tofuse-kernels-")
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function over arrays: nogil, cached, IEEE arithmetic (the same every time)."""
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = cache_folder()
+    try:
+        compiled: Callable[P, R] = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+    finally:
+        config.CACHE_DIR = before
+    return compiled

@@ -1,0 +1,63 @@
+"""What odometry gives for each frame, whatever the method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.recordings.frames import Frame
+from tofuse.registration.base import Registration
+
+Float64 = NDArray[np.float64]
+
+Status = Literal["tracked", "predicted", "lost", "skipped"]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What became of one frame.
+
+    Attributes
+    ----------
+    status
+        "tracked"; "predicted" where the data held none of it; "lost" without a pose.
+    reason
+        Why it is not tracked; empty otherwise.
+    T_world_camera
+        (4, 4), or None where lost.
+    reference
+        Index (`Frame.index`) of the frame it was registered to; None for the first.
+    registration
+        T_reference_frame and how well it is known; None for the first frame.
+    """
+
+    status: Status
+    reason: str
+    T_world_camera: Float64 | None
+    reference: int | None = None
+    registration: Registration | None = None
+
+
+class Tracker(Protocol):
+    """Odometry at work: holds what it needs of the frames so far."""
+
+    def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
+        """Find the pose of the next (filtered) frame.
+
+        `T_odometry` is the frame's T_world_camera from an odometry file, if there is one.
+        """
+        ...
+
+
+class Odometry(Protocol):
+    """A method that turns frames into poses, one at a time."""
+
+    part_kind: ClassVar[str] = "odometry"
+    takes: ClassVar[frozenset[str]]
+
+    def start(self, seed: int) -> Tracker:
+        """Begin a new recording."""
+        ...

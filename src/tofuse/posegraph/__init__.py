@@ -1,0 +1,1 @@
+"""Poses and what was measured between them: loops, optimisers, g2o files."""

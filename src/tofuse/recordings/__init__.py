@@ -1,0 +1,1 @@
+"""Views and recordings, and one reader for each format."""

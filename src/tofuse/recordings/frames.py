@@ -1,0 +1,245 @@
+"""The two kinds of view: a grid seen by a camera, and a bare cloud.
+
+Both offer the `View` protocol, which is all that cloud registration needs. All arrays are
+read-only by convention: a method that changes something returns a new frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import Camera, points_from_z, range_from_z, z_from_range
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+DepthKind = Literal["z", "range"]
+
+SATURATED_AMPLITUDE = 65535.0
+
+
+class View(Protocol):
+    """What both kinds of view have: N points with what is known of each, in the view's frame."""
+
+    @property
+    def index(self) -> int:
+        """Index of the frame in its recording, before any selection."""
+        ...
+
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        ...
+
+    @property
+    def points(self) -> Float32:
+        """(N, 3) valid points in m, camera (or cloud) frame."""
+        ...
+
+    @property
+    def normals(self) -> Float32 | None:
+        """(N, 3) unit normals towards the sensor, NaN where unknown; None if not computed."""
+        ...
+
+    @property
+    def sigma(self) -> Float32 | None:
+        """(N,) standard deviation of the range in m; None if not known."""
+        ...
+
+    @property
+    def amplitude(self) -> Float32 | None:
+        """(N,) amplitude in the recording's counts; None if not recorded."""
+        ...
+
+    @property
+    def color(self) -> UInt8 | None:
+        """(N, 3) RGB; None if not recorded."""
+        ...
+
+    @property
+    def origin(self) -> Float64:
+        """(3,) position of the sensor in the view's own frame."""
+        ...
+
+    def __len__(self) -> int:
+        """Return the number of valid points."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RangeFrame:
+    """One image of a depth camera.
+
+    Attributes
+    ----------
+    index
+        Index in the recording, before any selection.
+    timestamp
+        Seconds.
+    camera
+        Rays of the pixels.
+    depth
+        (H, W) float32 in m, 0 where invalid. Radial range or z depth: `depth_kind` says which.
+    depth_kind
+        "z" or "range".
+    amplitude_image
+        (H, W) float32 in counts, 0 where there is none, `SATURATED_AMPLITUDE` where saturated.
+    confidence_image
+        (H, W) uint8; higher is better.
+    color_image
+        (H, W, 3) uint8 RGB, registered to depth.
+    sigma_image
+        (H, W) float32, standard deviation of the range in m.
+    normal_image
+        (H, W, 3) float32 unit normals towards the camera, NaN where unknown.
+    """
+
+    index: int
+    timestamp: float
+    camera: Camera
+    depth: Float32
+    depth_kind: DepthKind = "z"
+    amplitude_image: Float32 | None = None
+    confidence_image: UInt8 | None = None
+    color_image: UInt8 | None = None
+    sigma_image: Float32 | None = None
+    normal_image: Float32 | None = None
+
+    def __post_init__(self) -> None:
+        shape = (self.camera.height, self.camera.width)
+        for name in ("depth", "amplitude_image", "confidence_image", "color_image", "sigma_image"):
+            image = getattr(self, name)
+            if image is not None and image.shape[:2] != shape:
+                raise InputError(
+                    f"{name} is {image.shape[1]} x {image.shape[0]}, the camera "
+                    f"{shape[1]} x {shape[0]}",
+                    where=f"frame {self.index}",
+                    remedy="use the camera of these images",
+                )
+        depth = np.asarray(self.depth, np.float32)
+        good = np.isfinite(depth) & (depth > 0)
+        if not good.all():
+            depth = np.where(good, depth, np.float32(0))
+        object.__setattr__(self, "depth", depth)
+
+    @cached_property
+    def valid(self) -> Bool:
+        """(H, W) mask of pixels with a measurement and a known ray."""
+        return (self.depth > 0) & np.isfinite(self.camera.rays()).all(-1)
+
+    @cached_property
+    def z(self) -> Float32:
+        """(H, W) z depth in m, 0 where invalid."""
+        return self.depth if self.depth_kind == "z" else z_from_range(self.camera, self.depth)
+
+    @cached_property
+    def radial_range(self) -> Float32:
+        """(H, W) radial range in m, 0 where invalid."""
+        return self.depth if self.depth_kind == "range" else range_from_z(self.camera, self.depth)
+
+    @cached_property
+    def point_image(self) -> Float32:
+        """(H, W, 3) points in m in the camera frame, the origin where invalid."""
+        return points_from_z(self.camera, self.z)
+
+    @cached_property
+    def points(self) -> Float32:
+        """See `View.points`; in row-major order of the valid pixels."""
+        return self.point_image[self.valid]
+
+    @property
+    def normals(self) -> Float32 | None:
+        """See `View.normals`."""
+        return None if self.normal_image is None else self.normal_image[self.valid]
+
+    @property
+    def sigma(self) -> Float32 | None:
+        """See `View.sigma`."""
+        return None if self.sigma_image is None else self.sigma_image[self.valid]
+
+    @property
+    def amplitude(self) -> Float32 | None:
+        """See `View.amplitude`."""
+        return None if self.amplitude_image is None else self.amplitude_image[self.valid]
+
+    @property
+    def color(self) -> UInt8 | None:
+        """See `View.color`."""
+        return None if self.color_image is None else self.color_image[self.valid]
+
+    @property
+    def origin(self) -> Float64:
+        """See `View.origin`: the optical centre."""
+        return np.zeros(3)
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(self.valid))
+
+    def keep(self, mask: Bool) -> Self:
+        """Return the frame with every pixel outside the (H, W) mask made invalid."""
+        return replace(self, depth=np.where(mask, self.depth, np.float32(0)))
+
+
+@dataclass(frozen=True, eq=False)
+class CloudFrame:
+    """One view without a camera: N points, non-finite ones dropped when it is made by `of`."""
+
+    index: int
+    timestamp: float
+    points: Float32
+    normals: Float32 | None = None
+    sigma: Float32 | None = None
+    amplitude: Float32 | None = None
+    color: UInt8 | None = None
+    origin: Float64 = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise InputError(
+                f"points have shape {self.points.shape}",
+                where=f"frame {self.index}",
+                remedy="give an (N, 3) array",
+            )
+
+    @classmethod
+    def of(cls, points: ArrayLike, *, index: int = 0, timestamp: float = 0.0) -> Self:
+        """Make a view of an (N, 3) array in m, dropping non-finite points."""
+        array = np.asarray(points)
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+            raise InputError(
+                f"is an array of shape {array.shape} and type {array.dtype}",
+                where="points",
+                remedy="give (N, 3) numbers in metres",
+            )
+        array = array[np.isfinite(array).all(1)].astype(np.float32)
+        return cls(index, timestamp, array)
+
+    @property
+    def valid(self) -> Bool:
+        """(N,) mask; every point of a cloud is valid."""
+        return np.ones(len(self.points), bool)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def keep(self, mask: Bool) -> Self:
+        """Return the view with only the points of the (N,) mask."""
+        return replace(
+            self,
+            points=self.points[mask],
+            normals=None if self.normals is None else self.normals[mask],
+            sigma=None if self.sigma is None else self.sigma[mask],
+            amplitude=None if self.amplitude is None else self.amplitude[mask],
+            color=None if self.color is None else self.color[mask],
+        )
+
+
+Frame = RangeFrame | CloudFrame

@@ -1,0 +1,193 @@
+"""A recording: frames read when they are needed, and what was found beside them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
+
+
+class Source(Protocol):
+    """What a reader makes of a path: metadata at once, frames on demand.
+
+    Attributes
+    ----------
+    timestamps
+        (N,) seconds, one for each frame.
+    reference
+        (N, 4, 4) T_world_camera found beside the frames, NaN where there is none; or None.
+        Only ever compared with.
+    odometry
+        (N, 4, 4) T_world_camera from odometry, NaN where there is none; or None.
+    warnings
+        What a person should know about how the recording was read, one line each.
+    metadata
+        Plain facts for `inspect` and reports (sensor, ambiguity_m, confidence_max ...).
+    """
+
+    timestamps: Float64
+    reference: Float64 | None
+    odometry: Float64 | None
+    warnings: list[str]
+    metadata: dict[str, Any]
+
+    def read(self, index: int) -> Frame:
+        """Read frame `index`; raise UnreadableFrameError if it can't be read."""
+        ...
+
+
+@dataclass
+class ArraySource:
+    """A source over frames that are in memory already."""
+
+    frames: Sequence[Frame]
+    reference: Float64 | None = None
+    odometry: Float64 | None = None
+    warnings: list[str] = field(default_factory=list)
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.timestamps = np.array([f.timestamp for f in self.frames], float)
+
+    def read(self, index: int) -> Frame:
+        """Return frame `index`."""
+        return self.frames[index]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A sequence of frames, read lazily.
+
+    ``len(recording)``, ``recording[k]`` and iteration give the selected frames. Iteration reads
+    ahead on another thread and skips nothing: a frame that can't be read raises when it is its
+    turn; `read_all` gives the error in its place instead.
+
+    Attributes
+    ----------
+    source
+        Where the frames come from.
+    path
+        What was opened, for messages.
+    format
+        Name of the reader.
+    indices
+        (M,) indices of the selected frames in the source.
+    """
+
+    source: Source
+    path: str
+    format: str
+    indices: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, source: Source, path: str | Path, format: str) -> Recording:  # noqa: A002
+        """Make a recording of all frames of a source."""
+        return cls(source, str(path), format, np.arange(len(source.timestamps)))
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, k: int) -> Frame:
+        return self.source.read(int(self.indices[k]))
+
+    def __iter__(self) -> Iterator[Frame]:
+        for item in self.read_all():
+            if isinstance(item, UnreadableFrameError):
+                raise item
+            yield item
+
+    @property
+    def timestamps(self) -> Float64:
+        """(M,) seconds of the selected frames."""
+        return self.source.timestamps[self.indices]
+
+    @property
+    def reference(self) -> Float64 | None:
+        """(M, 4, 4) T_world_camera to compare with, NaN where there is none; or None."""
+        return None if self.source.reference is None else self.source.reference[self.indices]
+
+    @property
+    def odometry(self) -> Float64 | None:
+        """(M, 4, 4) T_world_camera of odometry, NaN where there is none; or None."""
+        return None if self.source.odometry is None else self.source.odometry[self.indices]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know about how the recording was read."""
+        return self.source.warnings
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Plain facts about the recording."""
+        return self.source.metadata
+
+    def select(self, start: int = 0, end: int | None = None, every: int = 1) -> Recording:
+        """Return the frames start, start + every, ... before `end`; negative counts from the end.
+
+        Raises
+        ------
+        InputError
+            If nothing would be left.
+        """
+        if every < 1:
+            raise InputError(f"is {every}", where="--every", remedy="give 1 or more")
+        chosen = self.indices[slice(start, end, every)]
+        if len(chosen) == 0:
+            raise InputError(
+                f"frames {start} to {end} of {len(self)} select nothing",
+                where=self.path,
+                remedy="change --start, --end or --every",
+            )
+        return Recording(self.source, self.path, self.format, chosen)
+
+    def read_all(self, ahead: int = 8) -> Iterator[Frame | UnreadableFrameError]:
+        """Iterate over the frames, with the error in place of each that can't be read.
+
+        Reads up to `ahead` frames in advance on another thread.
+        """
+        out: queue.Queue[Frame | BaseException | None] = queue.Queue(max(1, ahead))
+        stop = threading.Event()
+
+        def put(item: Frame | BaseException | None) -> bool:
+            while not stop.is_set():
+                try:
+                    out.put(item, timeout=0.1)
+                    return True
+                except queue.Full:
+                    continue
+            return False
+
+        def work() -> None:
+            try:
+                for index in self.indices:
+                    try:
+                        item: Frame | BaseException = self.source.read(int(index))
+                    except UnreadableFrameError as error:
+                        item = error
+                    if not put(item):
+                        return
+                put(None)
+            except BaseException as error:
+                put(error)
+
+        thread = threading.Thread(target=work, name="tofuse-reader", daemon=True)
+        thread.start()
+        try:
+            while (item := out.get()) is not None:
+                if isinstance(item, BaseException) and not isinstance(item, UnreadableFrameError):
+                    raise item
+                yield item
+        finally:
+            stop.set()
+            thread.join()

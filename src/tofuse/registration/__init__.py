@@ -1,0 +1,1 @@
+"""Registration of one pair of views, put together from small parts (section 2.9)."""

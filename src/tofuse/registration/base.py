@@ -1,0 +1,79 @@
+"""What a registration takes and gives, whatever the method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """How one view lies in the frame of another.
+
+    Attributes
+    ----------
+    T_target_source
+        (4, 4) maps points of the source view into the target's frame.
+    converged
+        False if the iterations ran out before the stopping rule was met.
+    iterations
+        How many times points were matched.
+    correspondences
+        Pairs of points that were left at the end.
+    points
+        Points of the source that took part (n_p of the thesis).
+    error
+        E of Algorithm 1: sum of the distances of corresponding points / (points * resolution).
+    rms_m
+        Root mean square distance of corresponding points, m.
+    information
+        (6, 6) information of the right perturbation (tx ty tz rx ry rz) in the source frame:
+        1/m^2, 1/(m rad), 1/rad^2.
+    unobservable
+        (k, 6) directions of the right perturbation that the data doesn't hold.
+    errors
+        E at every iteration.
+    """
+
+    T_target_source: Float64
+    converged: bool
+    iterations: int
+    correspondences: int
+    points: int
+    error: float
+    rms_m: float
+    information: Float64
+    unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
+    errors: tuple[float, ...] = ()
+
+    @property
+    def share(self) -> float:
+        """Corresponding points as a share of the source's points, 0 to 1."""
+        return self.correspondences / self.points if self.points else 0.0
+
+
+class Registrar(Protocol):
+    """A method that registers one pair of views."""
+
+    part_kind: ClassVar[str] = "registration"
+    takes: ClassVar[frozenset[str]]
+
+    def register(
+        self,
+        source: Frame,
+        target: Frame,
+        guess: Float64,
+        rng: np.random.Generator,
+    ) -> Registration:
+        """Register `source` into the frame of `target`, starting from `guess` (T_target_source).
+
+        Raises RegistrationError if there are too few points to try.
+        """
+        ...

@@ -1,0 +1,1 @@
+"""report.html: the run, explained to a person."""

@@ -1,0 +1,107 @@
+"""What a run gives, in memory and in `run.json`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.cloud import Cloud
+from tofuse.odometry.base import Status
+from tofuse.posegraph.graph import LoopRecord, PoseGraph
+
+Float64 = NDArray[np.float64]
+
+Verdict = Literal["good", "degraded", "failed"]
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One reason for the verdict: a code from the closed list in `verdict.REASONS`."""
+
+    code: str
+    frames: tuple[int, int]
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """What became of one frame; the fields of `run.json`, SI units."""
+
+    index: int
+    timestamp: float
+    status: Status
+    reason: str = ""
+    valid_share: float | None = None
+    inlier_share: float | None = None
+    rms_m: float | None = None
+    covariance: Float64 | None = None  # (6, 6), (tx ty tz rx ry rz), m and rad
+    unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnostics:
+    """Everything that says how far the result can be trusted.
+
+    Attributes
+    ----------
+    sequential
+        (N, 4, 4) T_world_camera before loops were closed, NaN where lost.
+    objective
+        Value of the optimiser's objective at every iteration (figure 5.3).
+    removed
+        Share of points that each filter removed, by name.
+    seconds
+        Wall time of each stage.
+    """
+
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
+    frames: tuple[FrameRecord, ...]
+    loops: tuple[LoopRecord, ...]
+    sequential: Float64
+    objective: tuple[float, ...]
+    removed: dict[str, float]
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """The result of `tofuse.reconstruct`.
+
+    Attributes
+    ----------
+    trajectory
+        (N, 4, 4) T_world_camera of every frame read, NaN where it has none; the first pose is
+        the identity.
+    timestamps
+        (N,) seconds.
+    graph
+        Vertices are frame indices.
+    cloud
+        The fused model, in the world frame.
+    mesh
+        None until a surface is made.
+    config
+        The resolved configuration, as plain data.
+    recording
+        path, format, frames and the reader's warnings, as plain data.
+    """
+
+    trajectory: Float64
+    timestamps: Float64
+    graph: PoseGraph
+    cloud: Cloud
+    diagnostics: Diagnostics
+    config: dict[str, Any]
+    recording: dict[str, Any]
+    seed: int
+    threads: int
+    mesh: None = None
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """(N,) mask of the frames with a pose."""
+        return np.isfinite(self.trajectory[:, 0, 0])

@@ -1,0 +1,1 @@
+"""What is known of the sensor: noise, corrections, named cameras."""

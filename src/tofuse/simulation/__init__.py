@@ -1,0 +1,1 @@
+"""A ToF camera simulator: the package's own source of truth."""
