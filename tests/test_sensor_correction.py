@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.sensor.correction import DepthCorrection
+
+
+def test_curve_is_linear_between_knots_and_constant_outside() -> None:
+    correction = DepthCorrection(np.array([1.0, 2.0, 4.0]), np.array([0.1, 0.3, -0.1]))
+    measured = np.array([[0.0, 0.5, 1.5, 3.0, 9.0]], np.float32)
+    np.testing.assert_allclose(correction.correct(measured), [[0, 0.4, 1.3, 2.9, 9.1]], atol=1e-6)
+
+
+def test_offset_of_each_pixel_is_subtracted_and_invalid_stays_invalid() -> None:
+    pixel = np.array([[0.01, -0.02], [0.5, 0.0]], np.float32)
+    correction = DepthCorrection(np.array([0.0]), np.array([0.0]), pixel)
+    measured = np.array([[1, 0], [0.2, 2]], np.float32)
+    np.testing.assert_allclose(correction.correct(measured), [[0.99, 0], [0, 2]], atol=1e-6)
+
+
+@pytest.mark.parametrize("with_pixels", [False, True])
+def test_what_is_saved_is_loaded(tmp_path, with_pixels) -> None:
+    pixel = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32) * 0.01
+    one = DepthCorrection(np.linspace(0, 5, 11), np.sin(np.arange(11.0)), pixel)
+    one = one if with_pixels else DepthCorrection(one.range_m, one.bias_m)
+    one.save(tmp_path / "correction.npz")
+    assert [p.name for p in tmp_path.iterdir()] == ["correction.npz"]
+    two = DepthCorrection.load(tmp_path / "correction.npz")
+    measured = np.full((3, 4), 2.34, np.float32)
+    np.testing.assert_array_equal(one.correct(measured), two.correct(measured))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"range_m": [0.0, 1.0]}, "bias_m"),
+        ({"range_m": [0.0, 1.0], "bias_m": [0.0]}, "shape"),
+        ({"range_m": [0.0, np.nan], "bias_m": [0.0, 0.0]}, "not finite"),
+        ({"range_m": [1.0, 0.0], "bias_m": [0.0, 0.0]}, "ascend"),
+        ({"range_m": [0.0], "bias_m": [0.0], "pixel_bias_m": [1.0, 2.0]}, "pixel_bias_m"),
+        ({"range_m": ["a"], "bias_m": [0.0]}, "range_m"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path, arrays, said) -> None:
+    path = tmp_path / "correction.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match=said) as error:
+        DepthCorrection.load(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut"])
+def test_files_that_are_no_npz_are_refused(tmp_path, content) -> None:
+    path = tmp_path / "correction.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError):
+        DepthCorrection.load(path)
+    with pytest.raises(InputError):
+        DepthCorrection.load(tmp_path / "missing.npz")
+
+
+def test_objects_are_not_unpickled(tmp_path) -> None:
+    path = tmp_path / "correction.npz"
+    np.savez(path, range_m=np.array([{}], object), bias_m=np.zeros(1))
+    with pytest.raises(InputError):
+        DepthCorrection.load(path)
+
+
+def test_images_of_another_size_are_refused() -> None:
+    correction = DepthCorrection(np.zeros(1), np.zeros(1), np.zeros((2, 2), np.float32))
+    with pytest.raises(InputError, match="2 x 2"):
+        correction.correct(np.ones((3, 3)))
