@@ -1,0 +1,172 @@
+"""The kd-tree finds exactly what a search through all points finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from tofuse.errors import InputError
+from tofuse.kernels.kdtree import KdTree, kdtree_build
+from tofuse.kernels.threads import threads
+
+
+def all_distances(points, queries):
+    """Squared distances (M, N), summed in the order in which the kernel sums."""
+    p = np.asarray(points, float).reshape(-1, 3)
+    q = np.asarray(queries, float).reshape(-1, 3)
+    d = q[:, None, :] - p[None, :, :]
+    return d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1] + d[..., 2] * d[..., 2]
+
+
+def brute_neighbours(points, queries, k):
+    d2 = all_distances(points, queries)
+    order = np.argsort(d2, axis=1, kind="stable")[:, :k]
+    missing = max(0, k - d2.shape[1])
+    index = np.pad(order, ((0, 0), (0, missing)), constant_values=-1)
+    distance2 = np.take_along_axis(d2, order, 1)
+    return index, np.pad(distance2, ((0, 0), (0, missing)), constant_values=np.inf)
+
+
+def brute_nearest(points, queries, max_distance):
+    index, distance2 = brute_neighbours(points, queries, 1)
+    index, distance2 = index[:, 0], distance2[:, 0]
+    far = ~(distance2 <= max_distance**2) | (index < 0)
+    return np.where(far, -1, index), np.where(far, np.inf, distance2)
+
+
+def clouds(seed, n, kind):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (n, 3))
+    if kind == "grid":  # many exact ties
+        points = np.round(points * 2) / 2
+    elif kind == "line":
+        points = np.outer(points[:, 0], [1.0, 2.0, -0.5])
+    elif kind == "same":
+        points[:] = 0.25
+    elif kind == "plane":
+        points[:, 2] = 3.0
+    return points
+
+
+KINDS = ["random", "grid", "line", "same", "plane"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(0, 300),
+    kind=st.sampled_from(KINDS),
+    k=st.integers(1, 7),
+    limit=st.sampled_from([0.0, 0.1, 0.5, 1.0, np.inf]),
+)
+def test_it_equals_the_search_through_all_points(seed, n, kind, k, limit):
+    points = clouds(seed, n, kind)
+    rng = np.random.default_rng(seed + 1)
+    queries = np.concatenate([points[:20], clouds(seed + 1, 20, kind), rng.uniform(-3, 3, (5, 3))])
+    tree = KdTree(points)
+    for got, want in zip(
+        tree.nearest(queries, limit), brute_nearest(points, queries, limit), strict=True
+    ):
+        np.testing.assert_array_equal(got, want)
+    for got, want in zip(
+        tree.neighbours(queries, k), brute_neighbours(points, queries, k), strict=True
+    ):
+        np.testing.assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_it_agrees_with_scipy(dtype):
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(20_000, 3)).astype(dtype)
+    queries = rng.normal(size=(5_000, 3)).astype(dtype)
+    peer = cKDTree(points.astype(float))
+    tree = KdTree(points)
+
+    index, distance2 = tree.neighbours(queries, 3)
+    want_distance, want_index = peer.query(queries.astype(float), 3)
+    np.testing.assert_array_equal(index, want_index)
+    np.testing.assert_allclose(np.sqrt(distance2), want_distance, rtol=1e-12)
+
+    index, distance2 = tree.nearest(queries, 0.03)
+    want_distance, want_index = peer.query(queries.astype(float), distance_upper_bound=0.03)
+    np.testing.assert_array_equal(np.where(index < 0, len(points), index), want_index)
+    assert 0 < (index < 0).sum() < len(index)
+    np.testing.assert_allclose(np.sqrt(distance2), want_distance, rtol=1e-12)
+
+
+def test_a_tie_goes_to_the_lowest_index():
+    points = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, -1]] * 50)
+    index, distance2 = KdTree(points).nearest(np.zeros((1, 3)))
+    assert index[0] == 0
+    assert distance2[0] == 1
+    index, _ = KdTree(points).neighbours(np.zeros((1, 3)), 6)
+    np.testing.assert_array_equal(index[0], np.arange(6))
+
+
+def test_the_bound_is_inclusive():
+    tree = KdTree([[0.0, 0, 0]])
+    query = np.array([[0.5, 0, 0]])
+    assert tree.nearest(query, 0.5)[0][0] == 0
+    assert tree.nearest(query, np.nextafter(0.5, 0))[0][0] == -1
+    assert tree.nearest(query, -1.0)[0][0] == -1
+
+
+def test_no_points_and_no_queries():
+    empty = KdTree(np.zeros((0, 3)))
+    assert len(empty) == 0
+    index, distance2 = empty.nearest(np.zeros((4, 3)))
+    np.testing.assert_array_equal(index, -1)
+    assert np.isinf(distance2).all()
+    index, distance2 = empty.neighbours(np.zeros((4, 3)), 2)
+    np.testing.assert_array_equal(index, -1)
+    assert np.isinf(distance2).all()
+    index, distance2 = KdTree(np.zeros((3, 3))).neighbours(np.zeros((0, 3)), 2)
+    assert index.shape == distance2.shape == (0, 2)
+    assert index.dtype == np.int64
+
+
+def test_a_query_that_is_not_finite_has_no_neighbour():
+    tree = KdTree(np.random.default_rng(0).normal(size=(100, 3)))
+    queries = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]])
+    assert (tree.nearest(queries)[0] >= 0).tolist() == [False, False, True]
+    assert (tree.neighbours(queries, 2)[0] >= 0).all(1).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 2)), np.zeros(3), [[np.nan, 0, 0]]])
+def test_bad_points_are_refused(bad):
+    with pytest.raises(InputError):
+        KdTree(bad)
+
+
+def test_the_answer_does_not_depend_on_the_number_of_threads():
+    rng = np.random.default_rng(8)
+    tree = KdTree(np.round(rng.normal(size=(9_000, 3)), 1))
+    queries = rng.normal(size=(9_000, 3))
+    answers = []
+    for count in (1, 2, 3):
+        with threads(count):
+            answers.append(tree.nearest(queries, 0.2) + tree.neighbours(queries, 3))
+    for other in answers[1:]:
+        for a, b in zip(answers[0], other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_tree_is_balanced_and_cut_at_its_cuts(kind):
+    points = clouds(5, 1000, kind)
+    depth = 7
+    order, arranged, axes, cuts = kdtree_build(points, depth)
+    assert sorted(order) == list(range(1000))
+    np.testing.assert_array_equal(arranged, points[order])
+    for level in range(depth):
+        for j in range(1 << level):
+            start, stop = 1000 * j >> level, 1000 * (j + 1) >> level
+            middle = 1000 * (2 * j + 1) >> (level + 1)
+            node = (1 << level) - 1 + j
+            along = arranged[:, axes[node]]
+            assert (along[start:middle] <= cuts[node]).all()
+            assert (along[middle:stop] >= cuts[node]).all()
+            assert np.ptp(along[start:stop]) == np.ptp(arranged[start:stop], axis=0).max()
