@@ -1,1 +1,38 @@
-"""The command line."""
+"""The command line.
+
+Exit status: 0, a result was written and every readable frame has a pose; 3, a result was written
+but some readable frame has none; 2, nothing was written: one line on stderr says why.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    from tofuse.cli.parser import make_parser
+    from tofuse.errors import TofuseError
+
+    try:
+        arguments = make_parser().parse_args(argv)
+        status: int = arguments.command(arguments)
+        sys.stdout.flush()
+        return status
+    except TofuseError as error:
+        print(f"tofuse: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("tofuse: interrupted; nothing that was there before has changed", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away (`tofuse ... | head`): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except MemoryError:
+        print(
+            "tofuse: out of memory; use --every, --max-depth or a larger voxel_m", file=sys.stderr
+        )
+        return 2

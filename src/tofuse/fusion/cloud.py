@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.recordings.frames import Frame, RangeFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+_BUFFER_ROWS = 2_000_000
+_KEY_BITS = 21  # voxels per axis: 2^21, that is 21 km at 1 cm
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +35,181 @@ class Cloud:
         (3,) float64.
     """
 
-    points: NDArray[np.float32]
-    normals: NDArray[np.float32] | None
+    points: Float32
+    normals: Float32 | None
     color: NDArray[np.uint8] | None
     views: NDArray[np.int32]
-    offset: NDArray[np.float64]
+    offset: Float64
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+@dataclass(frozen=True)
+class CloudFusion:
+    """How the fused cloud is made.
+
+    Attributes
+    ----------
+    voxel_m
+        Edge of a voxel; None chooses the distance between neighbouring pixels at the median
+        depth, which keeps what the sensor resolved.
+    min_views
+        Points seen by fewer frames are left out.
+    normal_neighbours
+        Points in the plane fit of each normal.
+    """
+
+    voxel_m: float | None = None
+    min_views: int = 1
+    normal_neighbours: int = 12
+
+    def __post_init__(self) -> None:
+        if self.voxel_m is not None and not 1e-5 < self.voxel_m < 100:
+            raise ValueError(f"voxel_m is {self.voxel_m}; give metres, such as 0.01")
+        if self.min_views < 1 or self.normal_neighbours < 3:
+            raise ValueError("min_views must be at least 1 and normal_neighbours at least 3")
+
+
+def choose_voxel(frame: Frame) -> float:
+    """Return a voxel edge in m that fits the sensor and the scene: 2 mm to 10 cm."""
+    points = frame.points
+    if len(points) == 0:
+        return 0.01
+    if isinstance(frame, RangeFrame):
+        rays = frame.camera.rays()
+        pitch = float(np.nanmedian(np.abs(np.diff(rays[..., 0], axis=1))))
+        size = pitch * float(np.median(points[:, 2]))
+    else:
+        # A surface of N points: the spacing is about the root of the area over N.
+        extent = np.sort(np.ptp(points.astype(float), axis=0))
+        size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
+    return float(f"{np.clip(size, 0.002, 0.1):.2g}")
+
+
+@dataclass
+class CloudBuilder:
+    """Adds views one after another; memory grows with the surface, not with the frames."""
+
+    config: CloudFusion
+    voxel_m: float
+    _keys: list[NDArray[np.int64]] = field(default_factory=list)
+    _sums: list[Float64] = field(default_factory=list)
+    _rows: int = 0
+
+    def add(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Add a (filtered) view at its pose."""
+        if len(frame) == 0:
+            return
+        local = frame.points.astype(float)
+        world = se3.transform(T_world_camera, local)
+        towards = (T_world_camera[:3, :3] @ frame.origin + T_world_camera[:3, 3]) - world
+        distance = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+        rows = np.zeros((len(world), 12))
+        rows[:, 0:3] = world
+        rows[:, 3:6] = towards / distance
+        rows[:, 6] = 1
+        if frame.color is not None:
+            rows[:, 7:10] = frame.color
+            rows[:, 10] = 1
+        elif frame.amplitude is not None:
+            # Light falls off with the square of the range: this is nearly the surface's albedo.
+            rows[:, 7] = frame.amplitude * distance[:, 0] ** 2
+            rows[:, 11] = 1
+        keys = _voxel_keys(world, self.voxel_m)
+        keys, sums = _sum_by_key(keys, rows)
+        sums[:, :] /= sums[:, 6:7]  # one vote a frame, however many pixels fell into the voxel
+        self._keys.append(keys)
+        self._sums.append(sums)
+        self._rows += len(keys)
+        if self._rows > _BUFFER_ROWS:
+            self._merge()
+
+    def _merge(self) -> None:
+        keys, sums = _sum_by_key(np.concatenate(self._keys), np.concatenate(self._sums))
+        self._keys, self._sums = [keys], [sums]
+        # Grow the buffer with the model, or a large model would be merged at every frame.
+        self._rows = 0 if len(keys) > _BUFFER_ROWS // 2 else len(keys)
+
+    def finish(self) -> Cloud:
+        """Return the cloud, in an order that depends on the voxels alone."""
+        if not self._keys:
+            return empty_cloud()
+        self._merge()
+        sums = self._sums[0]
+        sums = sums[sums[:, 6] >= self.config.min_views]
+        if len(sums) == 0:
+            return empty_cloud()
+        views = sums[:, 6]
+        points = sums[:, 0:3] / views[:, None]
+        normals = _normals(points, sums[:, 3:6], self.config.normal_neighbours)
+        return Cloud(
+            points.astype(np.float32),
+            normals,
+            _colors(sums),
+            np.round(views).astype(np.int32),
+            np.zeros(3),
+        )
+
+
+def empty_cloud() -> Cloud:
+    """Return a cloud without points."""
+    return Cloud(np.zeros((0, 3), np.float32), None, None, np.zeros(0, np.int32), np.zeros(3))
+
+
+def thin(frame: Frame, points: int) -> Frame:
+    """Return the view with at most about `points` points, taken at an even stride."""
+    step = -(-len(frame) // points)
+    if step <= 1:
+        return frame
+    mask = np.zeros(frame.valid.shape, bool)
+    mask.ravel()[np.flatnonzero(frame.valid.ravel())[::step]] = True
+    return frame.keep(mask)
+
+
+def _voxel_keys(points: Float64, voxel: float) -> NDArray[np.int64]:
+    half = 1 << (_KEY_BITS - 1)
+    ijk = np.clip(np.floor(points / voxel), -half, half - 1).astype(np.int64) + half
+    return (ijk[:, 0] << 2 * _KEY_BITS) | (ijk[:, 1] << _KEY_BITS) | ijk[:, 2]
+
+
+def _sum_by_key(keys: NDArray[np.int64], rows: Float64) -> tuple[NDArray[np.int64], Float64]:
+    order = np.argsort(keys, kind="stable")
+    keys, rows = keys[order], rows[order]
+    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    return keys[starts], np.add.reduceat(rows, starts, axis=0)
+
+
+def _colors(sums: Float64) -> NDArray[np.uint8] | None:
+    rgb, grey = sums[:, 10] > 0, sums[:, 11] > 0
+    if not (rgb.any() or grey.any()):
+        return None
+    out = np.full((len(sums), 3), 128, np.uint8)
+    out[rgb] = np.round(sums[rgb, 7:10] / sums[rgb, 10:11]).clip(0, 255).astype(np.uint8)
+    grey &= ~rgb
+    if grey.any():
+        value = sums[grey, 7] / sums[grey, 11]
+        low, high = np.percentile(value, [1, 99])
+        # Gamma 1/2.2: albedo is linear, screens are not.
+        share = ((value - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)
+        out[grey] = np.round(255 * share).astype(np.uint8)[:, None]
+    return out
+
+
+def _normals(points: Float64, towards: Float64, neighbours: int) -> Float32 | None:
+    from scipy.spatial import cKDTree
+
+    k = min(neighbours, len(points))
+    if k < 3:
+        return None
+    _, near = cKDTree(points).query(points, k=k, workers=-1)
+    out = np.empty((len(points), 3), np.float32)
+    for start in range(0, len(points), 50_000):  # bounds the memory of the gathered neighbours
+        part = slice(start, start + 50_000)
+        group = points[near[part]]
+        group = group - group.mean(1, keepdims=True)
+        _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", group, group))
+        normal = vectors[..., 0]
+        sign = np.where((normal * towards[part]).sum(1) < 0, -1.0, 1.0)
+        out[part] = normal * sign[:, None]
+    return out

@@ -1,0 +1,210 @@
+"""Which commands and options there are. Imports nothing heavy: ``--help`` is instant."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+from tofuse._version import __version__
+
+DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
+
+_EXIT = """\
+exit status:
+  0  a result was written and every readable frame has a pose
+  3  a result was written, but some readable frame has no pose
+  2  nothing was written: one line on stderr says why
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with 2."""
+        sys.stderr.write(f"{self.prog}: {message}; see `{self.prog} --help`\n")
+        sys.exit(2)
+
+
+def make_parser() -> Parser:
+    """Return the parser of the whole command line."""
+    parser = Parser(
+        prog="tofuse",
+        description="Turn recordings of Time-of-Flight cameras into one 3D model and the "
+        "camera's trajectory, and say how far the result can be trusted.",
+    )
+    parser.add_argument("--version", action="version", version=f"tofuse {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    _run(commands)
+    _demo(commands)
+    _simulate(commands)
+    _inspect(commands)
+    _evaluate(commands)
+    _optimize(commands)
+    _experiments(commands)
+    return parser
+
+
+def _command(
+    commands: Any, name: str, summary: str, *, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+    def call(arguments: argparse.Namespace) -> int:
+        from tofuse.cli import commands as functions
+
+        function: Callable[[argparse.Namespace], int] = getattr(functions, name)
+        return function(arguments)
+
+    parser.set_defaults(command=call)
+    return parser
+
+
+def _run(commands: Any) -> None:
+    p = _command(commands, "run", "reconstruct a recording", epilog=_EXIT)
+    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the result")
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
+    p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+    _processing(p)
+    g = p.add_argument_group("what to read")
+    g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
+    g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    g.add_argument("--start", type=int, default=0, metavar="I", help="first frame (0)")
+    g.add_argument("--end", type=int, metavar="I", help="stop before this frame")
+    g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    g.add_argument("--min-depth", type=_metres, metavar="M", help="drop points nearer than this")
+    g.add_argument("--max-depth", type=_metres, metavar="M", help="drop points beyond this")
+
+
+def _processing(p: argparse.ArgumentParser) -> None:
+    g = p.add_argument_group("how to reconstruct")
+    g.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
+    g.add_argument(
+        "--config", type=Path, metavar="FILE", help="options from a .toml, or an earlier run.json"
+    )
+    g.add_argument(
+        "--guess",
+        choices=("identity", "previous", "odometry"),
+        help="where each registration starts",
+    )
+    g.add_argument(
+        "--loops", type=Path, metavar="FILE", help="loops known beforehand, one `i j` a line"
+    )
+    g.add_argument(
+        "--object",
+        action="store_true",
+        help="a turned object before a still background, not a moving camera",
+    )
+    _seed(g)
+    g.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+
+
+def _seed(p: Any) -> None:
+    p.add_argument("--seed", type=_seed_number, metavar="N", help="seed of all randomness (0)")
+
+
+def _demo(commands: Any) -> None:
+    p = _command(
+        commands,
+        "demo",
+        "simulate a recording and reconstruct it",
+        epilog="The recording is left in DIR/recording, the result in DIR.\n\n" + _EXIT,
+    )
+    p.add_argument("--scene", choices=DEMO_SCENES, default="room", help="what to simulate (room)")
+    p.add_argument(
+        "--out", type=Path, default=Path("tofuse-demo"), metavar="DIR", help="(tofuse-demo)"
+    )
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier demo in DIR")
+    p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+    p.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
+    _seed(p)
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+
+
+def _simulate(commands: Any) -> None:
+    p = _command(commands, "simulate", "make a recording with a simulated camera")
+    p.add_argument("scene", metavar="SCENE", help=", ".join(DEMO_SCENES))
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for it")
+    p.add_argument("--camera", default="sr4000", metavar="NAME", help="which camera (sr4000)")
+    p.add_argument("--every", type=_count, metavar="N", help="stride (default: the thesis's)")
+    p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
+    p.add_argument("--uniform", action="store_true", help="one albedo everywhere, no texture")
+    p.add_argument(
+        "--without",
+        default="",
+        metavar="EFFECTS",
+        help="errors to switch off, separated by commas (or: all)",
+    )
+    p.add_argument(
+        "--no-correction", action="store_true", help="leave out the factory's depth correction"
+    )
+    p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the peaks scene (0.05)")
+    _seed(p)
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+
+
+def _inspect(commands: Any) -> None:
+    p = _command(commands, "inspect", "say what a recording is, and what is wrong with it")
+    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
+    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _evaluate(commands: Any) -> None:
+    p = _command(commands, "evaluate", "compare a trajectory with a reference")
+    p.add_argument("estimate", type=Path, metavar="ESTIMATE", help="a TUM trajectory or a result")
+    p.add_argument("reference", type=Path, metavar="REFERENCE", help="a TUM trajectory")
+    p.add_argument(
+        "--recording", type=Path, metavar="REC", help="also measure how well its images agree"
+    )
+    p.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _optimize(commands: Any) -> None:
+    p = _command(commands, "optimize", "optimise a pose graph")
+    p.add_argument("input", type=Path, metavar="IN.g2o")
+    p.add_argument("--out", required=True, type=Path, metavar="OUT.g2o")
+    p.add_argument("--overwrite", action="store_true", help="replace OUT.g2o if it is there")
+
+
+def _experiments(commands: Any) -> None:
+    p = _command(commands, "experiments", "run chapters 4 and 5 of the thesis again")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the page")
+    p.add_argument("--overwrite", action="store_true", help="replace earlier experiments in DIR")
+    p.add_argument("--cases", default="", metavar="NAMES", help="only these, separated by commas")
+    p.add_argument("--seeds", type=_count, default=20, metavar="N", help="noise seeds (20)")
+    _seed(p)
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
+    return value
+
+
+def _seed_number(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _metres(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value) or value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a distance in metres")
+    return value

@@ -1,0 +1,141 @@
+"""The configuration of a reconstruction: which part does each job."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tofuse import parts
+from tofuse.errors import InputError
+from tofuse.filters.base import Filter
+from tofuse.fusion.cloud import CloudFusion
+from tofuse.odometry.base import Odometry
+from tofuse.posegraph.graph import Optimiser
+from tofuse.posegraph.loops import LoopDetector
+from tofuse.results.output import read_run_json
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides a result, apart from the recording and the seed.
+
+    Attributes
+    ----------
+    method
+        Name of the configuration that it started from, for people.
+    filters
+        Applied in this order to every frame.
+    odometry
+        Turns frames into poses.
+    loops
+        Finds and confirms places that the camera comes back to.
+    optimiser
+        Spreads the error of the loops.
+    fusion
+        Makes the cloud.
+    """
+
+    method: str
+    filters: tuple[Filter, ...]
+    odometry: Odometry
+    loops: LoopDetector
+    optimiser: Optimiser
+    fusion: CloudFusion
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, as in `run.json`."""
+        return dict(parts.to_dict(self))
+
+
+_ROOMS = ("tofuse.filters", "tofuse.registration", "tofuse.odometry", "tofuse.posegraph")
+
+
+def methods() -> dict[str, Callable[[], Config]]:
+    """Return the named configurations, `default` first."""
+    from tofuse.pipeline import methods as named
+
+    return {"default": named.default, "thesis": named.thesis}
+
+
+def from_method(name: str) -> Config:
+    """Return the configuration of that name; InputError if there is none."""
+    known = methods()
+    if name not in known:
+        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(known)}")
+    return known[name]()
+
+
+def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config:
+    """Return the configuration with some options replaced.
+
+    Parameters
+    ----------
+    changes
+        Nested options as in a TOML file. Tables are merged; a table that names another part
+        replaces the whole part, a list replaces the whole list.
+    where
+        Names the file in errors.
+
+    Raises
+    ------
+    InputError
+        For an option or part that does not exist, or a value of the wrong type.
+    """
+    for room in _ROOMS:
+        parts.discover(room)
+    merged = _merge(config.to_dict(), changes)
+    result: Config = parts.from_dict(Config, merged, where=where)
+    return result
+
+
+def read_changes(path: str | Path) -> dict[str, Any]:
+    """Read the options in a TOML file, or the `config` of a `run.json`.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read or is neither.
+    """
+    path = Path(path)
+    if path.suffix == ".json":
+        config = read_run_json(path).get("config")
+        if not isinstance(config, dict):
+            raise InputError("holds no config", where=path, remedy="give a run.json of tofuse")
+        return config
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"can't be read ({error.strerror})", where=path, remedy="check the path"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"is not TOML ({error})", where=path) from error
+
+
+def _merge(base: Any, change: Any) -> Any:
+    if not (isinstance(base, Mapping) and isinstance(change, Mapping)):
+        return change
+    if "part" in change and change["part"] != base.get("part"):
+        return dict(change)
+    return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
+
+
+def check_views(config: Config, kind: str) -> None:
+    """Raise InputError if a part of the configuration can't work on views of that kind.
+
+    Parameters
+    ----------
+    kind
+        "range" for images of a camera, "cloud" for bare clouds.
+    """
+    for part in (*config.filters, config.odometry):
+        if kind not in part.takes:
+            raise InputError(
+                f"{type(part).part_kind} {parts.name_of(part)!r} takes {sorted(part.takes)} "
+                f"views, and this recording holds {kind} views",
+                where="configuration",
+                remedy="leave that part out with --config, or use another --method",
+            )

@@ -1,0 +1,222 @@
+"""The output folder of a run: prepared first, staged beside, moved into place at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse._version import __version__
+from tofuse.errors import InputError, OutputError
+from tofuse.files.ply import write_ply
+from tofuse.files.trajectory import write_tum
+from tofuse.posegraph.g2o import write_g2o
+from tofuse.results.types import Reconstruction
+
+STAGING = ".tofuse-unfinished"
+EXTRA = ("recording",)  # what `tofuse demo` puts beside its result
+
+
+class OutputFolder:
+    """A folder that a run may write into.
+
+    Making one checks everything that can be checked before hours of work: that the folder is
+    ours or empty, and that it can be written.
+    """
+
+    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Check and create the folder.
+
+        Raises
+        ------
+        OutputError
+            If it holds something other than an earlier result, or a result and `overwrite` is
+            not given, or can't be written.
+        """
+        self.path = Path(path)
+        try:
+            self._check(overwrite)
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._staging = self.path / STAGING
+            shutil.rmtree(self._staging, ignore_errors=True)
+            self._staging.mkdir()
+        except OSError as error:
+            raise _output_error(self.path, error) from error
+
+    def _check(self, overwrite: bool) -> None:
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError("is a file", where=self.path, remedy="give --out a folder")
+        entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
+        entries -= {STAGING}
+        if not entries:
+            return
+        if not is_result(self.path) and entries - set(EXTRA):
+            raise OutputError(
+                "is not empty and holds no earlier result of tofuse",
+                where=self.path,
+                remedy="give --out a new or empty folder",
+            )
+        if not overwrite:
+            raise OutputError(
+                "holds an earlier result",
+                where=self.path,
+                remedy="give --overwrite to replace it, or another --out",
+            )
+
+    @contextmanager
+    def staging(self) -> Iterator[Path]:
+        """Give a folder to write files into; on success all are moved into place, else none.
+
+        `run.json` is moved last: where it is, everything else is.
+        """
+        try:
+            yield self._staging
+            files = sorted(self._staging.iterdir(), key=lambda p: (p.name == "run.json", p.name))
+            for file in files:
+                os.replace(file, self.path / file.name)
+        except OSError as error:
+            raise _output_error(self.path, error) from error
+        finally:
+            self.discard()
+
+    def discard(self) -> None:
+        """Remove what is unfinished, and the folder itself if nothing else is in it."""
+        shutil.rmtree(self._staging, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            self.path.rmdir()
+
+
+def _output_error(path: Path, error: OSError) -> OutputError:
+    return OutputError(
+        f"can't be written ({error.strerror or error})",
+        where=path,
+        remedy="check the permissions and the free space, or give another --out",
+    )
+
+
+def is_result(folder: Path) -> bool:
+    """Say whether a folder holds the result of an earlier run."""
+    try:
+        data = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(data, dict) and {"schema", "version", "verdict"} <= set(data)
+
+
+def write_result(
+    result: Reconstruction,
+    folder: OutputFolder,
+    report: Callable[[Reconstruction, Path], None] | None = None,
+) -> None:
+    """Write every file of the contract; `report` writes `report.html` into the folder it gets.
+
+    Raises
+    ------
+    OutputError
+        If a file can't be written; then nothing that was there before has changed.
+    """
+    with folder.staging() as staging:
+        posed = result.has_pose
+        write_tum(staging / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
+        write_g2o(staging / "pose_graph.g2o", result.graph)
+        cloud = result.cloud
+        write_ply(
+            staging / "cloud.ply",
+            cloud.points,
+            normals=cloud.normals,
+            color=cloud.color,
+            extra={"views": cloud.views},
+        )
+        if report is not None:
+            report(result, staging)
+        text = json.dumps(run_json(result), indent=1, allow_nan=False)
+        (staging / "run.json").write_text(text + "\n", encoding="utf-8")
+
+
+def run_json(result: Reconstruction) -> dict[str, Any]:
+    """Return the content of `run.json`, schema 1: SI units and radians, no NaN (null instead)."""
+    d = result.diagnostics
+    return plain(
+        {
+            "schema": 1,
+            "version": __version__,
+            "input": result.recording,
+            "seed": result.seed,
+            "threads": result.threads,
+            "config": result.config,
+            "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
+            "verdict": d.verdict,
+            "reasons": [
+                {"code": r.code, "frames": list(r.frames), "text": r.text} for r in d.reasons
+            ],
+            "frames": [
+                {
+                    "index": f.index,
+                    "timestamp": f.timestamp,
+                    "status": f.status,
+                    "reason": f.reason,
+                    "valid_share": f.valid_share,
+                    "inlier_share": f.inlier_share,
+                    "rms_m": f.rms_m,
+                    "covariance": None if f.covariance is None else f.covariance.ravel(),
+                    "unobservable": f.unobservable,
+                }
+                for f in d.frames
+            ],
+            "loops": [
+                {
+                    "i": p.i,
+                    "j": p.j,
+                    "accepted": p.accepted,
+                    "reason": p.reason,
+                    "overlap": p.overlap,
+                    "rms_m": p.rms_m,
+                    "free_space_violation": p.free_space_violation,
+                }
+                for p in d.loops
+            ],
+            "filters": {name: {"removed": share} for name, share in d.removed.items()},
+        }
+    )
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays and NumPy numbers into JSON values; NaN and infinity become null."""
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def read_run_json(path: str | Path) -> dict[str, Any]:
+    """Read a `run.json`.
+
+    Raises
+    ------
+    InputError
+        If it can't be read or is not one of ours.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"can't be read ({error.strerror})", where=path) from error
+    except ValueError as error:
+        raise InputError(f"is not JSON ({error})", where=path) from error
+    if not isinstance(data, dict) or data.get("schema") != 1:
+        raise InputError("is not a run.json of schema 1", where=path)
+    return data

@@ -1,0 +1,160 @@
+"""Group axioms and conventions of rigid motions, as properties."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from tofuse.errors import InputError
+from tofuse.geometry import quaternion, se3
+
+finite = st.floats(-3, 3)
+small = st.floats(-1.7, 1.7)  # keeps the rotation vector shorter than pi
+twists = st.tuples(arrays(float, 3, elements=finite), arrays(float, 3, elements=small)).map(
+    np.concatenate
+)
+tiny = st.tuples(
+    arrays(float, 3, elements=finite), arrays(float, 3, elements=st.floats(-1e-3, 1e-3))
+).map(np.concatenate)
+
+
+def generator(xi: np.ndarray) -> np.ndarray:
+    out = np.zeros((4, 4))
+    out[:3, :3] = se3.hat(xi[3:])
+    out[:3, 3] = xi[:3]
+    return out
+
+
+@given(st.one_of(twists, tiny))
+def test_exp_is_the_matrix_exponential(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(se3.exp(xi), expm(generator(xi)), atol=1e-12)
+
+
+@given(st.one_of(twists, tiny))
+def test_log_inverts_exp(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-10)
+
+
+@given(twists, twists, twists)
+def test_group_axioms(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> None:
+    A, B, C = se3.exp(a), se3.exp(b), se3.exp(c)
+    np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=1e-12)
+    np.testing.assert_allclose(A @ se3.inverse(A), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(se3.inverse(A @ B), se3.inverse(B) @ se3.inverse(A), atol=1e-12)
+
+
+@given(twists, twists)
+def test_adjoint_moves_a_perturbation_to_the_other_side(a: np.ndarray, xi: np.ndarray) -> None:
+    T = se3.exp(a)
+    left = se3.exp(se3.adjoint(T) @ (1e-2 * xi))
+    np.testing.assert_allclose(left @ T, T @ se3.exp(1e-2 * xi), atol=1e-11)
+
+
+@given(twists, twists, st.floats(0, 1))
+def test_interpolation_is_a_screw_between_its_ends(
+    a: np.ndarray, b: np.ndarray, share: float
+) -> None:
+    A, B = se3.exp(a), se3.exp(a) @ se3.exp(0.9 * b)
+    np.testing.assert_allclose(se3.interpolate(A, B, 0.0), A, atol=1e-12)
+    np.testing.assert_allclose(se3.interpolate(A, B, 1.0), B, atol=1e-9)
+    middle = se3.interpolate(A, B, share)
+    np.testing.assert_allclose(se3.log(se3.inverse(A) @ middle), share * 0.9 * b, atol=1e-9)
+
+
+@given(arrays(float, 3, elements=st.floats(-1, 1)).filter(lambda v: np.linalg.norm(v) > 0.1))
+def test_log_and_angle_are_exact_near_half_a_turn(axis: np.ndarray) -> None:
+    axis = axis / np.linalg.norm(axis)
+    for angle in (np.pi, np.pi - 1e-9, np.pi - 1e-5):
+        R = Rotation.from_rotvec(axis * angle).as_matrix()
+        assert abs(se3.angle(R) - angle) < 1e-7
+        w = se3.so3_log(R)
+        np.testing.assert_allclose(se3.so3_exp(w), R, atol=1e-9)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, [1, 2, 3]
+        np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-7)
+
+
+def test_functions_work_on_stacks() -> None:
+    xi = np.random.default_rng(0).normal(size=(4, 5, 6))
+    T = se3.exp(xi)
+    assert T.shape == (4, 5, 4, 4)
+    np.testing.assert_array_equal(T[2, 3], se3.exp(xi[2, 3]))
+    np.testing.assert_allclose(se3.log(se3.inverse(T))[1, 1], -se3.log(T)[1, 1], atol=1e-12)
+    assert se3.adjoint(T).shape == (4, 5, 6, 6)
+
+
+def test_transform_maps_points_of_b_into_a() -> None:
+    T_a_b = np.eye(4)
+    T_a_b[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    T_a_b[:3, 3] = [10, 0, 0]
+    np.testing.assert_allclose(
+        se3.transform(T_a_b, [[1, 0, 0], [0, 2, 0]]), [[10, 1, 0], [8, 0, 0]]
+    )
+
+
+@given(twists, arrays(float, (3, 3), elements=st.floats(-1e-3, 1e-3)))
+def test_orthonormalise_gives_the_nearest_rotation(xi: np.ndarray, noise: np.ndarray) -> None:
+    T = se3.exp(xi)
+    bent = T.copy()
+    bent[:3, :3] += noise
+    fixed = se3.orthonormalise(bent)
+    np.testing.assert_allclose(fixed[:3, :3] @ fixed[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(fixed[:3, :3]) > 0
+    to_fixed = np.linalg.norm(fixed[:3, :3] - bent[:3, :3])
+    assert to_fixed <= np.linalg.norm(T[:3, :3] - bent[:3, :3]) + 1e-12
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda T: T[:3],
+        lambda T: T * np.nan,
+        lambda T: T * 2,
+        lambda T: T @ np.diag([1, 1, -1, 1]),
+        lambda T: T + np.array([[0] * 4] * 3 + [[1, 0, 0, 0]]),
+    ],
+)
+def test_check_pose_refuses_what_is_no_rigid_motion(change) -> None:
+    T = se3.exp([1, 2, 3, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(se3.check_pose(T), T)
+    with pytest.raises(InputError, match="pose"):
+        se3.check_pose(change(T))
+
+
+unit_quaternions = (
+    arrays(float, 4, elements=st.floats(-1, 1))
+    .filter(lambda q: np.linalg.norm(q) > 0.1)
+    .map(lambda q: q / np.linalg.norm(q))
+)
+
+
+@given(unit_quaternions, st.floats(0.1, 10))
+def test_eq_2_11_and_2_12_agree_with_scipy(q: np.ndarray, scale: float) -> None:
+    R = Rotation.from_quat(q).as_matrix()
+    np.testing.assert_allclose(quaternion.to_matrix(scale * q), R, atol=1e-12)
+    np.testing.assert_allclose(quaternion.unnormalised_matrix(scale * q), scale**2 * R, atol=1e-10)
+
+
+@given(unit_quaternions)
+def test_from_matrix_inverts_to_matrix(q: np.ndarray) -> None:
+    back = quaternion.from_matrix(quaternion.to_matrix(q))
+    assert back[3] >= 0
+    np.testing.assert_allclose(back * np.sign(back @ q), q, atol=1e-12)
+
+
+@given(unit_quaternions, unit_quaternions)
+def test_products_and_inverses_of_quaternions(a: np.ndarray, b: np.ndarray) -> None:
+    A, B = quaternion.to_matrix(a), quaternion.to_matrix(b)
+    np.testing.assert_allclose(quaternion.to_matrix(quaternion.multiply(a, b)), A @ B, atol=1e-12)
+    np.testing.assert_allclose(quaternion.to_matrix(quaternion.conjugate(a)), A.T, atol=1e-12)
+
+
+def test_axis_angle_of_section_2_4() -> None:
+    q = quaternion.from_axis_angle([0.0, 0.0, 1.0], np.pi / 2)
+    np.testing.assert_allclose(q, [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+    np.testing.assert_allclose(quaternion.to_matrix(q) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
