@@ -32,7 +32,7 @@ class Filter(Protocol):
     @property
     def window(self) -> int:
         """How many frames it looks at, the current one included."""
-        ...
+        return 1
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """Say which points to keep.

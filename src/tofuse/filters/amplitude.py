@@ -1,0 +1,48 @@
+"""Keep points whose returned signal was neither too weak nor saturated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.filters._options import above, at_least
+from tofuse.filters.base import Bool, Filter
+from tofuse.parts import part
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+
+
+@part("filter", "amplitude")
+@dataclass(frozen=True)
+class Amplitude(Filter):
+    """Keep points whose amplitude lies in a window (section 2.8).
+
+    Saturated pixels are removed whatever the window. A view without amplitude is kept whole.
+
+    Attributes
+    ----------
+    minimum
+        Lowest amplitude that is kept, in the recording's counts.
+    maximum
+        Highest amplitude that is kept; None for no limit short of saturation.
+    """
+
+    minimum: float = 0.0
+    maximum: float | None = None
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        at_least("minimum", self.minimum, 0)
+        if self.maximum is not None:
+            above("maximum", self.maximum, self.minimum)
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        amplitude = frame.amplitude_image if isinstance(frame, RangeFrame) else frame.amplitude
+        if amplitude is None:
+            return np.ones(frame.valid.shape, bool)
+        keep = (amplitude >= self.minimum) & (amplitude < SATURATED_AMPLITUDE)
+        return keep if self.maximum is None else keep & (amplitude <= self.maximum)

@@ -1,0 +1,64 @@
+"""The neighbourhood angle of May et al. (2009), which tells jump edges from surfaces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.filters._options import within
+from tofuse.filters.base import Bool, Filter
+from tofuse.kernels.neighbourhood import largest_angle
+from tofuse.kernels.threads import run_chunks
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+
+
+@part("filter", "neighbourhood_angle", label="validated")
+@dataclass(frozen=True)
+class NeighbourhoodAngle(Filter):
+    """Remove points at jump edges by the neighbourhood angle (eq 2.6; May et al. 2009).
+
+    A point that mixes foreground and background, or lies on the rim of the foreground, has a
+    neighbour far behind it along nearly the same ray, so the angle at the point between the
+    camera and that neighbour approaches 180 degrees. On a surface seen at grazing angle g (0 when
+    seen edge on) it is at most about 180 degrees - g: the threshold is the tilt that is still
+    believed. The background beside an edge sees its neighbour in front (an angle near 0) and is
+    kept.
+
+    Attributes
+    ----------
+    threshold
+        Largest angle that is kept, rad.
+    """
+
+    threshold: float = math.radians(170)
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        within("threshold", self.threshold, math.pi / 2, math.pi)
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        assert isinstance(frame, RangeFrame)
+        return neighbourhood_angle(frame) <= self.threshold
+
+
+def neighbourhood_angle(frame: RangeFrame) -> NDArray[np.float32]:
+    """Neighbourhood angle xi (H, W) in rad; 0 at points without a valid neighbour.
+
+    Eq 2.6 takes the arcsine of ``|p_n| sin(phi) / |p_n - p_i|``, by the law of sines the sine of
+    the angle at p_i in the triangle of the camera, p_i and a neighbour p_n of the eight. An
+    arcsine never exceeds 90 degrees and so can't tell an angle from its supplement, while the
+    method needs those near 180. The interior angle itself is computed here, from the sine and the
+    cosine, and the largest over the neighbours is returned.
+    """
+    out = np.zeros(frame.depth.shape, np.float32)
+    points, valid = frame.point_image, frame.valid
+    run_chunks(lambda a, b: largest_angle(points, valid, a, b, out), len(out))
+    return out

@@ -1,0 +1,89 @@
+"""Keep points by where they are: within a distance of the camera, or within a box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from tofuse.filters._options import above, at_least, finite
+from tofuse.filters.base import Bool, Filter
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+
+
+@part("filter", "distance")
+@dataclass(frozen=True)
+class Distance(Filter):
+    """Keep points at a distance from `minimum` to `maximum` (section 2.8).
+
+    Attributes
+    ----------
+    minimum, maximum
+        Limits in m, both kept; None for no upper limit.
+    measure
+        "z" for depth along the optical axis, "range" for the straight line to the camera. A cloud
+        has no optical axis: its distance is always the straight line to its origin.
+    """
+
+    minimum: float = 0.0
+    maximum: float | None = None
+    measure: Literal["z", "range"] = "z"
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        at_least("minimum", self.minimum, 0)
+        if self.maximum is not None:
+            above("maximum", self.maximum, self.minimum)
+        if self.measure not in ("z", "range"):
+            raise ValueError(f"measure must be 'z' or 'range', not {self.measure!r}")
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        if isinstance(frame, RangeFrame):
+            distance = frame.z if self.measure == "z" else frame.radial_range
+        else:
+            distance = np.linalg.norm(frame.points - frame.origin, axis=1)
+        keep = distance >= self.minimum
+        return keep if self.maximum is None else keep & (distance <= self.maximum)
+
+
+@part("filter", "box")
+@dataclass(frozen=True)
+class Box(Filter):
+    """Remove points outside (or inside) a box along the axes of the camera frame (section 2.8).
+
+    Attributes
+    ----------
+    lower, upper
+        Opposite corners (x, y, z) in m: x right, y down, z forward. Points on the faces are
+        inside.
+    remove
+        "outside" keeps what is in the box, "inside" cuts it away.
+    """
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    remove: Literal["outside", "inside"] = "outside"
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        for name, corner in (("lower", self.lower), ("upper", self.upper)):
+            if len(corner) != 3:
+                raise ValueError(f"{name} must have 3 numbers, not {len(corner)}")
+            for axis, value in zip("xyz", corner, strict=True):
+                finite(f"{name} {axis}", value)
+        if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise ValueError("lower must be below upper on every axis")
+        if self.remove not in ("outside", "inside"):
+            raise ValueError(f"remove must be 'outside' or 'inside', not {self.remove!r}")
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        points = frame.point_image if isinstance(frame, RangeFrame) else frame.points
+        inside: Bool = np.all((points >= self.lower) & (points <= self.upper), axis=-1)
+        return inside if self.remove == "outside" else ~inside

@@ -1,0 +1,59 @@
+"""Remove pixels that stand out from those around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.filters._options import above, whole
+from tofuse.filters.base import Bool, Filter
+from tofuse.kernels.neighbourhood import window_median
+from tofuse.kernels.threads import run_chunks
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+
+
+@part("filter", "median")
+@dataclass(frozen=True)
+class Median(Filter):
+    """Remove pixels whose z is further than a threshold from the local median (section 2.8).
+
+    Nothing is smoothed: what is kept is as it was measured.
+
+    Attributes
+    ----------
+    threshold
+        Largest distance from the median that is kept, m.
+    size
+        Width and height of the window in pixels, odd.
+    """
+
+    threshold: float = 0.1
+    size: int = 5
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        above("threshold", self.threshold, 0)
+        whole("size", self.size, 3)
+        if self.size % 2 == 0 or self.size > 31:
+            raise ValueError(f"size must be odd and at most 31, not {self.size}")
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        assert isinstance(frame, RangeFrame)
+        return np.abs(frame.z - local_median(frame.z, self.size)) <= self.threshold
+
+
+def local_median(z: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Median (H, W) of the valid (positive) pixels in the window around each; 0 if there is none.
+
+    The window is cut at the image's border. Of an even number the two in the middle are averaged.
+    """
+    out = np.zeros_like(z)
+    run_chunks(lambda a, b: window_median(z, size // 2, a, b, out), len(z))
+    return out

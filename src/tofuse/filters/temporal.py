@@ -1,0 +1,70 @@
+"""Keep points that hold still over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.filters._options import above, whole
+from tofuse.filters.base import Bool, Filter
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+
+
+@part("filter", "temporal")
+@dataclass(frozen=True)
+class TemporalDeviation(Filter):
+    """Remove pixels whose z varied too much over the last frames (section 2.8).
+
+    The thesis calls it a "z-variance threshold" and gives 25 mm, a length: here that is the
+    sample standard deviation of z at the pixel, over the frames in the window that measured it.
+    It means noise where the camera is still; while it moves, slopes and edges vary too. A pixel
+    that was measured only once is kept, as nothing is known against it.
+
+    Attributes
+    ----------
+    threshold
+        Highest standard deviation that is kept, m.
+    frames
+        Length of the window, the current frame included.
+    """
+
+    threshold: float = 0.025
+    frames: int = 4
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        above("threshold", self.threshold, 0)
+        whole("frames", self.frames, 2)
+
+    @property
+    def window(self) -> int:
+        """See `Filter.window`."""
+        return self.frames
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        assert isinstance(frame, RangeFrame)
+        past = [
+            f.z for f in history if isinstance(f, RangeFrame) and f.depth.shape == frame.depth.shape
+        ]
+        deviation = z_deviation([*past[-(self.frames - 1) :], frame.z])
+        return ~(deviation > self.threshold)
+
+
+def z_deviation(z: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Sample standard deviation (H, W) in m of z images (H, W), 0 = invalid left out.
+
+    NaN where fewer than two images have a value.
+    """
+    stack = np.asarray(z, np.float64)
+    seen = stack > 0
+    count = seen.sum(0)
+    mean = stack.sum(0, where=seen) / np.maximum(count, 1)
+    squares = ((stack - mean) ** 2).sum(0, where=seen)
+    return np.where(count >= 2, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
