@@ -1,0 +1,194 @@
+"""Pose graphs in g2o text files: VERTEX_SE3:QUAT and EDGE_SE3:QUAT.
+
+A vertex is ``id tx ty tz qx qy qz qw``; an edge is ``i j`` and the measured T_i_j in the same
+form, then the 21 numbers of the upper triangle of the information matrix, row by row, in the
+order (tx ty tz rx ry rz). Its rotation part is read per radian squared of the rotation vector,
+as GTSAM does (g2o itself means the quaternion's vector part, half as large).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, OutputError
+from tofuse.geometry import quaternion
+from tofuse.posegraph.graph import PoseGraph
+
+Float64 = NDArray[np.float64]
+
+VERTEX = "VERTEX_SE3:QUAT"
+EDGE = "EDGE_SE3:QUAT"
+# FIX holds a vertex still, which here is always the first; the offset concerns other edges only.
+IGNORED = ("FIX", "PARAMS_SE3OFFSET")
+
+_UPPER = np.triu_indices(6)
+_UNIT = 1e-2  # how far a quaternion written with few digits may be from length 1
+
+
+def read_g2o(path: str | Path) -> PoseGraph:
+    """Read a pose graph; vertices and edges keep the order of the file.
+
+    An edge counts as odometry where it joins a vertex to the next one in the file, as a loop
+    otherwise. Lines that start with FIX, PARAMS_SE3OFFSET or # are passed over.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read or holds no vertex, and, with the line's number: for an unknown
+        tag, a wrong count of numbers, what is not a finite number, a quaternion that is not a
+        unit, information that is not positive semidefinite (or is all zero), a vertex given
+        twice, an edge to a missing vertex or to itself.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(
+            f"can't be read ({error.strerror})", where=path, remedy="check the path"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=path, remedy="give a .g2o file") from error
+    position: dict[int, int] = {}
+    vertices: list[list[float]] = []
+    ends: list[tuple[int, int]] = []
+    edges: list[list[float]] = []
+    edge_lines: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0].startswith("#") or words[0] in IGNORED:
+            continue
+        where = f"{path}, line {number}"
+        if words[0] == VERTEX:
+            (vertex,), values = _numbers(words, 1, 7, where)
+            if vertex in position:
+                raise InputError(f"vertex {vertex} is given twice", where=where)
+            position[vertex] = len(vertices)
+            vertices.append(values)
+        elif words[0] == EDGE:
+            (i, j), values = _numbers(words, 2, 28, where)
+            if i == j:
+                raise InputError(f"an edge joins vertex {i} to itself", where=where)
+            ends.append((i, j))
+            edges.append(values)
+            edge_lines.append(number)
+        else:
+            raise InputError(
+                f"holds {words[0]!r}", where=where, remedy=f"only {VERTEX} and {EDGE} are read"
+            )
+    if not vertices:
+        raise InputError("holds no vertex", where=path, remedy=f"give {VERTEX} lines")
+    for (i, j), number in zip(ends, edge_lines, strict=True):
+        for vertex in (i, j):
+            if vertex not in position:
+                raise InputError(
+                    f"the edge {i} {j} names vertex {vertex}, which is not there",
+                    where=f"{path}, line {number}",
+                )
+    rows = np.array(edges, float).reshape(-1, 28)
+    information = np.zeros((len(rows), 6, 6))
+    information[:, _UPPER[0], _UPPER[1]] = rows[:, 7:]
+    information[:, _UPPER[1], _UPPER[0]] = rows[:, 7:]
+    _check_information(information, path, edge_lines)
+    pairs = np.array([(position[i], position[j]) for i, j in ends], np.intp).reshape(-1, 2)
+    return PoseGraph(
+        ids=np.array(list(position), np.intp),
+        poses=_matrices(np.array(vertices)),
+        edges=pairs,
+        measurements=_matrices(rows[:, :7]),
+        information=information,
+        loop=np.abs(pairs[:, 1] - pairs[:, 0]) != 1,
+    )
+
+
+def write_g2o(path: str | Path, graph: PoseGraph) -> None:
+    """Write a pose graph, every number with all its digits; the same graph, the same bytes.
+
+    Raises
+    ------
+    InputError
+        If a number of the graph is not finite, or its information not positive semidefinite.
+    OutputError
+        If the file can't be written.
+    """
+    for name in ("poses", "measurements", "information"):
+        if not np.isfinite(getattr(graph, name)).all():
+            raise InputError(f"{name} are not all finite", where="pose graph")
+    _check_information(graph.information, None, None)
+    lines = [
+        f"{VERTEX} {vertex} {_text(values)}"
+        for vertex, values in zip(graph.ids, _vectors(graph.poses), strict=True)
+    ]
+    upper = graph.information[:, _UPPER[0], _UPPER[1]]
+    values = np.concatenate([_vectors(graph.measurements), upper], axis=1)
+    ends = graph.ids[graph.edges]
+    lines += [f"{EDGE} {i} {j} {_text(row)}" for (i, j), row in zip(ends, values, strict=True)]
+    path = Path(path)
+    beside = path.with_name(f"{path.name}.part")
+    try:
+        beside.write_bytes("".join(f"{line}\n" for line in lines).encode())
+        os.replace(beside, path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise OutputError(f"can't be written ({error.strerror})", where=path) from error
+
+
+def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[int], list[float]]:
+    if len(words) != 1 + ids + count:
+        raise InputError(
+            f"{words[0]} has {len(words) - 1} numbers, not {ids + count}",
+            where=where,
+            remedy="give the whole line",
+        )
+    try:
+        vertices = [int(word) for word in words[1 : 1 + ids]]
+    except ValueError as error:
+        raise InputError(f"an id is not a whole number ({error})", where=where) from error
+    try:
+        values = [float(word) for word in words[1 + ids :]]
+    except ValueError as error:
+        raise InputError(f"holds something that is no number ({error})", where=where) from error
+    if not np.isfinite(values).all():
+        raise InputError(f"{words[0]} holds a number that is not finite", where=where)
+    length = float(np.linalg.norm(values[3:7]))
+    if abs(length - 1) > _UNIT:
+        raise InputError(
+            f"the quaternion has length {length:.4g}, not 1", where=where, remedy="normalise it"
+        )
+    return vertices, values
+
+
+def _check_information(
+    information: Float64, path: Path | None, line_numbers: list[int] | None
+) -> None:
+    eigenvalues = np.linalg.eigvalsh(information)
+    largest = np.abs(eigenvalues).max(axis=1, initial=0)
+    bad = np.flatnonzero((eigenvalues.min(axis=1, initial=0) < -1e-9 * largest) | (largest == 0))
+    if len(bad):
+        place = f"edge {bad[0]}" if line_numbers is None else f"{path}, line {line_numbers[bad[0]]}"
+        raise InputError(
+            "the information matrix is not positive",
+            where=place,
+            remedy="give the 21 numbers of its upper triangle, row by row, with none negative "
+            "along the diagonal",
+        )
+
+
+def _matrices(values: Float64) -> Float64:
+    T = np.zeros((len(values), 4, 4))
+    T[:, :3, :3] = quaternion.to_matrix(values[:, 3:7])
+    T[:, :3, 3] = values[:, :3]
+    T[:, 3, 3] = 1
+    return T
+
+
+def _vectors(T: Float64) -> Float64:
+    return np.concatenate([T[:, :3, 3], quaternion.from_matrix(T[:, :3, :3])], axis=1)
+
+
+def _text(values: Float64) -> str:
+    # Adding zero turns -0.0 into 0.0; repr gives the fewest digits that read back the same.
+    return " ".join(repr(float(value) + 0.0) for value in values)

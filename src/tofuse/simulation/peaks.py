@@ -1,0 +1,85 @@
+"""The synthetic case of the thesis (4.1.6): MATLAB's `peaks`, seen by 20 cameras on a circle."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.geometry import se3
+from tofuse.recordings.frames import CloudFrame
+
+Float64 = NDArray[np.float64]
+
+CAMERAS = 20
+RADIUS_M = 10.0
+GRID = 71
+POINTS = 5000
+POINTS_PER_VIEW = 2500
+
+
+def peaks(x: ArrayLike, y: ArrayLike) -> Float64:
+    """MATLAB's `peaks` function: a sum of three scaled and shifted Gaussians."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    return (
+        3 * (1 - x) ** 2 * np.exp(-(x**2) - (y + 1) ** 2)
+        - 10 * (x / 5 - x**3 - y**5) * np.exp(-(x**2) - y**2)
+        - np.exp(-((x + 1) ** 2) - y**2) / 3
+    )
+
+
+def peaks_points() -> Float64:
+    """(5000, 3) noise-free points in m, as (x, height, y).
+
+    The first 5000 points, in row-major order (x fastest), of a 71 x 71 grid on [-3, 3]^2.
+    """
+    side = np.linspace(-3, 3, GRID)
+    x, y = np.meshgrid(side, side)
+    return np.stack([x, peaks(x, y), y], -1).reshape(-1, 3)[:POINTS]
+
+
+def peaks_cameras() -> Float64:
+    """(20, 4, 4) T_object_camera of the cameras, 18 degrees apart, 10 m from the origin.
+
+    Camera k stands at (10 sin a, 0, -10 cos a), a = 18 k degrees, and looks at the origin;
+    the object's second axis (height) is up, so camera axes are x right, y down, z forward.
+    """
+    a = 2 * np.pi * np.arange(CAMERAS) / CAMERAS
+    zero = np.zeros(CAMERAS)
+    position = RADIUS_M * np.stack([np.sin(a), zero, -np.cos(a)], -1)
+    T = np.tile(np.eye(4), (CAMERAS, 1, 1))
+    T[:, :3, 1] = [0, -1, 0]
+    T[:, :3, 2] = -position / RADIUS_M
+    T[:, :3, 0] = np.cross(T[:, :3, 1], T[:, :3, 2])
+    T[:, :3, 3] = position
+    return T
+
+
+def peaks_views(sigma: float, seed: int) -> tuple[list[CloudFrame], Float64]:
+    """Make the 20 noisy views and the true poses.
+
+    Each view holds the 2500 points nearest to its camera, which stands in for occlusion, with
+    fresh Gaussian noise on every coordinate.
+
+    Parameters
+    ----------
+    sigma
+        Standard deviation of the noise in m.
+    seed
+        Draws the noise; two sigmas with the same seed get the same noise, scaled.
+
+    Returns
+    -------
+    views, T_world_camera
+        The views in their cameras' frames, and (20, 4, 4) poses; the first is the identity.
+    """
+    points = peaks_points()
+    T_object_camera = peaks_cameras()
+    views = []
+    for k, T in enumerate(T_object_camera):
+        distance = np.linalg.norm(points - T[:3, 3], axis=1)
+        nearest = np.sort(np.argsort(distance, kind="stable")[:POINTS_PER_VIEW])
+        seen = se3.transform(se3.inverse(T), points[nearest])
+        noise = np.random.default_rng([seed, k]).normal(size=seen.shape)
+        cloud = (seen + sigma * noise).astype(np.float32)
+        views.append(CloudFrame(k, float(k), cloud))
+    return views, se3.inverse(T_object_camera[0]) @ T_object_camera
