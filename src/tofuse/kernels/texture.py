@@ -1,0 +1,168 @@
+"""Procedural albedo, evaluated at points on surfaces: continuous, and the same for one seed.
+
+Noise is value noise on a lattice (Perlin 1985, with values instead of gradients): band-limited
+by its finest octave, so that a camera's pixels can resolve it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+
+PLAIN, NOISE, WOOD, TILES, PRINT, SPECKLE = 0, 1, 2, 3, 4, 5
+
+# Columns of a row of texture parameters.
+ALBEDO, CONTRAST, SCALE, KIND, GLOSS, SHIFT, COLUMNS = 0, 1, 2, 5, 6, 7, 10
+LATTICE = 256
+
+
+@kernel
+def value_noise(table: Float64, x: float, y: float, z: float) -> float:
+    """Smooth noise of unit variance at the lattice points, cell size 1, period 256 cells.
+
+    `table` holds (2, 256) values: a permutation of 0 to 255, and the noise.
+    """
+    fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+    ux, uy, uz = x - fx, y - fy, z - fz
+    wx = ux * ux * (3.0 - 2.0 * ux)
+    wy = uy * uy * (3.0 - 2.0 * uy)
+    wz = uz * uz * (3.0 - 2.0 * uz)
+    x0, y0, z0 = int(fx) & 255, int(fy) & 255, int(fz) & 255
+    total = 0.0
+    for a in range(2):
+        pa = int(table[0, (x0 + a) & 255])
+        sa = wx if a else 1.0 - wx
+        for b in range(2):
+            pb = int(table[0, (pa + y0 + b) & 255])
+            sb = sa * (wy if b else 1.0 - wy)
+            p0 = int(table[0, (pb + z0) & 255])
+            p1 = int(table[0, (pb + z0 + 1) & 255])
+            total += sb * (table[1, p0] * (1.0 - wz) + table[1, p1] * wz)
+    return total
+
+
+@kernel
+def fractal_noise(table: Float64, x: float, y: float, z: float) -> float:
+    """Three octaves of `value_noise`, near unit variance on the average over a surface."""
+    total = value_noise(table, x, y, z)
+    total += 0.7 * value_noise(table, 2.13 * x + 31.7, 2.13 * y + 11.3, 2.13 * z + 47.1)
+    total += 0.5 * value_noise(table, 4.31 * x + 7.9, 4.31 * y + 53.9, 4.31 * z + 19.3)
+    return 1.3 * total
+
+
+@kernel
+def pattern_at(table: Float64, row: Float64, x: float, y: float, z: float) -> float:
+    """Pattern of one surface at a point of its body: mean near 0, standard deviation near 1."""
+    kind = int(row[KIND])
+    if kind == PLAIN:
+        return 0.0
+    u = (x + row[SHIFT]) / row[SCALE]
+    v = (y + row[SHIFT + 1]) / row[SCALE + 1]
+    w = (z + row[SHIFT + 2]) / row[SCALE + 2]
+    if kind == WOOD:
+        warp = value_noise(table, 0.4 * u, 0.4 * v, 0.4 * w)
+        return 0.9 * np.sin(6.2831853 * (u + v + w) * 0.35 + 4.0 * warp) + 0.7 * value_noise(
+            table, u, v, w
+        )
+    if kind == TILES:
+        # Joints between square tiles, with soft edges, and a tone for each tile.
+        joint = 0.0
+        tone = 0.0
+        for k in range(3):
+            q = u if k == 0 else (v if k == 1 else w)
+            away = abs(q - np.floor(q) - 0.5)
+            s = min(max((away - 0.44) / 0.04, 0.0), 1.0)
+            joint = max(joint, s * s * (3.0 - 2.0 * s))
+        tone = table[1, (int(np.floor(u)) * 7 + int(np.floor(v)) * 57 + int(np.floor(w))) & 255]
+        return (0.6 * tone + 0.3) * (1.0 - joint) - 2.0 * joint
+    if kind == PRINT:
+        return 1.1 * np.tanh(2.2 * fractal_noise(table, u, v, w))
+    if kind == SPECKLE:
+        fine = value_noise(table, u, v, w)
+        return 1.6 * fine + 0.8 * value_noise(table, 0.23 * u, 0.23 * v, 0.23 * w)
+    return fractal_noise(table, u, v, w)
+
+
+@kernel
+def shade_hits(
+    corner_normals: Float64,
+    face_normals: Float64,
+    face_surface: Int32,
+    rows: Float64,
+    table: Float64,
+    origins: Float64,
+    directions: Float64,
+    rotation: Float64,
+    distance: Float64,
+    face: Int32,
+    weights: Float64,
+    normal: Float32,
+    albedo: Float32,
+    gloss: Float32,
+    surface: Int32,
+) -> None:
+    """Fill in what each ray hit, where `face` is not negative.
+
+    Parameters
+    ----------
+    corner_normals (F, 9), face_normals (F, 3), face_surface (F,)
+        Of the body's triangles, in the order of the leaves.
+    rows (S, 10)
+        Texture parameters of every surface; `table` (2, 256) as in `value_noise`.
+    origins (1 or N, 3), directions (N, 3)
+        Rays in the body's frame.
+    rotation (3, 3)
+        Turns directions of the body's frame into the room's.
+    distance (N,), face (N,), weights (N, 2)
+        From `cast_rays`.
+    normal (N, 3), albedo (N,), gloss (N,), surface (N,)
+        Written. Normals are in the room's frame and face the origin of the ray.
+    """
+    shared = origins.shape[0] == 1
+    n = np.empty(3)
+    for i in range(directions.shape[0]):
+        f = face[i]
+        if f < 0:
+            continue
+        j = 0 if shared else i
+        v, w = weights[i, 0], weights[i, 1]
+        u = 1.0 - v - w
+        flat = 0.0
+        smooth = 0.0
+        norm = 0.0
+        for k in range(3):
+            n[k] = (
+                u * corner_normals[f, k]
+                + v * corner_normals[f, 3 + k]
+                + w * corner_normals[f, 6 + k]
+            )
+            norm += n[k] * n[k]
+            flat += face_normals[f, k] * directions[i, k]
+            smooth += n[k] * directions[i, k]
+        norm = np.sqrt(norm)
+        sign = -1.0 if flat > 0.0 else 1.0
+        # A normal blended between corners may turn away from the ray at a silhouette.
+        if norm < 1e-6 or sign * smooth >= 0.0:
+            norm = 1.0
+            for k in range(3):
+                n[k] = face_normals[f, k]
+        for k in range(3):
+            total = rotation[k, 0] * n[0] + rotation[k, 1] * n[1] + rotation[k, 2] * n[2]
+            normal[i, k] = sign * total / norm
+        s = face_surface[f]
+        surface[i] = s
+        gloss[i] = rows[s, GLOSS]
+        value = rows[s, ALBEDO]
+        if rows[s, CONTRAST] > 0.0:
+            x = origins[j, 0] + distance[i] * directions[i, 0]
+            y = origins[j, 1] + distance[i] * directions[i, 1]
+            z = origins[j, 2] + distance[i] * directions[i, 2]
+            p = min(max(pattern_at(table, rows[s], x, y, z), -2.5), 2.5)
+            value = min(max(value * (1.0 + rows[s, CONTRAST] * p), 0.02), 0.98)
+        albedo[i] = value

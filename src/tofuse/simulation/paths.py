@@ -1,0 +1,93 @@
+"""How cameras and objects move: poses as functions of time, without jumps in velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.geometry import se3
+
+Float64 = NDArray[np.float64]
+Path = Callable[[float], Float64]
+
+
+def look_at(position: ArrayLike, target: ArrayLike) -> Float64:
+    """T_room_camera (4, 4) of a camera at `position` facing `target`, in a room with z up."""
+    p = np.asarray(position, float)
+    z = np.asarray(target, float) - p
+    z = z / np.linalg.norm(z)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x = x / np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    T[:3, 3] = p
+    return T
+
+
+def still(T: Float64) -> Path:
+    """Stay where one is."""
+    return lambda _t: T.copy()
+
+
+def turn_angle(t: float, seconds: float, unevenness: float = 0.02) -> float:
+    """Angle in rad of a full turn by hand in `seconds`: exactly 2 pi then, nearly even between.
+
+    `unevenness` is the largest share by which the speed differs from the mean. The angle carries
+    on before 0 and after the end.
+    """
+    u = t / seconds
+    return float(2 * np.pi * u + unevenness / 3 * np.sin(3 * 2 * np.pi * u))
+
+
+def camera_turn(T_room_camera: Float64, seconds: float, axis_offset_m: float = 0.0) -> Path:
+    """Turn the camera about its own vertical (y) axis, to the right.
+
+    `axis_offset_m` is how far the optical centre sits in front of the axis of the stand.
+    """
+    arm = np.eye(4)
+    arm[2, 3] = axis_offset_m
+    stand = T_room_camera @ se3.inverse(arm)
+
+    def path(t: float) -> Float64:
+        return stand @ rotation([0, turn_angle(t, seconds), 0]) @ arm
+
+    return path
+
+
+def object_turn(seconds: float) -> Path:
+    """Turn an object about the z axis of its frame, which stands in the room's origin."""
+    return lambda t: rotation([0, 0, turn_angle(t, seconds)])
+
+
+def rotation(w: ArrayLike) -> Float64:
+    """Motion (4, 4) that turns by a rotation vector in rad."""
+    return se3.exp(np.concatenate([np.zeros(3), np.asarray(w, float)]))
+
+
+def smooth_step(u: float) -> float:
+    """From 0 at u = 0 to 1 at u = 1 with minimal jerk: how a hand moves a thing."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0))
+
+
+def there_and_back(
+    T_room_camera: Float64, length_m: float, seconds: float, outward_share: float = 0.38
+) -> Path:
+    """Slide along the camera's +x axis by `length_m` and back again, faster on the way out."""
+    out = outward_share * seconds
+
+    def path(t: float) -> Float64:
+        share = smooth_step(t / out) - smooth_step((t - out) / (seconds - out))
+        step = np.eye(4)
+        step[0, 3] = length_m * share
+        return T_room_camera @ step
+
+    return path
+
+
+def sway(T_room_camera: Float64, twist: ArrayLike, seconds: float) -> Path:
+    """Move along a twist (tx ty tz rx ry rz) and back within `seconds`, as a sine."""
+    xi = np.asarray(twist, float)
+    return lambda t: T_room_camera @ se3.exp(xi * (0.5 - 0.5 * np.cos(2 * np.pi * t / seconds)))

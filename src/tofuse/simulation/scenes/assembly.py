@@ -1,0 +1,46 @@
+"""Putting meshes and materials together, and what several scenes share."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.simulation import mesh as meshes
+from tofuse.simulation.mesh import Mesh
+from tofuse.simulation.texture import Material
+
+Float64 = NDArray[np.float64]
+
+
+class Assembly:
+    """Collects parts, each of one material."""
+
+    def __init__(self, materials: list[Material]) -> None:
+        self.materials = materials
+        self._parts: list[Mesh] = []
+
+    def add(self, material: Material, *parts: Mesh) -> None:
+        """Add parts made of a material."""
+        if material not in self.materials:
+            self.materials.append(material)
+        surface = self.materials.index(material)
+        self._parts.extend(part.of_surface(surface) for part in parts)
+
+    def mesh(self) -> Mesh:
+        """Return everything added so far."""
+        return meshes.joined(self._parts)
+
+
+def shell(
+    assembly: Assembly,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    walls: list[Material],
+    floor: Material,
+    ceiling: Material,
+) -> None:
+    """Add a closed room between two corners; walls in the order -x, +x, -y, +y."""
+    hull = meshes.inside_out(meshes.box_between(low, high))
+    # The order of the faces of `box`: -z, +z, -y, +y, -x, +x, two triangles each.
+    for k, material in enumerate([floor, ceiling, walls[2], walls[3], walls[0], walls[1]]):
+        assembly.add(material, Mesh(hull.vertices, hull.faces[2 * k : 2 * k + 2], hull.surface[:2]))

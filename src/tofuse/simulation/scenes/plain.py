@@ -1,0 +1,33 @@
+"""Small scenes: a wall, a corner, a corridor."""
+
+from __future__ import annotations
+
+from tofuse.simulation import mesh as meshes
+from tofuse.simulation import paths
+from tofuse.simulation.scene import Plan, SceneOptions
+from tofuse.simulation.scenes.assembly import Assembly, shell
+from tofuse.simulation.texture import Material
+
+WALL = Material("wall", 0.65, 0.2, "noise", (0.5, 0.5, 0.5))
+SIDE = Material("side wall", 0.7, 0.15, "print", (0.4, 0.4, 0.4))
+FLOOR = Material("floor", 0.4, 0.2, "speckle", (0.1, 0.1, 0.1))
+CEILING = Material("ceiling", 0.75, 0.05, "tiles", (0.6, 0.6, 0.6))
+
+
+def plan(options: SceneOptions) -> Plan:
+    """Lay out one of the small scenes."""
+    assembly = Assembly([])
+    camera = paths.look_at((0, 0, 1.2), (0, 1, 1.2))
+    if options.name == "wall":
+        assembly.add(WALL, meshes.quad((-6, 2, -4), (12, 0, 0), (0, 0, 10)))
+        path = paths.sway(camera, (0.3, 0.05, 0.1, 0.02, 0.08, 0.0), options.seconds)
+    elif options.name == "corner":
+        assembly.add(WALL, meshes.quad((-4, 3, 0), (4.8, 0, 0), (0, 0, 4)))
+        assembly.add(SIDE, meshes.quad((0.8, 3, 0), (0, -6, 0), (0, 0, 4)))
+        assembly.add(FLOOR, meshes.quad((-4, 3, 0), (0, -6, 0), (4.8, 0, 0)))
+        camera = paths.look_at((0, 0.6, 1.2), (0.4, 3, 0.4))
+        path = paths.sway(camera, (0.2, 0.1, 0.2, 0.05, 0.12, 0.03), options.seconds)
+    else:
+        shell(assembly, (-1, -2, 0), (1, 10, 2.4), [SIDE, SIDE, WALL, WALL], FLOOR, CEILING)
+        path = paths.sway(camera, (0.0, 0.0, 1.5, 0.0, 0.1, 0.0), 2 * options.seconds)
+    return Plan(assembly.materials, assembly.mesh(), path)
