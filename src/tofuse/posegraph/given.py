@@ -1,0 +1,101 @@
+"""Loops that a person gives by hand, in a text file."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry import quaternion
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.loops import LoopEdge, reversed_edge
+
+Float64 = NDArray[np.float64]
+
+# A measurement given by hand is taken to be good to 1 cm and 0.01 rad (about half a degree).
+GIVEN_INFORMATION = np.diag([1e4] * 6)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenLoop:
+    """Frames i and j (indices, i < j) see the same place; T_i_j is None where not given."""
+
+    i: int
+    j: int
+    T_i_j: Float64 | None = None
+
+    def edge(self) -> tuple[LoopRecord, LoopEdge] | None:
+        """Return the record and edge of a loop that came with its motion, None otherwise."""
+        if self.T_i_j is None:
+            return None
+        record = LoopRecord(self.i, self.j, True, "given with its motion")
+        return record, LoopEdge(self.i, self.j, self.T_i_j, GIVEN_INFORMATION)
+
+
+def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[GivenLoop]:
+    """Read lines of ``i j`` or ``i j tx ty tz qx qy qz qw`` (the measured T_i_j, m).
+
+    ``#`` starts a comment. `frames` are the indices that exist, if they are to be checked.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, and, with the line's number, for anything else in a line, a
+        frame that doesn't exist, a frame joined to itself, a pair given twice.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(
+            f"can't be read ({error.strerror})", where=path, remedy="check --loops"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError("is not a text file", where=path, remedy="check --loops") from error
+    loops: dict[tuple[int, int], GivenLoop] = {}
+    for number, line in enumerate(lines, start=1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        where = f"{path}, line {number}"
+        loop = _loop(words, where)
+        for index in (loop.i, loop.j):
+            if frames is not None and index not in frames:
+                raise InputError(
+                    f"there is no frame {index}", where=where, remedy="give indices of frames"
+                )
+        if (loop.i, loop.j) in loops:
+            raise InputError(f"the loop {loop.i} {loop.j} is given twice", where=where)
+        loops[loop.i, loop.j] = loop
+    return list(loops.values())
+
+
+def _loop(words: list[str], where: str) -> GivenLoop:
+    form = "write 'i j' or 'i j tx ty tz qx qy qz qw'"
+    if len(words) not in (2, 9):
+        raise InputError(f"has {len(words)} values", where=where, remedy=form)
+    try:
+        i, j = (int(word) for word in words[:2])
+        values = np.array([float(word) for word in words[2:]])
+    except ValueError as error:
+        raise InputError(f"is not understood ({error})", where=where, remedy=form) from error
+    if i < 0 or j < 0 or i == j:
+        raise InputError(f"joins frames {i} and {j}", where=where, remedy="give two frames")
+    if len(values) == 0:
+        return GivenLoop(min(i, j), max(i, j))
+    length = float(np.linalg.norm(values[3:]))
+    if not np.isfinite(values).all() or abs(length - 1) > 1e-2:
+        raise InputError(
+            "is no rigid motion",
+            where=where,
+            remedy="give finite numbers and a quaternion qx qy qz qw of length 1",
+        )
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = quaternion.to_matrix(values[3:]), values[:3]
+    edge = LoopEdge(i, j, T, GIVEN_INFORMATION)
+    edge = edge if i < j else reversed_edge(edge)
+    return GivenLoop(edge.i, edge.j, edge.T_i_j)
