@@ -56,7 +56,11 @@ class Odometry(Protocol):
     """A method that turns frames into poses, one at a time."""
 
     part_kind: ClassVar[str] = "odometry"
-    takes: ClassVar[frozenset[str]]
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view it works on: "range", "cloud"."""
+        ...
 
     def start(self, seed: int) -> Tracker:
         """Begin a new recording."""

@@ -63,7 +63,11 @@ class Registrar(Protocol):
     """A method that registers one pair of views."""
 
     part_kind: ClassVar[str] = "registration"
-    takes: ClassVar[frozenset[str]]
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view it works on: "range", "cloud"."""
+        ...
 
     def register(
         self,

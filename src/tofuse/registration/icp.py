@@ -1,0 +1,173 @@
+"""The Iterative Closest Point algorithm (Besl and McKay 1992), put together from parts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.kernels.icp import transform_points
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.interfaces import (
+    Alignment,
+    Float64,
+    History,
+    Matcher,
+    Metric,
+    Points,
+    Rejector,
+    Selector,
+    Stopping,
+)
+from tofuse.registration.matchers import ClosestPoint
+from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.rejectors import MaxDistance, Unique
+from tofuse.registration.selectors import All, Random
+from tofuse.registration.stopping import TwoLoops
+
+_FEWEST_POINTS = 3
+
+
+@part("registration", "icp", label="validated")
+@dataclass(frozen=True)
+class Icp(Registrar):
+    """ICP: match, reject, move, until the stopping rule is met.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points in m (res of the thesis). Distances and the
+        error E are measured by it.
+    source, target
+        Choose the points of each view, once for all iterations; the source's are drawn first.
+    matcher
+        Pairs points.
+    rejectors
+        Drop pairs, in this order.
+    metric
+        Turns pairs into a motion.
+    stopping
+        Ends the iterations.
+    """
+
+    resolution: float = 0.01
+    source: Selector = field(default_factory=Random)
+    target: Selector = field(default_factory=Random)
+    matcher: Matcher = field(default_factory=ClosestPoint)
+    rejectors: tuple[Rejector, ...] = (MaxDistance(), Unique())
+    metric: Metric = field(default_factory=PointToPoint)
+    stopping: Stopping = field(default_factory=TwoLoops)
+
+    def __post_init__(self) -> None:
+        if not (self.resolution > 0 and math.isfinite(self.resolution)):
+            raise ValueError(f"resolution is {self.resolution}, not a length in metres")
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view it works on: those of its matcher."""
+        return self.matcher.takes
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """Register `source` into the frame of `target`, starting from `guess` (T_target_source).
+
+        Number of correspondences, E and rms are those of the last matching, just before the last
+        motion. If the iterations run out before the stopping rule is met, the result is the
+        estimate so far with `converged` False.
+
+        Raises
+        ------
+        RegistrationError
+            If a view has fewer than three points, or if at some iteration the corresponding
+            points fix no motion (for `PointToPoint`: fewer than three, or on a line).
+        """
+        data = self._select(self.source, source, rng)
+        model = self._select(self.target, target, rng)
+        search = self.matcher.prepare(model)
+        reach = min((r.reach(self.resolution) for r in self.rejectors), default=math.inf)
+
+        T = np.array(guess, np.float64)
+        moved = transform_points(T, data.points)
+        history = History()
+        converged = False
+        while not converged and len(history) < self.stopping.max_iterations:
+            alignment = Alignment(data, model, self.resolution, T, moved)
+            matches = search.match(alignment, reach)
+            for rejector in self.rejectors:
+                matches = rejector.reject(matches, alignment)
+            T = self.metric.motion(matches, alignment) @ T
+            moved = transform_points(T, data.points)
+            history.correspondences.append(len(matches))
+            history.errors.append(float(matches.distance.sum()) / (len(data) * self.resolution))
+            converged = self.stopping.met(history)
+
+        T = se3.orthonormalise(T)
+        final = Alignment(data, model, self.resolution, T, moved)
+        return Registration(
+            T_target_source=T,
+            converged=converged,
+            iterations=len(history),
+            correspondences=len(matches),
+            points=len(data),
+            error=history.errors[-1],
+            rms_m=math.sqrt(float((matches.distance**2).mean())),
+            information=self.metric.information(matches, final),
+            errors=tuple(history.errors),
+        )
+
+    @staticmethod
+    def _select(selector: Selector, view: Frame, rng: np.random.Generator) -> Points:
+        chosen = Points.of(view, selector.select(view, rng))
+        if len(chosen) < _FEWEST_POINTS:
+            raise RegistrationError(
+                f"has {len(chosen)} points, {_FEWEST_POINTS} are needed",
+                where=f"frame {view.index}",
+            )
+        return chosen
+
+
+def algorithm_1(
+    resolution: float = 0.01,
+    points: int | None = 1000,
+    epsilon: float = 1e-4,
+    k: int = 3,
+    max_iterations: int = 100,
+) -> Icp:
+    """Return Algorithm 1 of the thesis, "Pairwise ICP" (section 3.2).
+
+    A random subset of `points` of each view (None: all points) is kept through all iterations.
+    Each takes the closest points, drops pairs further apart than 2 res, keeps the shortest where
+    several share a target point, and moves the source by Arun's solution. For the error
+
+        E = sum(d_i) / (n_p res),
+
+    d_i are the distances of the corresponding points and n_p is the number of points of the
+    source that take part.
+
+    Parameters
+    ----------
+    resolution
+        res, m (section 4.1: 0.01; 1 for the synthetic data).
+    points
+        Points of each view (section 3.3: 1000).
+    epsilon, k
+        Stop when E has changed by less than `epsilon` in `k` iterations in a row.
+    max_iterations
+        Of both loops together.
+    """
+    selector: Selector = All() if points is None else Random(points)
+    return Icp(
+        resolution,
+        source=selector,
+        target=selector,
+        matcher=ClosestPoint(),
+        rejectors=(MaxDistance(2.0), Unique()),
+        metric=PointToPoint(),
+        stopping=TwoLoops(epsilon, k, max_iterations),
+    )

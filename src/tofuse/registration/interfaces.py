@@ -1,0 +1,199 @@
+"""The parts of an ICP, and what they hand to each other.
+
+One iteration goes: the *matcher* pairs points, the *rejectors* drop pairs, the error *metric*
+turns the pairs into a motion, the *stopping* rule looks at the history. Before the first, a
+*selector* chooses the points of each view that take part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The points of a view that take part in a registration.
+
+    Attributes
+    ----------
+    view
+        The view; a part that needs normals, sigma or amplitude finds them there.
+    index
+        (n,) positions of the points in ``view.points``.
+    points
+        (n, 3) m, in the view's frame.
+    """
+
+    view: Frame
+    index: Int64
+    points: Float64
+
+    @classmethod
+    def of(cls, view: Frame, index: Int64) -> Self:
+        """Take the points of a view at the positions `index`."""
+        return cls(view, index, view.points[index].astype(np.float64))
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where the source lies in the target's frame, at one moment of a registration.
+
+    Attributes
+    ----------
+    source, target
+        The points that take part.
+    resolution
+        Typical distance between neighbouring points in m (res of the thesis).
+    T_target_source
+        (4, 4) the estimate so far.
+    moved
+        (n, 3) the source's points in the target's frame, m.
+    """
+
+    source: Points
+    target: Points
+    resolution: float
+    T_target_source: Float64
+    moved: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Pairs of corresponding points.
+
+    Attributes
+    ----------
+    source, target
+        (m,) positions in ``Alignment.source.points`` and ``Alignment.target.points``; `source`
+        rises.
+    distance
+        (m,) distance of the points of each pair, m.
+    weight
+        (m,) how much each pair counts; None where all count the same.
+    """
+
+    source: Int64
+    target: Int64
+    distance: Float64
+    weight: Float64 | None = None
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def keep(self, mask: Bool) -> Matches:
+        """Return the pairs of the (m,) mask."""
+        if mask.all():
+            return self
+        weight = None if self.weight is None else self.weight[mask]
+        return Matches(self.source[mask], self.target[mask], self.distance[mask], weight)
+
+    def weights(self) -> Float64:
+        """Return the (m,) weights, ones where none are given."""
+        return np.ones(len(self)) if self.weight is None else self.weight
+
+
+@dataclass
+class History:
+    """What the iterations so far gave: number of correspondences and E, one for each."""
+
+    correspondences: list[int] = field(default_factory=list)
+    errors: list[float] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.errors)
+
+
+class Selector(Protocol):
+    """Chooses the points of a view that take part, once for all iterations (section 2.9.2)."""
+
+    part_kind: ClassVar[str] = "selector"
+
+    def select(self, view: Frame, rng: np.random.Generator) -> Int64:
+        """Return rising positions (n,) in ``view.points``."""
+        ...
+
+
+class Search(Protocol):
+    """A matcher made ready for one target."""
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        """Pair points of the source with points of the target.
+
+        Pairs of points further apart than `reach` (m) will be rejected anyway and may be left out.
+        """
+        ...
+
+
+class Matcher(Protocol):
+    """Finds which point of the target corresponds to a point of the source (section 2.9.3)."""
+
+    part_kind: ClassVar[str] = "matcher"
+    takes: ClassVar[frozenset[str]]
+
+    def prepare(self, target: Points) -> Search:
+        """Do what needs doing once for each target (build a tree, say)."""
+        ...
+
+
+class Rejector(Protocol):
+    """Drops pairs that are likely to be wrong (section 2.9.4)."""
+
+    part_kind: ClassVar[str] = "rejector"
+
+    def reach(self, resolution: float) -> float:
+        """Return the distance in m beyond which it drops every pair; infinity if there is none."""
+        ...
+
+    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+        """Return the pairs that stay, in the same order."""
+        ...
+
+
+class Metric(Protocol):
+    """The error that the motion makes small, and how well it fixes that motion."""
+
+    part_kind: ClassVar[str] = "metric"
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """Return the motion (4, 4), in the target's frame, that aligns the pairs best.
+
+        It is applied from the left: ``T_target_source <- motion @ T_target_source``.
+
+        Raises
+        ------
+        RegistrationError
+            If the pairs don't fix a motion.
+        """
+        ...
+
+    def information(self, matches: Matches, alignment: Alignment) -> Float64:
+        """Return the information (6, 6) of the estimate, as in `Registration.information`."""
+        ...
+
+
+class Stopping(Protocol):
+    """Says when the iterations are over."""
+
+    part_kind: ClassVar[str] = "stopping"
+
+    @property
+    def max_iterations(self) -> int:
+        """Iterations after which it ends in any case."""
+        ...
+
+    def met(self, history: History) -> bool:
+        """Say whether the estimate has converged."""
+        ...

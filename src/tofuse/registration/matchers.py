@@ -1,0 +1,34 @@
+"""Which point of the target corresponds to a point of the source (section 2.9.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.kernels.kdtree import KdTree
+from tofuse.parts import part
+from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, Search
+
+
+@part("matcher", "closest-point", label="validated")
+@dataclass(frozen=True)
+class ClosestPoint(Matcher):
+    """The closest point of the target (Besl and McKay 1992), by a kd-tree (section 2.9.5)."""
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def prepare(self, target: Points) -> Search:
+        """Build the tree, once for all iterations: the target doesn't move."""
+        return _TreeSearch(KdTree(target.points))
+
+
+@dataclass(frozen=True, eq=False)
+class _TreeSearch:
+    tree: KdTree
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        index, distance2 = self.tree.nearest(alignment.moved, reach)
+        source = np.flatnonzero(index >= 0)
+        return Matches(source, index[source], np.sqrt(distance2[source]))

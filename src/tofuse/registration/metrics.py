@@ -1,0 +1,80 @@
+"""The error that a motion makes small (section 2.9.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.errors import RegistrationError
+from tofuse.kernels.icp import point_information, weighted_moments
+from tofuse.parts import part
+from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
+
+# Second singular values this small, relatively, are rounding errors: the points lie on a line.
+_RANK_TOLERANCE = 1e-12
+_ROUNDING = 1e-14
+# Residuals below this share of the resolution say nothing about the true error of the points.
+_SMALLEST_SIGMA = 1e-3
+
+
+@part("metric", "point-to-point", label="validated")
+@dataclass(frozen=True)
+class PointToPoint(Metric):
+    """Sum of squared distances of the pairs, ``sum w_i |m_i - (R d_i + t)|^2`` (eq 2.7).
+
+    The minimum is found in one step (Arun, Huang and Blostein 1987): with the centroids ``m0``,
+    ``d0`` and ``H = sum w_i (d_i - d0) (m_i - m0)^T = U S V^T``,
+
+        R = V diag(1, 1, det(V U^T)) U^T,    t = m0 - R d0.
+
+    The determinant (Umeyama 1991) keeps R from being a reflection, which is otherwise the best
+    fit where points are few, planar or very noisy.
+    """
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`.
+
+        Raises
+        ------
+        RegistrationError
+            If there are fewer than three pairs or their points lie on a line.
+        """
+        if len(matches) < 3:
+            raise RegistrationError(
+                f"only {len(matches)} points of the views correspond, 3 are needed"
+            )
+        d0, m0, H, size = weighted_moments(
+            alignment.moved,
+            alignment.target.points,
+            matches.source,
+            matches.target,
+            matches.weights(),
+        )
+        U, S, Vt = np.linalg.svd(H)
+        if S[1] <= max(_RANK_TOLERANCE * S[0], _ROUNDING * size):
+            raise RegistrationError("the corresponding points lie on a line")
+        if np.linalg.det(U) * np.linalg.det(Vt) < 0:
+            Vt[2] *= -1
+        T = np.eye(4)
+        T[:3, :3] = (U @ Vt).T
+        T[:3, 3] = m0 - T[:3, :3] @ d0
+        return T
+
+    def information(self, matches: Matches, alignment: Alignment) -> Float64:
+        """Return ``sum w J^T J / sigma^2`` with ``J = R [I, -hat(p)]``, p in the source's frame.
+
+        ``J`` is the derivative of ``T exp(xi) p``; R cancels. sigma is estimated from the
+        residuals, ``sigma^2 = sum w |r|^2 / (3 m - 6)`` (m^2, along each axis), and is taken for
+        at least a thousandth of the resolution.
+
+        It speaks of the pairs as if each were the same point of the world seen twice. Closest
+        points are not, so it is optimistic, above all along a surface: a flat wall's looks as well
+        known as any other.
+        """
+        weight = matches.weights()
+        r = alignment.moved[matches.source] - alignment.target.points[matches.target]
+        freedom = max(3 * len(matches) - 6, 1)
+        variance = float((weight[:, None] * r * r).sum()) / freedom
+        variance = max(variance, (_SMALLEST_SIGMA * alignment.resolution) ** 2)
+        return point_information(alignment.source.points, matches.source, weight) / variance

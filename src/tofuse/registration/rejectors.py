@@ -1,0 +1,54 @@
+"""Which pairs of points are likely to be wrong (section 2.9.4)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from tofuse.kernels.icp import shortest_of_each_target
+from tofuse.parts import part
+from tofuse.registration.interfaces import Alignment, Matches, Rejector
+
+
+@part("rejector", "max-distance", label="validated")
+@dataclass(frozen=True)
+class MaxDistance(Rejector):
+    """Drops pairs further apart than ``tau = factor * res`` (section 3.2: 2 res).
+
+    Attributes
+    ----------
+    factor
+        In resolutions.
+    """
+
+    factor: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.factor > 0:
+            raise ValueError(f"factor is {self.factor}, not more than 0")
+
+    def reach(self, resolution: float) -> float:
+        """See `Rejector.reach`."""
+        return self.factor * resolution
+
+    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+        """See `Rejector.reject`."""
+        return matches.keep(matches.distance <= self.reach(alignment.resolution))
+
+
+@part("rejector", "unique", label="validated")
+@dataclass(frozen=True)
+class Unique(Rejector):
+    """Of several pairs with the same target point only the shortest stays (Algorithm 1, line 7).
+
+    Of equally short ones the one with the lowest index in the source stays.
+    """
+
+    def reach(self, resolution: float) -> float:
+        """See `Rejector.reach`."""
+        return math.inf
+
+    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
+        """See `Rejector.reject`."""
+        keep = shortest_of_each_target(matches.target, matches.distance, len(alignment.target))
+        return matches.keep(keep)

@@ -1,0 +1,47 @@
+"""Which points of a view take part (section 2.9.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame
+from tofuse.registration.interfaces import Int64, Selector
+
+
+@part("selector", "all", label="validated")
+@dataclass(frozen=True)
+class All(Selector):
+    """Every valid point."""
+
+    def select(self, view: Frame, rng: np.random.Generator) -> Int64:
+        """See `Selector.select`; draws nothing."""
+        return np.arange(len(view), dtype=np.int64)
+
+
+@part("selector", "random", label="validated")
+@dataclass(frozen=True)
+class Random(Selector):
+    """A random subset, each point as likely as any other (section 3.3).
+
+    Attributes
+    ----------
+    points
+        How many; a view with fewer gives all it has.
+    """
+
+    points: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.points < 1:
+            raise ValueError(f"points is {self.points}, not 1 or more")
+
+    def select(self, view: Frame, rng: np.random.Generator) -> Int64:
+        """See `Selector.select`."""
+        size = len(view)
+        if size <= self.points:
+            return np.arange(size, dtype=np.int64)
+        drawn = rng.choice(size, self.points, replace=False, shuffle=False)
+        return np.sort(drawn.astype(np.int64))

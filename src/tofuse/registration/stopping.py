@@ -1,0 +1,53 @@
+"""When the iterations are over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tofuse.parts import part
+from tofuse.registration.interfaces import History, Stopping
+
+
+@part("stopping", "two-loops", label="validated")
+@dataclass(frozen=True)
+class TwoLoops(Stopping):
+    """The two loops of Algorithm 1.
+
+    The first (lines 1 to 15) runs until the number of corresponding points is the same in two
+    iterations. The second (line 16) goes on until the change of E from one iteration to the next,
+    ``|E_i - E_(i-1)|``, has been below `epsilon` in `k` iterations in a row; its first change is
+    that from the last E of the first loop.
+
+    Attributes
+    ----------
+    epsilon
+        Smallest change of E that counts; E has no unit.
+    k
+        In how many iterations in a row.
+    max_iterations
+        Of both loops together.
+    """
+
+    epsilon: float = 1e-4
+    k: int = 3
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        if not self.epsilon > 0:
+            raise ValueError(f"epsilon is {self.epsilon}, not more than 0")
+        if self.k < 1:
+            raise ValueError(f"k is {self.k}, not 1 or more")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations is {self.max_iterations}, not 1 or more")
+
+    def met(self, history: History) -> bool:
+        """See `Stopping.met`."""
+        counts, errors = history.correspondences, history.errors
+        last = len(errors) - 1
+        first = last - self.k
+        if first < 1 or any(
+            abs(errors[i] - errors[i - 1]) >= self.epsilon for i in range(first + 1, last + 1)
+        ):
+            return False
+        # The first loop must have ended at `first` or before.
+        return any(counts[i] == counts[i - 1] for i in range(1, first + 1))
