@@ -8,11 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tofuse.filters._options import above, whole, within
 from tofuse.filters.base import Bool, Filter
-from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 
@@ -87,14 +86,9 @@ def mean_neighbour_distance(points: NDArray[np.float32], k: int) -> NDArray[np.f
     if n < 2:
         return np.full(n, np.inf)
     k = min(k, n - 1)
-    tree = cKDTree(points)
-
-    def mean(start: int, stop: int) -> NDArray[np.float64]:
-        # The nearest is the point itself, or one at the same place: either way at distance 0.
-        distance, _ = tree.query(points[start:stop], k=k + 1)
-        return distance[:, 1:].mean(1)
-
-    return np.concatenate(run_chunks(mean, n))
+    # The nearest is the point itself, or one at the same place: either way at distance 0.
+    _, squares = KdTree(points).neighbours(points, k + 1)
+    return np.sqrt(squares[:, 1:]).mean(1)
 
 
 def _spread(frame: Frame, keep: Bool) -> Bool:

@@ -1,0 +1,377 @@
+"""Map consistency: how well the range images of a recording agree under given poses.
+
+It needs no truth, so it also tells good poses from bad where the reference is no better than the
+estimate. The definition:
+
+1. Of the frames with a pose at most `frames` are taken, evenly spaced, the first and the last
+   among them.
+2. z images are brought to 320 columns or fewer by taking every second pixel until that holds;
+   pixels outside 0.1 to 12 m don't count.
+3. A normal is the cross product of central differences over +-2 pixels of the raw points, and is
+   unknown where one of the four is invalid or differs from the centre by over 5 % of its depth.
+4. A pair counts if at least 35 % of the valid pixels of each land on a valid pixel of the other
+   with a difference in z under 0.25 m.
+5. The later image's points are compared with the plane at the pixel of the earlier one that they
+   land on. Inliers are those with a normal there and at most 0.10 m from the point there.
+
+The figures are the rms of the inliers' distances from the plane and the share of inliers among
+the points that land on a pixel with a normal, pooled over all pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
+from tofuse.kernels.consistency import agreement_sums, move_points, project_by_lens
+from tofuse.kernels.threads import run_chunks
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import Recording
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+MAX_COLUMNS = 320
+MIN_DEPTH, MAX_DEPTH = 0.1, 12.0  # m
+NORMAL_REACH = 2  # pixels
+NORMAL_JUMP = 0.05  # share of the depth
+MIN_OVERLAP = 0.35  # share of the valid pixels, both ways
+SAME_SURFACE = 0.25  # m
+INLIER_DISTANCE = 0.10  # m
+FRAMES = 100
+
+
+@dataclass(frozen=True)
+class PairAgreement:
+    """How well view j agrees with the earlier view i.
+
+    Attributes
+    ----------
+    i, j
+        Positions of the views in what was given; i < j.
+    overlap
+        The smaller of the two shares of step 4.
+    compared
+        Points of j that land on a pixel of i with a normal.
+    inliers
+        Those of them within 0.10 m of the point there.
+    squares
+        Sum of the inliers' squared distances from the plane, m^2.
+    """
+
+    i: int
+    j: int
+    overlap: float
+    compared: int
+    inliers: int
+    squares: float
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square distance of the inliers from the plane, m; NaN without inliers."""
+        return float(np.sqrt(self.squares / self.inliers)) if self.inliers else np.nan
+
+    @property
+    def inlier_share(self) -> float:
+        """Inliers as a share of the points compared; NaN if there are none."""
+        return self.inliers / self.compared if self.compared else np.nan
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Map consistency of a set of views.
+
+    Attributes
+    ----------
+    rms_m
+        Pooled rms of the inliers' distances from the plane, m; NaN if no pair counts.
+    inlier_share
+        Pooled share of inliers, 0 to 1; NaN if no pair counts.
+    pairs
+        How many pairs of views count.
+    frames
+        How many views were looked at.
+    agreements
+        The pairs that count, in order of (i, j).
+    """
+
+    rms_m: float
+    inlier_share: float
+    pairs: int
+    frames: int
+    agreements: tuple[PairAgreement, ...] = ()
+
+    @classmethod
+    def of(cls, agreements: Sequence[PairAgreement], frames: int) -> Consistency:
+        """Pool the pairs that count of so many views."""
+        compared = sum(p.compared for p in agreements)
+        inliers = sum(p.inliers for p in agreements)
+        squares = sum(p.squares for p in agreements)
+        return cls(
+            float(np.sqrt(squares / inliers)) if inliers else np.nan,
+            inliers / compared if compared else np.nan,
+            len(agreements),
+            frames,
+            tuple(agreements),
+        )
+
+    @classmethod
+    def pooled(cls, parts: Sequence[Consistency]) -> Consistency:
+        """Pool what was found over several sets of views."""
+        return cls.of([p for part in parts for p in part.agreements], sum(p.frames for p in parts))
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """Return the pooled figures as plain data; None where there is nothing to measure."""
+        return {
+            "rms_m": _known(self.rms_m),
+            "inlier_share": _known(self.inlier_share),
+            "pairs": self.pairs,
+            "frames": self.frames,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceImage:
+    """A range image prepared for comparison (steps 2 and 3).
+
+    Attributes
+    ----------
+    camera
+        The camera, at full resolution.
+    step
+        Every how many pixels of the camera one was taken.
+    points
+        (H, W, 3) in m, z = 0 where invalid.
+    normals
+        (H, W, 3) unit normals, 0 where unknown.
+    """
+
+    camera: Camera
+    step: int
+    points: Float64
+    normals: Float32
+
+    @classmethod
+    def of(cls, frame: RangeFrame, depth_unit_m: float | None = None) -> SurfaceImage:
+        """Prepare a frame.
+
+        Parameters
+        ----------
+        depth_unit_m
+            What one count of the recording's depth images is, if known. Depths in single
+            precision are then put back on that grid, so that comparisons with a limit which counts
+            can meet exactly go as they do in double precision.
+        """
+        depth = frame.depth.astype(np.float64)
+        if depth_unit_m:
+            counts = np.rint(depth / depth_unit_m) * depth_unit_m
+            depth = np.where(np.abs(counts - depth) <= 1e-6 * depth, counts, depth)
+        rays = _rays(frame.camera)
+        if frame.depth_kind == "range":
+            depth = depth / np.sqrt((rays * rays).sum(-1) + 1)
+        depth[~((depth >= MIN_DEPTH) & (depth <= MAX_DEPTH))] = 0
+        step = 1
+        while depth.shape[1] // step > MAX_COLUMNS:
+            step *= 2
+        z, rays = depth[::step, ::step], rays[::step, ::step]
+        points = np.empty((*z.shape, 3))
+        points[..., :2] = np.where(z[..., None] > 0, rays * z[..., None], 0)
+        points[..., 2] = z
+        return cls(frame.camera, step, points, _normals(points))
+
+    @cached_property
+    def valid_points(self) -> Float64:
+        """(N, 3) the valid points, row by row."""
+        return self.points[self.points[..., 2] > 0]
+
+    @cached_property
+    def lens(self) -> Float64 | None:
+        """Numbers of the lens for `project_by_lens` at this resolution; None for other cameras."""
+        camera = self.camera
+        if not isinstance(camera, Pinhole):
+            return None
+        model = 0 if type(camera) is Pinhole else 2 if isinstance(camera, Fisheye) else 1
+        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        size = [getattr(camera, name) / self.step for name in ("fx", "fy", "cx", "cy")]
+        bend = [getattr(camera, name, 0.0) for name in names]
+        return np.array([*size, *bend, model, self.reach], float)
+
+    @cached_property
+    def reach(self) -> float:
+        """The largest x^2 + y^2 at z = 1 that a pixel sees, with a margin."""
+        return 1.1 * float(np.nanmax((_rays(self.camera) ** 2).sum(-1)))
+
+    def pixels(self, points: Float64) -> Float64:
+        """Pixels (N, 2) of this resolution that points (N, 3) in the camera frame land on."""
+        out = np.full((len(points), 2), np.nan)
+        if self.lens is not None:
+            project_by_lens(points, self.lens, out)
+            return out
+        # Other cameras project slowly: only what can be in view.
+        x, y, z = points.T
+        seen = (z > 0.05) & (x * x + y * y <= self.reach * z * z)
+        out[seen] = self.camera.project(points[seen]) / self.step
+        return out
+
+
+def pair_agreement(
+    a: SurfaceImage, b: SurfaceImage, T_a_b: Float64, i: int = 0, j: int = 1
+) -> PairAgreement | None:
+    """Compare view b with the earlier view a; None if they overlap too little (step 4)."""
+    forth, compared, inliers, squares = _land(a, b, T_a_b)
+    overlap = forth / max(len(b.valid_points), 1)
+    if overlap < MIN_OVERLAP:
+        return None
+    back, *_ = _land(b, a, se3.inverse(T_a_b))
+    overlap = min(overlap, back / max(len(a.valid_points), 1))
+    if overlap < MIN_OVERLAP:
+        return None
+    return PairAgreement(i, j, overlap, compared, inliers, squares)
+
+
+def agreement(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
+    """Map consistency of prepared views under poses (N, 4, 4) T_world_camera, over all pairs.
+
+    The same on any number of threads; must not be called from inside a chunk of `run_chunks`.
+    """
+    T = np.asarray(poses, float)
+    pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
+
+    def work(start: int, stop: int) -> list[PairAgreement]:
+        found = []
+        for i, j in pairs[start:stop]:
+            pair = pair_agreement(images[i], images[j], se3.inverse(T[i]) @ T[j], i, j)
+            if pair is not None:
+                found.append(pair)
+        return found
+
+    agreements = tuple(p for chunk in run_chunks(work, len(pairs), chunks=64) for p in chunk)
+    return Consistency.of(agreements, len(images))
+
+
+def map_consistency(recording: Recording, poses: ArrayLike, frames: int = FRAMES) -> Consistency:
+    """Map consistency of a recording under poses of its frames.
+
+    Parameters
+    ----------
+    poses
+        (M, 4, 4) T_world_camera of the M frames of the recording, NaN where there is none; see
+        `poses_of_frames` for a trajectory with its own times.
+    frames
+        How many frames to look at, at most.
+
+    Frames that can't be read are left out.
+
+    Raises
+    ------
+    InputError
+        If the recording holds clouds, or the poses are not one for each frame.
+    """
+    T = np.asarray(poses, float)
+    if T.shape != (len(recording), 4, 4):
+        raise InputError(
+            f"have shape {T.shape}, for {len(recording)} frames",
+            where="poses",
+            remedy="give one each",
+        )
+    if frames < 1:
+        raise InputError(f"is {frames}", where="frames", remedy="give 1 or more")
+    unit = recording.metadata.get("depth_unit_m")
+    chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), frames)
+    images, used = [], []
+    for k in chosen:
+        try:
+            frame = recording[int(k)]
+        except UnreadableFrameError:
+            continue
+        if not isinstance(frame, RangeFrame):
+            raise InputError(
+                "holds clouds, and map consistency compares images",
+                where=recording.path,
+                remedy="leave --recording out",
+            )
+        images.append(SurfaceImage.of(frame, unit))
+        used.append(int(k))
+    return agreement(images, T[used])
+
+
+def consistency(frames: Sequence[RangeFrame], poses: ArrayLike, limit: int = 60) -> Consistency:
+    """Map consistency of frames in memory under their poses (N, 4, 4) T_world_camera.
+
+    Looks at no more than `limit` of them, evenly spaced. Frames without a pose (NaN) don't count.
+    """
+    T = np.asarray(poses, float)
+    chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), limit)
+    return agreement([SurfaceImage.of(frames[k]) for k in chosen], T[chosen])
+
+
+def evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Choose at most `count` of the items, evenly spaced, the first and last among them."""
+    if len(items) == 0:
+        return items
+    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round()
+    return items[np.unique(positions.astype(np.intp))]
+
+
+def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -> Float64:
+    """Give each pose (P, 4, 4) to the frame nearest in time, if that is within 0.02 s.
+
+    Returns (M, 4, 4), NaN for the frames at `times` (M,) without a pose. Of several poses for one
+    frame the last is taken.
+    """
+    times, pose_times = np.asarray(times, float), np.asarray(pose_times, float)
+    out = np.full((len(times), 4, 4), np.nan)
+    if len(times) == 0:
+        return out
+    for time, T in zip(pose_times, np.asarray(poses, float), strict=True):
+        k = int(np.abs(times - time).argmin())
+        if abs(times[k] - time) < 0.02:
+            out[k] = T
+    return out
+
+
+def _land(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
+    """Compare b's points, in a's frame, with the pixels of a that they land on."""
+    moved = np.empty_like(b.valid_points)
+    move_points(b.valid_points, np.ascontiguousarray(T_a_b), moved)
+    return agreement_sums(
+        moved, a.pixels(moved), a.points, a.normals, SAME_SURFACE, INLIER_DISTANCE
+    )
+
+
+def _rays(camera: Camera) -> Float64:
+    """(H, W, 2) rays in double precision: exact for a pinhole, whose table is rounded."""
+    if type(camera) is Pinhole:
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
+        return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
+    return camera.rays().astype(np.float64)
+
+
+def _normals(points: Float64) -> Float32:
+    k = NORMAL_REACH
+    out = np.zeros(points.shape, np.float32)
+    if min(points.shape[:2]) <= 2 * k:
+        return out
+    centre = points[k:-k, k:-k, 2]
+    sides = [points[k:-k, 2 * k :], points[k:-k, : -2 * k], points[2 * k :, k:-k]]
+    sides.append(points[: -2 * k, k:-k])
+    known = centre > 0
+    for side in sides:
+        z = side[..., 2]
+        known &= (z > 0) & (np.abs(z - centre) <= NORMAL_JUMP * centre)
+    normal = np.cross(sides[0] - sides[1], sides[2] - sides[3])
+    length = np.linalg.norm(normal, axis=-1)
+    known &= length > 0
+    out[k:-k, k:-k][known] = normal[known] / np.maximum(length[known], 1e-12)[:, None]
+    return out
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
