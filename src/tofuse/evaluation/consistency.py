@@ -302,7 +302,9 @@ def map_consistency(recording: Recording, poses: ArrayLike, frames: int = FRAMES
     return agreement(images, T[used])
 
 
-def consistency(frames: Sequence[RangeFrame], poses: ArrayLike, limit: int = 60) -> Consistency:
+def consistency_of_frames(
+    frames: Sequence[RangeFrame], poses: ArrayLike, limit: int = 60
+) -> Consistency:
     """Map consistency of frames in memory under their poses (N, 4, 4) T_world_camera.
 
     Looks at no more than `limit` of them, evenly spaced. Frames without a pose (NaN) don't count.
