@@ -38,26 +38,25 @@ def graph_of(steps: Mapping[int, Step], loops: Sequence[LoopEdge] = ()) -> PoseG
     InputError
         If a step or loop refers to a frame without a pose.
     """
-    placed = {k: s for k, s in steps.items() if s.T_world_camera is not None}
-    position = {index: k for k, index in enumerate(placed)}
-    poses = [step.T_world_camera for step in placed.values()]
+    poses = {k: s.T_world_camera for k, s in steps.items() if s.T_world_camera is not None}
     edges: list[LoopEdge] = []
-    for index, step in placed.items():
+    for index, pose in poses.items():
+        step = steps[index]
         if step.reference is None:
             continue
-        _check(step.reference, position, f"frame {index} was registered to")
+        _check(step.reference, poses, f"frame {index} was registered to")
         if step.registration is None:
-            T = se3.inverse(poses[position[step.reference]]) @ poses[position[index]]
+            T = se3.inverse(poses[step.reference]) @ pose
             edges.append(LoopEdge(step.reference, index, T, PREDICTED_INFORMATION))
         else:
             r = step.registration
             edges.append(LoopEdge(step.reference, index, r.T_target_source, r.information))
     for loop in loops:
         for index in (loop.i, loop.j):
-            _check(index, position, f"the loop {loop.i} {loop.j} names")
+            _check(index, poses, f"the loop {loop.i} {loop.j} names")
     return _graph(
-        np.array(list(placed), np.intp),
-        np.array(poses, float).reshape(-1, 4, 4),
+        np.array(list(poses), np.intp),
+        np.array(list(poses.values()), float).reshape(-1, 4, 4),
         [*edges, *loops],
         len(edges),
     )
@@ -85,8 +84,8 @@ def accumulate(relative: Float64) -> Float64:
     return poses
 
 
-def _check(index: int, position: Mapping[int, int], what: str) -> None:
-    if index not in position:
+def _check(index: int, poses: Mapping[int, Float64], what: str) -> None:
+    if index not in poses:
         raise InputError(f"{what} frame {index}, which has no pose", where="pose graph")
 
 

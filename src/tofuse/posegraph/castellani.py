@@ -25,7 +25,7 @@ from scipy.sparse.linalg import splu
 from tofuse.errors import InputError
 from tofuse.geometry import quaternion, se3
 from tofuse.parts import part
-from tofuse.posegraph.graph import Optimisation, PoseGraph
+from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -132,7 +132,7 @@ def normalisation_factors(
 
 @part("optimiser", "castellani", label="validated")
 @dataclass(frozen=True)
-class Castellani:
+class Castellani(Optimiser):
     """Spread the error of the loops evenly over all edges (eq 2.10).
 
     The search starts from the poses in the graph. The first vertex stays where it is. Where the

@@ -8,13 +8,14 @@ as GTSAM does (g2o itself means the quaternion's vector part, half as large).
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.errors import InputError, OutputError
+from tofuse.errors import InputError
+from tofuse.files.atomic import replacing
+from tofuse.files.reading import read_text
 from tofuse.geometry import quaternion
 from tofuse.posegraph.graph import PoseGraph
 
@@ -43,15 +44,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
         unit, information that is not positive semidefinite (or is all zero), a vertex given
         twice, an edge to a missing vertex or to itself.
     """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(
-            f"can't be read ({error.strerror})", where=path, remedy="check the path"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=path, remedy="give a .g2o file") from error
+    lines = read_text(path).splitlines()
     position: dict[int, int] = {}
     vertices: list[list[float]] = []
     ends: list[tuple[int, int]] = []
@@ -126,14 +119,8 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     values = np.concatenate([_vectors(graph.measurements), upper], axis=1)
     ends = graph.ids[graph.edges]
     lines += [f"{EDGE} {i} {j} {_text(row)}" for (i, j), row in zip(ends, values, strict=True)]
-    path = Path(path)
-    beside = path.with_name(f"{path.name}.part")
-    try:
-        beside.write_bytes("".join(f"{line}\n" for line in lines).encode())
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OutputError(f"can't be written ({error.strerror})", where=path) from error
+    with replacing(path) as temporary:
+        temporary.write_bytes("".join(f"{line}\n" for line in lines).encode())
 
 
 def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[int], list[float]]:
@@ -162,7 +149,7 @@ def _numbers(words: list[str], ids: int, count: int, where: str) -> tuple[list[i
 
 
 def _check_information(
-    information: Float64, path: Path | None, line_numbers: list[int] | None
+    information: Float64, path: str | Path | None, line_numbers: list[int] | None
 ) -> None:
     eigenvalues = np.linalg.eigvalsh(information)
     largest = np.abs(eigenvalues).max(axis=1, initial=0)

@@ -10,14 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.geometry import quaternion
+from tofuse.files.reading import read_text
+from tofuse.geometry import quaternion, se3
 from tofuse.posegraph.graph import LoopRecord
-from tofuse.posegraph.loops import LoopEdge, reversed_edge
+from tofuse.posegraph.loops import LoopEdge
 
 Float64 = NDArray[np.float64]
 
 # A measurement given by hand is taken to be good to 1 cm and 0.01 rad (about half a degree).
 GIVEN_INFORMATION = np.diag([1e4] * 6)
+
+_UNIT = 1e-2  # how far a quaternion written with few digits may be from length 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,17 +50,8 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
         If the file can't be read, and, with the line's number, for anything else in a line, a
         frame that doesn't exist, a frame joined to itself, a pair given twice.
     """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(
-            f"can't be read ({error.strerror})", where=path, remedy="check --loops"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError("is not a text file", where=path, remedy="check --loops") from error
     loops: dict[tuple[int, int], GivenLoop] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue
@@ -87,8 +81,7 @@ def _loop(words: list[str], where: str) -> GivenLoop:
         raise InputError(f"joins frames {i} and {j}", where=where, remedy="give two frames")
     if len(values) == 0:
         return GivenLoop(min(i, j), max(i, j))
-    length = float(np.linalg.norm(values[3:]))
-    if not np.isfinite(values).all() or abs(length - 1) > 1e-2:
+    if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > _UNIT:
         raise InputError(
             "is no rigid motion",
             where=where,
@@ -96,6 +89,4 @@ def _loop(words: list[str], where: str) -> GivenLoop:
         )
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = quaternion.to_matrix(values[3:]), values[:3]
-    edge = LoopEdge(i, j, T, GIVEN_INFORMATION)
-    edge = edge if i < j else reversed_edge(edge)
-    return GivenLoop(edge.i, edge.j, edge.T_i_j)
+    return GivenLoop(i, j, T) if i < j else GivenLoop(j, i, se3.inverse(T))

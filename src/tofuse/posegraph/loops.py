@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -17,6 +17,9 @@ from tofuse.registration.base import Registrar, Registration
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
+
+# Keeps the draws of loops apart from those of other stages that register the same pair.
+SEED_STAGE = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +42,16 @@ class Confirmation:
     Attributes
     ----------
     max_error
-        Largest E of Algorithm 1, in units of its resolution.
+        Largest E of Algorithm 1, in units of its resolution. E is divided by all points, so it
+        also falls when points lose their partners: alone it confirms nothing.
     min_share
-        Least share of the source's points that must have a correspondence, 0 to 1.
+        Least share of the source's points that must have a correspondence, 0 to 1. How large it
+        can be depends on how densely the registration samples the views in units of its
+        resolution.
     """
 
-    max_error: float = 0.5
-    min_share: float = 0.4
+    max_error: float = 0.35
+    min_share: float = 0.25
 
     def objection(self, registration: Registration) -> str:
         """Return why a registration is not good enough, or nothing if it is."""
@@ -60,13 +66,7 @@ class Confirmation:
 
 
 class LoopDetector(Protocol):
-    """A method that says where the camera may be again, and how to make sure.
-
-    Attributes
-    ----------
-    confirmation
-        What a registration of the two views must reach.
-    """
+    """A method that says where the camera may be again, and how to make sure."""
 
     part_kind: ClassVar[str] = "loops"
 
@@ -86,7 +86,7 @@ class LoopDetector(Protocol):
 
 @part("loops", "given")
 @dataclass(frozen=True)
-class Given:
+class Given(LoopDetector):
     """Look for no loops: only those given by hand are closed, as in chapter 4 of the thesis."""
 
     confirmation: Confirmation = Confirmation()
@@ -98,7 +98,7 @@ class Given:
 
 @part("loops", "nearby", label="validated")
 @dataclass(frozen=True)
-class Nearby:
+class Nearby(LoopDetector):
     """Take cameras as candidates that are close and look the same way (section 3.4).
 
     Attributes
@@ -119,18 +119,25 @@ class Nearby:
     per_frame: int = 2
     confirmation: Confirmation = Confirmation()
 
+    def __post_init__(self) -> None:
+        for name in ("max_distance_m", "max_yaw_rad"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+        for name in ("min_gap", "per_frame"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
+
     def candidates(self, poses: Float64) -> Integers:
         """See `LoopDetector.candidates`."""
-        old = max(0, len(poses) - max(1, self.min_gap))
-        if old == 0 or not np.isfinite(poses[-1]).all():
+        old = poses[: max(0, len(poses) - self.min_gap)]
+        if len(old) == 0:
             return np.zeros(0, np.intp)
-        distance = np.linalg.norm(poses[:old, :3, 3] - poses[-1, :3, 3], axis=1)
-        angle = np.abs(yaw(se3.inverse(poses[:old]) @ poses[-1]))
+        distance = np.linalg.norm(old[:, :3, 3] - poses[-1, :3, 3], axis=1) / self.max_distance_m
+        angle = np.abs(yaw(se3.inverse(old) @ poses[-1])) / self.max_yaw_rad
         # NaN, of a lost frame, compares as False.
-        near = np.flatnonzero((distance <= self.max_distance_m) & (angle <= self.max_yaw_rad))
-        apart = (distance[near] / max(self.max_distance_m, 1e-9)) ** 2
-        apart += (angle[near] / max(self.max_yaw_rad, 1e-9)) ** 2
-        return near[np.argsort(apart, kind="stable")[: self.per_frame]]
+        near = np.flatnonzero((distance <= 1) & (angle <= 1))
+        order = np.argsort(distance[near] ** 2 + angle[near] ** 2, kind="stable")
+        return near[order[: self.per_frame]]
 
 
 def yaw(T: Float64) -> Float64:
@@ -150,12 +157,12 @@ def confirm(
     """Register two views and decide whether they close a loop.
 
     The registration is tried from the guess and, as a trajectory may have drifted far, from the
-    identity; of those that are good enough (else of all) the one with more correspondences counts.
+    identity. Of those that are good enough (else of all) the one with more correspondences counts.
 
     Parameters
     ----------
     source, target
-        The two views, in any order of time.
+        The two views; the later one is registered to the earlier one, whatever their order here.
     guess
         (4, 4) T_target_source, as the trajectory has it.
     seed
@@ -167,42 +174,22 @@ def confirm(
         What was decided and why; the edge is None where the loop is not accepted.
     """
     i, j = target.index, source.index
+    if j < i:
+        return confirm(target, source, se3.inverse(guess), registrar, confirmation, seed=seed)
     found: list[Registration] = []
     failure = ""
     for start in (guess, np.eye(4)):
         try:
-            rng = np.random.default_rng([seed, i, j])
+            rng = np.random.default_rng([seed, SEED_STAGE, i, j])
             found.append(registrar.register(source, target, start, rng))
         except RegistrationError as error:
             failure = str(error)
     if not found:
-        record = LoopRecord(min(i, j), max(i, j), False, f"can't be registered: {failure}")
-        return record, None
+        return LoopRecord(i, j, False, f"can't be registered: {failure}"), None
     best = max(found, key=lambda r: (not confirmation.objection(r), r.share, -r.error))
     objection = confirmation.objection(best)
-    record = LoopRecord(
-        min(i, j),
-        max(i, j),
-        accepted=not objection,
-        reason=objection or f"error {best.error:.3g}, {best.share:.0%} of the points correspond",
-        overlap=best.share,
-        rms_m=best.rms_m,
-    )
+    reason = objection or f"{best.share:.0%} of the points correspond, error {best.error:.3g}"
+    record = LoopRecord(i, j, not objection, reason, overlap=best.share, rms_m=best.rms_m)
     if objection:
         return record, None
-    edge = LoopEdge(i, j, best.T_target_source, best.information)
-    return record, edge if i < j else reversed_edge(edge)
-
-
-def reversed_edge(edge: LoopEdge) -> LoopEdge:
-    """Return the same measurement from the other end, T_j_i, with its information."""
-    # exp(xi)^-1 T^-1 = T^-1 exp(-Ad(T) xi): the perturbation in the frame of i is Ad(T_i_j) xi.
-    back = se3.adjoint(se3.inverse(edge.T_i_j))
-    information = back.T @ edge.information @ back
-    return replace(
-        edge,
-        i=edge.j,
-        j=edge.i,
-        T_i_j=se3.inverse(edge.T_i_j),
-        information=(information + information.T) / 2,
-    )
+    return record, LoopEdge(i, j, best.T_target_source, best.information)
