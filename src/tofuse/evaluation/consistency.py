@@ -122,11 +122,6 @@ class Consistency:
             tuple(agreements),
         )
 
-    @classmethod
-    def pooled(cls, parts: Sequence[Consistency]) -> Consistency:
-        """Pool what was found over several sets of views."""
-        return cls.of([p for part in parts for p in part.agreements], sum(p.frames for p in parts))
-
     def to_dict(self) -> dict[str, float | int | None]:
         """Return the pooled figures as plain data; None where there is nothing to measure."""
         return {
@@ -187,9 +182,9 @@ class SurfaceImage:
         return cls(frame.camera, step, points, _normals(points))
 
     @cached_property
-    def valid_points(self) -> Float64:
-        """(N, 3) the valid points, row by row."""
-        return self.points[self.points[..., 2] > 0]
+    def valid(self) -> int:
+        """How many pixels are valid."""
+        return int(np.count_nonzero(self.points[..., 2]))
 
     @cached_property
     def lens(self) -> Float64 | None:
@@ -226,11 +221,11 @@ def pair_agreement(
 ) -> PairAgreement | None:
     """Compare view b with the earlier view a; None if they overlap too little (step 4)."""
     forth, compared, inliers, squares = _land(a, b, T_a_b)
-    overlap = forth / max(len(b.valid_points), 1)
+    overlap = forth / max(b.valid, 1)
     if overlap < MIN_OVERLAP:
         return None
     back, *_ = _land(b, a, se3.inverse(T_a_b))
-    overlap = min(overlap, back / max(len(a.valid_points), 1))
+    overlap = min(overlap, back / max(a.valid, 1))
     if overlap < MIN_OVERLAP:
         return None
     return PairAgreement(i, j, overlap, compared, inliers, squares)
@@ -341,8 +336,9 @@ def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -
 
 def _land(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
     """Compare b's points, in a's frame, with the pixels of a that they land on."""
-    moved = np.empty_like(b.valid_points)
-    move_points(b.valid_points, np.ascontiguousarray(T_a_b), moved)
+    points = b.points.reshape(-1, 3)
+    moved = np.empty_like(points)
+    move_points(points, np.ascontiguousarray(T_a_b), moved)
     return agreement_sums(
         moved, a.pixels(moved), a.points, a.normals, SAME_SURFACE, INLIER_DISTANCE
     )

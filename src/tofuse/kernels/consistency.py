@@ -15,9 +15,12 @@ Float32 = NDArray[np.float32]
 
 @kernel
 def move_points(points: Float64, T: Float64, out: Float64) -> None:
-    """Write the points (N, 3) mapped by T (4, 4)."""
+    """Write the points (N, 3) mapped by T (4, 4); the origin for those at z = 0, the invalid."""
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        if z == 0:
+            out[k] = 0
+            continue
         for r in range(3):
             out[k, r] = T[r, 0] * x + T[r, 1] * y + T[r, 2] * z + T[r, 3]
 
