@@ -1,0 +1,84 @@
+"""Writing a file so that it is either whole or not there."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tofuse.errors import OutputError
+
+_counter = itertools.count()
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space, or choose another folder",
+    errno.EDQUOT: "free some space, or choose another folder",
+    errno.EACCES: "choose a folder that you may write to",
+    errno.EPERM: "choose a folder that you may write to",
+    errno.EROFS: "choose a folder that you may write to",
+    errno.ENOENT: "create its folder first",
+    errno.ENOTDIR: "choose a path whose parents are folders",
+    errno.EISDIR: "choose the path of a file",
+}
+
+
+def output_error(error: OSError, path: str | Path) -> OutputError:
+    """Say in one line why `path` can't be written, and what to do."""
+    reason = (error.strerror or str(error)).lower()
+    remedy = _REMEDIES.get(error.errno or 0, "choose another place for it")
+    return OutputError(f"can't be written ({reason})", where=path, remedy=remedy)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`, renamed to it if the block succeeds, else removed.
+
+    The temporary name keeps the suffix, as some libraries choose the format by it. The block
+    should only write: its OSErrors are taken for trouble with the output.
+
+    Raises
+    ------
+    OutputError
+        If the file can't be written or renamed.
+    """
+    path = Path(path)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}-{next(_counter)}.part{path.suffix}")
+    try:
+        yield beside
+        os.replace(beside, path)
+    except BaseException as error:
+        with suppress(OSError):
+            beside.unlink()
+        if isinstance(error, OSError):
+            raise output_error(error, path) from error
+        raise
+
+
+def write_bytes(path: str | Path, data: bytes | bytearray | memoryview) -> None:
+    """Write a whole file; see `replacing`."""
+    with replacing(path) as beside:
+        beside.write_bytes(data)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a whole UTF-8 file with line feeds on every system; see `replacing`."""
+    write_bytes(path, text.encode())
+
+
+def make_folder(path: str | Path) -> Path:
+    """Create a folder and its parents, where they are missing, and return it.
+
+    Raises
+    ------
+    OutputError
+        If that isn't possible.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(error, path) from error
+    return path

@@ -1,0 +1,208 @@
+"""Images: PNG and JPEG, checked before they are decoded.
+
+A decoder fills what a truncated file lacks with zeros or grey and says so at most on stderr, and
+believes any size that a header claims. So the structure of a file is checked first.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.atomic import write_bytes
+from tofuse.files.reading import read_bytes, read_head
+
+MAX_PIXELS = 1 << 26  # 8192 x 8192: far beyond any depth camera, and 400 MB of colour
+MAX_IMAGE_BYTES = 1 << 29
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+_NOT_SOF = {0xC4, 0xC8, 0xCC}
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What the header of an image promises."""
+
+    format: str
+    width: int
+    height: int
+    channels: int
+    bits: int
+
+    def __str__(self) -> str:
+        return f"{self.width} x {self.height}, {self.channels} x {self.bits} bits"
+
+
+def read_header(path: str | Path) -> ImageHeader:
+    """Read size and type of a PNG or JPEG without decoding it.
+
+    Raises
+    ------
+    InputError
+        If it is neither, is cut off within its header, or claims an absurd size.
+    """
+    head = read_head(path, 64)
+    return _header(head if head.startswith(_PNG) else read_bytes(path, limit=MAX_IMAGE_BYTES), path)
+
+
+def _header(data: bytes, path: str | Path) -> ImageHeader:
+    if data.startswith(_PNG):
+        header = _png_header(data, path)
+    elif data.startswith(b"\xff\xd8"):
+        header = _jpeg_header(data, path)
+    else:
+        what = "is empty" if not data else "is neither a PNG nor a JPEG image"
+        raise InputError(what, where=path, remedy="check the file")
+    if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
+        raise InputError(
+            f"claims to be {header.width} x {header.height} pixels",
+            where=path,
+            remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
+        )
+    return header
+
+
+def _png_header(data: bytes, path: str | Path) -> ImageHeader:
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise InputError("is cut off within its header", where=path, remedy="copy the file again")
+    width, height, bits, color = struct.unpack(">IIBB", data[16:26])
+    if color not in _PNG_CHANNELS:
+        raise InputError("is a damaged PNG (no such colour type)", where=path)
+    return ImageHeader("png", width, height, _PNG_CHANNELS[color], bits)
+
+
+def _jpeg_header(data: bytes, path: str | Path) -> ImageHeader:
+    at = 2
+    while at + 9 < len(data):
+        if data[at] != 0xFF:
+            break
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+            continue
+        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
+        if 0xC0 <= marker <= 0xCF and marker not in _NOT_SOF:
+            bits, height, width, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
+            return ImageHeader("jpeg", width, height, channels, bits)
+        at += 2 + length
+    raise InputError("is a damaged or cut off JPEG", where=path, remedy="copy the file again")
+
+
+def _check_whole(data: bytes, path: str | Path) -> None:
+    """Raise InputError unless a PNG has all its chunks, each with its checksum."""
+    view = memoryview(data)
+    at = len(_PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            break
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(view[at + 4 : end - 4]) != checksum:
+            raise InputError("is damaged (checksum of a PNG chunk)", where=path)
+        if data[at + 4 : at + 8] == b"IEND":
+            return
+        at = end
+    raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+
+
+def read_image(
+    path: str | Path, *, size: tuple[int, int] | None = None, dtype: str | None = None
+) -> NDArray[Any]:
+    """Read a PNG or JPEG as it is stored: (H, W) grey, or (H, W, 3) RGB; uint8 or uint16.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        (width, height) that it must have.
+    dtype
+        "uint8" or "uint16" of the one channel that it must have (depth, amplitude, confidence).
+
+    Raises
+    ------
+    InputError
+        If it can't be read, is cut off or damaged, or isn't of that size and type.
+    """
+    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    header = _header(data, path)
+    if size is not None and (header.width, header.height) != size:
+        raise InputError(
+            f"is {header.width} x {header.height} pixels, the camera {size[0]} x {size[1]}",
+            where=path,
+            remedy="use the camera description of these images",
+        )
+    if dtype is not None and (header.channels != 1 or f"uint{header.bits}" != dtype):
+        raise InputError(
+            f"has {header.channels} channels of {header.bits} bits",
+            where=path,
+            remedy=f"store one channel of {dtype}",
+        )
+    if header.format == "png":
+        _check_whole(data, path)
+    elif data.rfind(b"\xff\xd9") < 0:
+        raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+    return _decode(data, header, path)
+
+
+def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
+    import cv2
+
+    grey = header.channels < 3
+    # An orientation noted by a phone would turn the image away from its depth.
+    flags = cv2.IMREAD_IGNORE_ORIENTATION | (
+        cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        if grey
+        else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+    )
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise InputError("can't be decoded", where=path, remedy="copy the file again") from error
+    if image is None or image.shape[:2] != (header.height, header.width):
+        raise InputError("can't be decoded", where=path, remedy="copy the file again")
+    return image if grey else np.ascontiguousarray(image[..., ::-1])
+
+
+def read_color(path: str | Path) -> NDArray[np.uint8]:
+    """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is repeated, 16 bits are cut to 8."""
+    image = read_image(path)
+    if image.dtype == np.uint16:
+        image = (image.astype(np.uint16) >> 8).astype(np.uint8)
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    return image.astype(np.uint8, copy=False)
+
+
+def png_bytes(image: NDArray[np.generic]) -> bytes:
+    """Encode (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB, as PNG."""
+    import cv2
+
+    image = np.asarray(image)
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
+        raise InputError(
+            f"is an array of shape {image.shape} and type {image.dtype}",
+            where="image",
+            remedy="give (H, W) uint8 or uint16, or (H, W, 3) uint8",
+        )
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    pixels: NDArray[Any] = image
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as PNG", where="image")
+    return bytes(data)
+
+
+def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
+    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
+    write_bytes(path, png_bytes(image))

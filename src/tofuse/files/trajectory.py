@@ -1,0 +1,128 @@
+"""Trajectories in the TUM format: timestamp tx ty tz qx qy qz qw, one pose a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.atomic import write_text
+from tofuse.files.reading import read_text
+from tofuse.files.tables import exact
+from tofuse.geometry.quaternion import from_matrix, to_matrix
+
+Float64 = NDArray[np.float64]
+
+ASSOCIATION_LIMIT_S = 0.02
+
+
+def read_tum(path: str | Path) -> tuple[Float64, Float64]:
+    """Read a trajectory.
+
+    Returns
+    -------
+    (N,) timestamps in s and (N, 4, 4) T_world_camera, in the order of the file. Comments after
+    '#' and empty lines are left out; quaternions are normalised.
+
+    Raises
+    ------
+    InputError
+        Naming file and line, if a line isn't 8 finite numbers or its quaternion isn't one.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        cells = line.split("#", 1)[0].replace(",", " ").split()
+        if not cells:
+            continue
+        where = f"{path}, line {number}"
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError as error:
+            raise InputError(str(error), where=where, remedy=_TUM) from error
+        if len(row) != 8:
+            raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
+        if not np.isfinite(row).all():
+            raise InputError("holds a number that is not finite", where=where, remedy=_TUM)
+        if abs(float(np.linalg.norm(row[4:])) - 1) > 0.1:
+            raise InputError("holds no unit quaternion", where=where, remedy=_TUM)
+        rows.append(row)
+    table = np.array(rows, float).reshape(-1, 8)
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, 3] = table[:, 1:4]
+    if len(table):
+        poses[:, :3, :3] = to_matrix(table[:, 4:])
+    return table[:, 0], poses
+
+
+_TUM = "write 'timestamp tx ty tz qx qy qz qw'"
+
+
+def write_tum(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:
+    """Write (N,) timestamps in s and (N, 4, 4) T_world_camera; poses that are NaN are left out.
+
+    Every number is the shortest text that reads back as the same float64, so the same trajectory
+    gives the same bytes.
+    """
+    write_text(path, tum_text(timestamps, poses))
+
+
+def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
+    """Return the text that `write_tum` writes."""
+    times = np.asarray(timestamps, float)
+    T = np.asarray(poses, float)
+    if T.shape != (len(times), 4, 4):
+        raise InputError(
+            f"{times.shape} timestamps and poses of shape {T.shape}",
+            where="trajectory",
+            remedy="give (N,) and (N, 4, 4)",
+        )
+    known = np.isfinite(T).all((1, 2))
+    times, T = times[known], T[known]
+    if not len(times):
+        return ""
+    table = np.column_stack([times, T[:, :3, 3], from_matrix(T[:, :3, :3])])
+    return "".join(" ".join(exact(v) for v in row) + "\n" for row in table)
+
+
+def associate(
+    timestamps: ArrayLike, others: ArrayLike, *, limit: float = ASSOCIATION_LIMIT_S
+) -> NDArray[np.intp]:
+    """For each of (N,) timestamps, the index of the nearest of (M,) others, or -1.
+
+    An entry is given to the one timestamp nearest to it, and only within `limit` seconds
+    (inclusive, give or take a nanosecond). Neither needs to be sorted.
+    """
+    times, others = np.asarray(timestamps, float), np.asarray(others, float)
+    out = np.full(len(times), -1, np.intp)
+    if not len(times) or not len(others):
+        return out
+    order = np.argsort(others, kind="stable")
+    ordered = others[order]
+    after = np.clip(np.searchsorted(ordered, times), 0, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(ordered[before] - times) <= np.abs(ordered[after] - times)
+    best = np.where(nearer, before, after)
+    gap = np.abs(ordered[best] - times)
+    # By gap, so that an entry wanted twice goes to the nearer one.
+    taken = np.zeros(len(ordered), bool)
+    for k in np.argsort(gap, kind="stable"):
+        if gap[k] <= limit + 1e-9 and not taken[best[k]]:
+            taken[best[k]] = True
+            out[k] = order[best[k]]
+    return out
+
+
+def associated_poses(
+    timestamps: ArrayLike,
+    others: ArrayLike,
+    poses: ArrayLike,
+    *,
+    limit: float = ASSOCIATION_LIMIT_S,
+) -> Float64:
+    """Poses (N, 4, 4) at the timestamps, from (M,) others with (M, 4, 4) poses; NaN where none."""
+    index = associate(timestamps, others, limit=limit)
+    out = np.full((len(index), 4, 4), np.nan)
+    out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]
+    return out

@@ -1,0 +1,279 @@
+"""camera.json: how the camera of a native recording is described."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_text
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
+from tofuse.geometry.se3 import check_pose
+from tofuse.recordings.frames import DepthKind
+
+SCHEMA = 1
+AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
+
+_LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+_KEYS = (
+    "schema",
+    *_LENS,
+    "depth_unit_m",
+    "depth_kind",
+    "frame_rate_hz",
+    "ambiguity_m",
+    "confidence_max",
+    "amplitude_kind",
+    "color",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ColorCamera:
+    """A colour camera that colour images are not registered to depth for.
+
+    `T_color_depth` (4, 4) maps points in m of the depth camera's frame into the colour camera's.
+    """
+
+    camera: Pinhole
+    T_color_depth: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile:
+    """Content of a camera.json.
+
+    Attributes
+    ----------
+    camera
+        None where the model is "rays" (then rays.npy holds it) or a recording of clouds has none.
+    size
+        (width, height), or None for clouds.
+    depth_unit_m
+        Metres per count.
+    depth_kind
+        "z" or "range".
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind
+        As in the format, None where not given.
+    color
+        None where colour is registered to depth.
+    unknown
+        Keys that mean nothing here.
+    """
+
+    camera: Pinhole | None
+    size: tuple[int, int] | None
+    depth_unit_m: float = 0.001
+    depth_kind: DepthKind = "z"
+    frame_rate_hz: float | None = None
+    ambiguity_m: float | None = None
+    confidence_max: float | None = None
+    amplitude_kind: str | None = None
+    color: ColorCamera | None = None
+    unknown: tuple[str, ...] = ()
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, is broken (with line and column), or holds something else.
+    """
+    text = read_text(path, limit=64 << 20)
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"is broken JSON ({error.msg}, line {error.lineno} column {error.colno})",
+            where=path,
+            remedy="correct it there",
+        ) from error
+    except (RecursionError, ValueError) as error:
+        raise InputError("is broken JSON", where=path, remedy="write it again") from error
+    if not isinstance(data, dict):
+        raise InputError("holds no JSON object", where=path, remedy="write {...}")
+    return data
+
+
+def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
+    """Read and check a camera.json.
+
+    Parameters
+    ----------
+    path
+        The file.
+    clouds
+        Whether it belongs to a recording of clouds, which needs no camera.
+
+    Raises
+    ------
+    InputError
+        Naming file and field, with what to write instead.
+    """
+    data = read_json(path)
+    get = _Fields(data, str(path))
+    schema = data.get("schema")
+    if schema != SCHEMA or isinstance(schema, bool):
+        raise get.error(
+            "schema",
+            f"is {schema!r}" if "schema" in data else "is missing",
+            f"write {SCHEMA}, the only version there is",
+        )
+    camera = size = None
+    color = None
+    unit = 0.001
+    kind: DepthKind = "z"
+    if not (clouds and "model" not in data):
+        camera, size = _lens(get)
+        unit = get.positive("depth_unit_m", needed=True) or 0.001
+        kind = get.choice("depth_kind", ("z", "range"), needed=True)  # type: ignore[assignment]
+        color = _color(get)
+    return CameraFile(
+        camera,
+        size,
+        unit,
+        kind,
+        get.positive("frame_rate_hz"),
+        get.positive("ambiguity_m"),
+        get.positive("confidence_max"),
+        get.choice("amplitude_kind", AMPLITUDE_KINDS),
+        color,
+        tuple(key for key in data if key not in _KEYS),
+    )
+
+
+def camera_fields(camera: Camera) -> dict[str, Any]:
+    """Return the fields of camera.json that describe a lens; a ray table gives only its size."""
+    if isinstance(camera, RayTable):
+        return {"model": "rays", "width": camera.width, "height": camera.height}
+    if not isinstance(camera, Pinhole):
+        raise InputError(
+            f"is a {type(camera).__name__}",
+            where="camera",
+            remedy="give one of the models, or a RayTable of its rays",
+        )
+    out: dict[str, Any] = {"model": camera.model, "width": camera.width, "height": camera.height}
+    out |= {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    if order := DISTORTION_ORDER[camera.model]:
+        out["distortion"] = [float(getattr(camera, name)) for name in order]
+    return out
+
+
+def color_fields(color: ColorCamera) -> dict[str, Any]:
+    """Return the "color" object of camera.json."""
+    return {
+        "intrinsics": camera_fields(color.camera),
+        "T_color_depth": [[float(v) for v in row] for row in color.T_color_depth],
+    }
+
+
+class _Fields:
+    """Checked access to the fields of an object, with errors that name file and field."""
+
+    def __init__(self, data: dict[str, Any], where: str) -> None:
+        self.data, self.where = data, where
+
+    def error(self, field: str, problem: str, remedy: str) -> InputError:
+        return InputError(problem, where=f"{self.where}: {field}", remedy=remedy)
+
+    def number(self, field: str, *, needed: bool = False, hint: str = "a number") -> float | None:
+        value = self.data.get(field)
+        if value is None:
+            if needed:
+                raise self.error(field, "is missing", f"give {hint}")
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.error(field, f"is {value!r:.60}", f"give {hint}")
+        try:
+            value = float(value)
+        except OverflowError:
+            value = math.inf
+        if not math.isfinite(value):
+            raise self.error(field, f"is {value}", f"give a finite {hint.removeprefix('a ')}")
+        return value
+
+    def positive(self, field: str, *, needed: bool = False) -> float | None:
+        value = self.number(field, needed=needed, hint="a positive number")
+        if value is not None and value <= 0:
+            raise self.error(field, f"is {value}", "give a positive number")
+        return value
+
+    def pixels(self, field: str) -> int:
+        value = self.number(field, needed=True, hint="a number of pixels")
+        if value is None or value != int(value) or not 2 <= value <= 16384:
+            raise self.error(field, f"is {value}", "give a whole number of pixels, 2 to 16384")
+        return int(value)
+
+    def choice(self, field: str, choices: tuple[str, ...], *, needed: bool = False) -> str | None:
+        value = self.data.get(field)
+        if value is None and not needed:
+            return None
+        if value not in choices or not isinstance(value, str):
+            problem = "is missing" if field not in self.data else f"is {value!r:.60}"
+            raise self.error(field, problem, f"write one of {', '.join(choices)}")
+        return value
+
+
+def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
+    model = get.choice("model", (*MODELS, "rays"), needed=True)
+    size = (get.pixels("width"), get.pixels("height"))
+    if model == "rays" or model is None:
+        return None, size
+    values: dict[str, float] = {}
+    for name in ("fx", "fy"):
+        values[name] = get.positive(name, needed=True) or 1.0
+    for name in ("cx", "cy"):
+        values[name] = get.number(name, needed=True) or 0.0
+    order = DISTORTION_ORDER[model]
+    given = get.data.get("distortion")
+    given = [] if given is None else given
+    if not isinstance(given, list):
+        raise get.error("distortion", f"is {given!r:.60}", f"give a list [{' '.join(order)}]")
+    for k, value in enumerate(given):
+        _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", needed=True)
+    extra = given[len(order) :]
+    if any(extra):
+        raise get.error(
+            "distortion",
+            f"has {len(given)} numbers, the model {model!r} takes {len(order)}",
+            f"give [{' '.join(order)}], or another model",
+        )
+    values |= {name: float(v) for name, v in zip(order, given, strict=False)}
+    cls = MODELS[model]
+    known = {f.name for f in fields(cls)}
+    values = {name: v for name, v in values.items() if name in known}
+    try:
+        return cls(size[0], size[1], **values), size
+    except InputError as error:
+        raise InputError(
+            error.problem, where=f"{get.where}: {error.where}", remedy=error.remedy
+        ) from error
+
+
+def _color(get: _Fields) -> ColorCamera | None:
+    data = get.data.get("color")
+    if data is None:
+        return None
+    if not isinstance(data, dict) or not isinstance(data.get("intrinsics"), dict):
+        raise get.error(
+            "color", "has no intrinsics", "give {intrinsics: {...}, T_color_depth: ...}"
+        )
+    camera, _ = _lens(
+        _Fields({"model": "pinhole"} | data["intrinsics"], f"{get.where}: color.intrinsics")
+    )
+    if camera is None:
+        raise get.error("color.intrinsics.model", "is 'rays'", "give a lens model")
+    field = "color.T_color_depth"
+    try:
+        matrix = np.array(data.get("T_color_depth"), float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise get.error(field, "is no 4x4 matrix", "give four rows of four numbers") from error
+    return ColorCamera(camera, check_pose(matrix, where=f"{get.where}: {field}"))

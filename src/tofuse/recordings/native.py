@@ -1,0 +1,501 @@
+"""The native recording: a folder of PNG images (or PLY clouds), described by a camera.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError, OutputError
+from tofuse.files.atomic import make_folder, replacing, write_text
+from tofuse.files.images import read_color, read_header, read_image, write_png
+from tofuse.files.ply import write_ply
+from tofuse.files.reading import files_with, input_error, is_file, is_folder
+from tofuse.files.tables import exact, read_columns, read_numbers, write_columns
+from tofuse.files.trajectory import write_tum
+from tofuse.geometry.cameras import Camera, RayTable, range_from_z, z_from_range
+from tofuse.recordings.camera_file import (
+    SCHEMA,
+    CameraFile,
+    ColorCamera,
+    camera_fields,
+    read_camera_file,
+)
+from tofuse.recordings.frames import (
+    SATURATED_AMPLITUDE,
+    CloudFrame,
+    DepthKind,
+    Frame,
+    RangeFrame,
+)
+from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
+from tofuse.sensor.correction import DepthCorrection
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+INVALID_DEPTH = 65535
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+class NativeSource(FileSource):
+    """Reads a native folder.
+
+    Attributes
+    ----------
+    camera
+        Of all frames; None for clouds.
+    description
+        Content of camera.json.
+    imu
+        Columns of imu.csv by name, or None.
+    frame_columns
+        Columns of frames.csv by name, each (N,), or None.
+
+    Raises
+    ------
+    InputError
+        Naming file and field, if the folder isn't complete and consistent.
+    """
+
+    def __init__(self, folder: Path, camera_file: Path | None = None) -> None:
+        self.folder = folder
+        self.is_clouds = not is_folder(folder / "depth") and is_folder(folder / "cloud")
+        name, suffixes = ("cloud", (".ply",)) if self.is_clouds else ("depth", (".png",))
+        self.files = files_with(folder / name, *suffixes)
+        if not self.files:
+            raise InputError(
+                f"has no {suffixes[0]} files",
+                where=folder / name,
+                remedy="check that the recording is complete",
+            )
+        self.description, self.camera = self._read_camera(camera_file or folder / "camera.json")
+        rate = self.description.frame_rate_hz
+        super().__init__(np.arange(len(self.files)) / (rate or 1.0))
+        self._read_timestamps()
+        self.amplitude = self._channel("amplitude", ".png")
+        self.confidence = self._channel("confidence", ".png")
+        self.color = self._channel("color", *_IMAGES)
+        self.correction = self._read_correction()
+        self.imu = self._read_table("imu.csv")
+        self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
+        if is_file(folder / "groundtruth.txt"):
+            self.reference = tum_poses(self, folder / "groundtruth.txt")
+        if is_file(folder / "odometry.txt"):
+            self.odometry = tum_poses(self, folder / "odometry.txt")
+        self._check_sizes()
+        self._fill_metadata()
+
+    def load(self, index: int) -> Frame:
+        """See `FileSource.load`."""
+        timestamp = float(self.timestamps[index])
+        if self.camera is None:
+            return ply_frame(self.files[index], index, timestamp)
+        size = (self.camera.width, self.camera.height)
+        counts = read_image(self.files[index], size=size, dtype="uint16")
+        depth = depth_from_counts(counts, self.description.depth_unit_m)
+        kind = self.description.depth_kind
+        if self.correction is not None:
+            depth = _corrected(self.correction, self.camera, depth, kind)
+        frame = RangeFrame(index, timestamp, self.camera, depth, kind)
+        amplitude = confidence = color = None
+        if self.amplitude:
+            amplitude = read_image(self.amplitude[index], size=size, dtype="uint16")
+            amplitude = amplitude.astype(np.float32)
+        if self.confidence:
+            confidence = read_image(self.confidence[index], size=size, dtype="uint8")
+            confidence = confidence.astype(np.uint8, copy=False)
+        if self.color:
+            color = self._registered(frame, self.color[index])
+        return RangeFrame(
+            index, timestamp, self.camera, frame.depth, kind, amplitude, confidence, color
+        )
+
+    def _read_camera(self, path: Path) -> tuple[CameraFile, Camera | None]:
+        if self.is_clouds:
+            if not is_file(path):
+                return CameraFile(None, None), None
+            return read_camera_file(path, clouds=True), None
+        description = read_camera_file(path)
+        table = self.folder / "rays.npy"
+        # A camera given by hand replaces the folder's own lens, table included.
+        if path.parent != self.folder and description.camera is not None:
+            return description, description.camera
+        if is_file(path.parent / "rays.npy"):
+            table = path.parent / "rays.npy"
+        if is_file(table):
+            camera = read_rays(table)
+            if description.size != (camera.width, camera.height):
+                raise InputError(
+                    f"is {camera.width} x {camera.height}, camera.json says "
+                    f"{' x '.join(map(str, description.size or ()))}",
+                    where=table,
+                    remedy="use the table of this camera",
+                )
+            return description, camera
+        if description.camera is None:
+            raise InputError(
+                "is 'rays' and there is no rays.npy",
+                where=f"{path}: model",
+                remedy="add rays.npy, or give a lens model",
+            )
+        return description, description.camera
+
+    def _read_timestamps(self) -> None:
+        path = self.folder / "timestamps.txt"
+        if not is_file(path):
+            return
+        table = read_numbers(path)
+        if len(table) != len(self.files):
+            raise self._count_error(path, f"{len(table)} lines")
+        if table.shape[1] != 1:
+            raise InputError(
+                f"has {table.shape[1]} numbers in a line", where=path, remedy="give one, in seconds"
+            )
+        self.timestamps = table[:, 0]
+        check_timestamps(self.timestamps, path, self.warnings)
+
+    def _channel(self, name: str, *suffixes: str) -> list[Path]:
+        folder = self.folder / name
+        if self.is_clouds or not is_folder(folder):
+            return []
+        files = files_with(folder, *suffixes)
+        if len(files) != len(self.files):
+            raise self._count_error(folder, f"{len(files)} images")
+        if [f.stem for f in files] != [f.stem for f in self.files]:
+            self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
+        return files
+
+    def _read_correction(self) -> DepthCorrection | None:
+        path = self.folder / "correction.npz"
+        if self.camera is None or not is_file(path):
+            return None
+        correction = DepthCorrection.load(path)
+        try:
+            correction.correct(np.ones((self.camera.height, self.camera.width), np.float32))
+        except InputError as error:
+            raise InputError(error.problem, where=path, remedy=error.remedy) from error
+        return correction
+
+    def _read_table(self, name: str, rows: int | None = None) -> dict[str, Float64] | None:
+        path = self.folder / name
+        if not is_file(path):
+            return None
+        columns = read_columns(path)
+        length = len(next(iter(columns.values())))
+        if rows is not None and length != rows:
+            raise self._count_error(path, f"{length} rows")
+        return columns
+
+    def _count_error(self, where: Path, what: str) -> InputError:
+        return InputError(
+            f"has {what}, {self.files[0].parent.name}/ has {len(self.files)} files",
+            where=where,
+            remedy="make the counts agree, or remove it",
+        )
+
+    def _check_sizes(self) -> None:
+        """Refuse a camera.json of other images, as far as the first readable header tells."""
+        if self.camera is None:
+            return
+        for channel in (self.files, self.amplitude, self.confidence):
+            self._check_size(channel, (self.camera.width, self.camera.height), "")
+        color = self.description.color
+        if color is None:
+            hint = '; or describe its camera by "color" in camera.json'
+            self._check_size(self.color, (self.camera.width, self.camera.height), hint)
+        else:
+            self._check_size(self.color, (color.camera.width, color.camera.height), "")
+
+    def _check_size(self, files: list[Path], size: tuple[int, int], hint: str) -> None:
+        for path in files[:5]:
+            try:
+                header = read_header(path)
+            except InputError:
+                continue  # that frame's own trouble, told when it is read
+            if (header.width, header.height) != size:
+                raise InputError(
+                    f"is {header.width} x {header.height} pixels, camera.json says "
+                    f"{size[0]} x {size[1]}",
+                    where=path,
+                    remedy=f"use the camera.json of these images{hint}",
+                )
+            return
+
+    def _registered(self, frame: RangeFrame, path: Path) -> NDArray[np.uint8]:
+        """Return the colour of each depth pixel (H, W, 3); black where there is none."""
+        image = read_color(path)
+        color = self.description.color
+        camera = frame.camera if color is None else color.camera
+        if image.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
+                f"{camera.width} x {camera.height}",
+                where=path,
+            )
+        return image if color is None else sampled_color(frame, image, color)
+
+    def _fill_metadata(self) -> None:
+        about = self.description
+        if about.unknown:
+            self.warnings.append(
+                f"{self.folder / 'camera.json'}: means nothing here: {', '.join(about.unknown)}"
+            )
+        for name in ("frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
+            if getattr(about, name) is not None:
+                self.metadata[name] = getattr(about, name)
+        if self.camera is not None:
+            self.metadata["depth_unit_m"] = about.depth_unit_m
+            self.metadata["depth_kind"] = about.depth_kind
+            self.metadata["corrected"] = self.correction is not None
+        if is_folder(self.folder / "truth"):
+            self.metadata["truth"] = str(self.folder / "truth")
+
+
+def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
+    """Depth in m (float32) of stored counts; 0 and 65535 give 0."""
+    depth = counts.astype(np.float32) * np.float32(unit_m)
+    depth[counts == INVALID_DEPTH] = 0
+    return depth
+
+
+def read_rays(path: Path) -> RayTable:
+    """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
+    try:
+        # Mapped first, so that a header can't make us allocate more than the file holds.
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
+            raise ValueError("no array of floats")
+        if table.ndim != 3 or table.shape[2] != 2:
+            raise ValueError(f"shape {table.shape}, not (H, W, 2)")
+        return RayTable(np.array(table, np.float32))
+    except OSError as error:
+        raise input_error(error, path) from error
+    except InputError as error:
+        raise InputError(error.problem, where=path, remedy=error.remedy) from error
+    except Exception as error:  # NumPy parses the header as Python: anything may come out
+        raise InputError(
+            f"is no table of rays ({error})", where=path, remedy="save (H, W, 2) float32 by NumPy"
+        ) from error
+
+
+def sampled_color(
+    frame: RangeFrame, image: NDArray[np.uint8], color: ColorCamera
+) -> NDArray[np.uint8]:
+    """Colour (H, W, 3) of each valid depth pixel, from where its point lands in the image."""
+    T = color.T_color_depth
+    uv = color.camera.project(frame.points @ T[:3, :3].T + T[:3, 3])
+    with np.errstate(invalid="ignore"):
+        pixel = np.nan_to_num(np.rint(uv), nan=-1.0, posinf=-1.0, neginf=-1.0)
+    u, v = np.clip(pixel, -1, 1 << 20).astype(np.intp).T
+    inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
+    seen = np.zeros((len(u), 3), np.uint8)
+    seen[inside] = image[v[inside], u[inside]]
+    out = np.zeros((*frame.depth.shape, 3), np.uint8)
+    out[frame.valid] = seen
+    return out
+
+
+def _corrected(
+    correction: DepthCorrection, camera: Camera, depth: Float32, kind: DepthKind
+) -> Float32:
+    if kind == "range":
+        return correction.correct(depth)
+    return z_from_range(camera, correction.correct(range_from_z(camera, depth)))
+
+
+class RecordingWriter:
+    """Writes a native folder, frame by frame.
+
+    Every file is written beside and renamed; camera.json comes last, in `finish`, so that an
+    interrupted recording is never mistaken for a whole one.
+
+    Parameters
+    ----------
+    folder
+        Made if missing; must be empty.
+    camera
+        Of all frames; a RayTable goes to rays.npy. None for clouds.
+    depth_unit_m
+        Metres per count.
+    depth_kind
+        What is stored, "z" or "range"; frames are converted.
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind
+        As in the format; None: not written.
+
+    Attributes
+    ----------
+    out_of_range
+        Pixels so far whose depth or amplitude didn't fit into 16 bits (depth became invalid,
+        amplitude the largest unsaturated value).
+
+    Raises
+    ------
+    OutputError
+        If something can't be written, or the folder isn't empty.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        camera: Camera | None,
+        *,
+        depth_unit_m: float = 0.001,
+        depth_kind: DepthKind = "z",
+        frame_rate_hz: float | None = None,
+        ambiguity_m: float | None = None,
+        confidence_max: float | None = None,
+        amplitude_kind: str | None = None,
+    ) -> None:
+        self.folder = make_folder(folder)
+        if any(self.folder.iterdir()):
+            raise OutputError("isn't empty", where=self.folder, remedy="choose a new folder")
+        self.camera = camera
+        self.depth_unit_m, self.depth_kind = depth_unit_m, depth_kind
+        self.out_of_range = 0
+        self._channels: frozenset[str] | None = None
+        self._times: list[float] = []
+        self._about: dict[str, Any] = {"schema": SCHEMA}
+        if camera is not None:
+            self._about |= camera_fields(camera)
+            self._about |= {"depth_unit_m": float(depth_unit_m), "depth_kind": depth_kind}
+        optional: dict[str, Any] = {
+            "frame_rate_hz": frame_rate_hz,
+            "ambiguity_m": ambiguity_m,
+            "confidence_max": confidence_max,
+            "amplitude_kind": amplitude_kind,
+        }
+        self._about |= {key: value for key, value in optional.items() if value is not None}
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def add(self, frame: Frame) -> None:
+        """Write the next frame.
+
+        Raises
+        ------
+        InputError
+            If the frame has another camera's size or kind, or not the channels of the first.
+        """
+        channels = self._write_clouds if isinstance(frame, CloudFrame) else self._write_images
+        channels(frame)  # type: ignore[arg-type]
+        self._times.append(float(frame.timestamp))
+
+    def _name(self, channel: str, suffix: str) -> Path:
+        return make_folder(self.folder / channel) / f"{len(self):06d}{suffix}"
+
+    def _write_clouds(self, frame: CloudFrame) -> None:
+        if self.camera is not None:
+            raise InputError("is a cloud", where=f"frame {frame.index}", remedy="add images only")
+        self._check_channels(frame, "cloud")
+        write_ply(
+            self._name("cloud", ".ply"),
+            frame.points,
+            normals=frame.normals,
+            color=frame.color,
+            scalars=None if frame.amplitude is None else {"amplitude": frame.amplitude},
+        )
+
+    def _write_images(self, frame: RangeFrame) -> None:
+        camera = self.camera
+        if camera is None:
+            raise InputError("is an image", where=f"frame {frame.index}", remedy="give a camera")
+        if frame.depth.shape != (camera.height, camera.width):
+            raise InputError(
+                f"is {frame.depth.shape[1]} x {frame.depth.shape[0]}, the recording's camera "
+                f"{camera.width} x {camera.height}",
+                where=f"frame {frame.index}",
+            )
+        images = {
+            "amplitude": frame.amplitude_image,
+            "confidence": frame.confidence_image,
+            "color": frame.color_image,
+        }
+        self._check_channels(frame, *(name for name, image in images.items() if image is not None))
+        depth = frame.z if self.depth_kind == "z" else frame.radial_range
+        write_png(self._name("depth", ".png"), self._counts(depth))
+        if frame.amplitude_image is not None:
+            write_png(self._name("amplitude", ".png"), self._amplitude(frame.amplitude_image))
+        if frame.confidence_image is not None:
+            confidence = frame.confidence_image.astype(np.uint8, copy=False)
+            write_png(self._name("confidence", ".png"), confidence)
+        if frame.color_image is not None:
+            write_png(self._name("color", ".png"), frame.color_image)
+
+    def _check_channels(self, frame: Frame, *names: str) -> None:
+        if self._channels is None:
+            self._channels = frozenset(names)
+        elif self._channels != set(names):
+            raise InputError(
+                f"has {sorted(names)} where the first frame has {sorted(self._channels)}",
+                where=f"frame {frame.index}",
+                remedy="give all frames the same channels",
+            )
+
+    def _counts(self, depth: Float32) -> NDArray[np.uint16]:
+        counts = np.rint(depth.astype(float) / self.depth_unit_m)
+        beyond = counts >= INVALID_DEPTH
+        self.out_of_range += int(beyond.sum())
+        return np.where(beyond, 0, counts).astype(np.uint16)
+
+    def _amplitude(self, amplitude: Float32) -> NDArray[np.uint16]:
+        counts = np.rint(np.nan_to_num(amplitude.astype(float)))
+        beyond = (counts >= SATURATED_AMPLITUDE) & (amplitude != SATURATED_AMPLITUDE)
+        self.out_of_range += int(beyond.sum())
+        counts[beyond] = SATURATED_AMPLITUDE - 1
+        return np.clip(counts, 0, SATURATED_AMPLITUDE).astype(np.uint16)
+
+    def finish(
+        self,
+        *,
+        groundtruth: ArrayLike | None = None,
+        odometry: ArrayLike | None = None,
+        correction: DepthCorrection | None = None,
+        imu: Mapping[str, NDArray[np.generic]] | None = None,
+        frames: Mapping[str, NDArray[np.generic]] | None = None,
+    ) -> Path:
+        """Write what belongs to the whole recording, camera.json last, and return the folder.
+
+        Parameters
+        ----------
+        groundtruth, odometry
+            (N, 4, 4) T_world_camera of the frames added, NaN where unknown.
+        correction
+            Depth correction that readers are to apply: frames were added uncorrected.
+        imu
+            Columns of imu.csv by name.
+        frames
+            Columns of frames.csv by name, one value for each frame.
+
+        Raises
+        ------
+        InputError
+            If there are no frames, or the counts disagree.
+        """
+        if not len(self):
+            raise InputError("has no frames", where=self.folder, remedy="add at least one")
+        for name, poses in (("groundtruth", groundtruth), ("odometry", odometry)):
+            if poses is not None:
+                write_tum(self.folder / f"{name}.txt", self._times, poses)
+        if correction is not None:
+            with replacing(self.folder / "correction.npz") as beside:
+                correction.save(beside)
+        if imu is not None:
+            write_columns(self.folder / "imu.csv", imu)
+        if frames is not None:
+            if any(len(column) != len(self) for column in frames.values()):
+                raise InputError(
+                    f"columns don't have {len(self)} values", where=self.folder / "frames.csv"
+                )
+            write_columns(self.folder / "frames.csv", frames)
+        if isinstance(self.camera, RayTable):
+            with replacing(self.folder / "rays.npy") as beside:
+                np.save(beside, np.asarray(self.camera.table, np.float32))
+        write_text(self.folder / "timestamps.txt", "".join(exact(t) + "\n" for t in self._times))
+        write_text(self.folder / "camera.json", json.dumps(self._about, indent=1) + "\n")
+        return self.folder

@@ -1,0 +1,208 @@
+"""What the readers share: a base for sources over files, poses beside frames, joining, limits."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.ply import read_ply
+from tofuse.files.trajectory import associated_poses, read_tum
+from tofuse.geometry.se3 import check_pose, orthonormalise
+from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.recordings.recording import Source
+
+Float64 = NDArray[np.float64]
+
+
+class FileSource(ABC):
+    """A source whose frames are files; any trouble with one of them is that frame's alone."""
+
+    def __init__(self, timestamps: Float64) -> None:
+        self.timestamps = timestamps
+        self.reference: Float64 | None = None
+        self.odometry: Float64 | None = None
+        self.warnings: list[str] = []
+        self.metadata: dict[str, Any] = {}
+
+    @abstractmethod
+    def load(self, index: int) -> Frame:
+        """Read frame `index`; raise InputError if it can't be read."""
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        try:
+            return self.load(index)
+        except UnreadableFrameError:
+            raise
+        except InputError as error:
+            raise UnreadableFrameError(
+                error.problem, where=error.where, remedy=error.remedy
+            ) from error
+        except MemoryError as error:
+            raise UnreadableFrameError("needs more memory than there is") from error
+
+
+def tum_poses(source: FileSource, path: Path) -> Float64:
+    """Poses (N, 4, 4) of a TUM file at the source's timestamps, NaN where none is within 0.02 s."""
+    times, poses = read_tum(path)
+    out = associated_poses(source.timestamps, times, poses)
+    found = int(np.isfinite(out[:, 0, 0]).sum())
+    if found < len(out):
+        source.warnings.append(
+            f"{path}: {found} of {len(out)} frames have a pose within 0.02 s of their timestamp"
+        )
+    return out
+
+
+def read_matrix_pose(table: Float64, where: str) -> Float64:
+    """Check a (4, 4) pose read from a file, and make its rotation one to machine precision.
+
+    Not-a-number or infinite entries, which trackers write where they were lost, give NaN.
+    """
+    if table.shape != (4, 4):
+        raise InputError(
+            f"has {table.shape[0]} rows of {table.shape[-1]} numbers",
+            where=where,
+            remedy="write the pose as four rows of four numbers",
+        )
+    if not np.isfinite(table).all():
+        return np.full((4, 4), np.nan)
+    return orthonormalise(check_pose(table, where=where))
+
+
+def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
+    """Refuse timestamps that are not finite; warn of those that repeat or go back."""
+    if not np.isfinite(times).all():
+        k = int(np.argmin(np.isfinite(times)))
+        raise InputError(
+            f"line {k + 1} is {times[k]}", where=path, remedy="give every frame a time in seconds"
+        )
+    steps = np.diff(times)
+    if (steps < 0).any():
+        k = int(np.argmax(steps < 0)) + 1
+        warnings.append(f"{path}: time goes back at frame {k}; frames stay in the order of files")
+    elif (steps == 0).any():
+        k = int(np.argmax(steps == 0)) + 1
+        warnings.append(f"{path}: frames {k - 1} and {k} have the same time")
+
+
+def ply_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
+    """Read a PLY cloud as a view; points that are not finite are dropped."""
+    ply = read_ply(path)
+    return cloud_frame(
+        index, timestamp, ply.points, ply.normals, amplitude=ply.amplitude, color=ply.color
+    )
+
+
+def cloud_frame(
+    index: int,
+    timestamp: float,
+    points: NDArray[np.float32],
+    normals: NDArray[np.float32] | None = None,
+    *,
+    amplitude: NDArray[np.float32] | None = None,
+    color: NDArray[np.uint8] | None = None,
+    origin: Float64 | None = None,
+) -> CloudFrame:
+    """Make a view of (N, 3) points and what is known of each, dropping those not finite."""
+    frame = CloudFrame(
+        index,
+        timestamp,
+        points,
+        normals,
+        amplitude=amplitude,
+        color=color,
+        origin=np.zeros(3) if origin is None else origin,
+    )
+    finite = np.asarray(np.isfinite(points).all(1))
+    return frame if finite.all() else frame.keep(finite)
+
+
+class JoinedSource:
+    """Several sources one after the other."""
+
+    def __init__(self, parts: Sequence[Source], names: Sequence[str]) -> None:
+        self.parts = list(parts)
+        counts = [len(p.timestamps) for p in self.parts]
+        self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
+        self.warnings = _joined_warnings(self.parts, names)
+        self.timestamps = self._joined_times(names)
+        self.reference = _joined_poses([p.reference for p in self.parts], counts)
+        self.odometry = _joined_poses([p.odometry for p in self.parts], counts)
+        self.metadata: dict[str, Any] = dict(self.parts[0].metadata)
+        for part in self.parts[1:]:
+            # Only what holds for all of them.
+            self.metadata = {
+                key: value
+                for key, value in self.metadata.items()
+                if key in part.metadata and part.metadata[key] == value
+            }
+        self.metadata["parts"] = [
+            {"name": name, "frames": count} for name, count in zip(names, counts, strict=True)
+        ]
+
+    def _joined_times(self, names: Sequence[str]) -> Float64:
+        times: list[Float64] = []
+        for part, name in zip(self.parts, names, strict=True):
+            own = part.timestamps
+            if times and own[0] <= times[-1][-1]:
+                steps = np.diff(own)
+                step = float(np.median(steps)) if len(steps) else 1.0
+                shift = float(times[-1][-1]) + max(step, 1e-3) - float(own[0])
+                own = own + shift
+                self.warnings.append(f"{name}: starts anew in time, moved on by {shift:.6g} s")
+            times.append(own)
+        return np.concatenate(times)
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        part = int(np.searchsorted(self.starts, index, side="right")) - 1
+        frame = self.parts[part].read(index - int(self.starts[part]))
+        return replace(frame, index=index, timestamp=float(self.timestamps[index]))
+
+
+def _joined_warnings(parts: Sequence[Source], names: Sequence[str]) -> list[str]:
+    """Return the parts' warnings, each once, naming the part where they differ."""
+    lines: dict[str, list[str]] = {}
+    for part, name in zip(parts, names, strict=True):
+        for line in part.warnings:
+            lines.setdefault(line, []).append(name)
+    return [
+        line if len(where) == len(parts) or where[0] in line else f"{', '.join(where)}: {line}"
+        for line, where in lines.items()
+    ]
+
+
+def _joined_poses(poses: Sequence[Float64 | None], counts: Sequence[int]) -> Float64 | None:
+    if all(p is None for p in poses):
+        return None
+    return np.concatenate(
+        [np.full((n, 4, 4), np.nan) if p is None else p for p, n in zip(poses, counts, strict=True)]
+    )
+
+
+class LimitedSource:
+    """A source with only the points between two depths: z of images, distance in clouds."""
+
+    def __init__(self, source: Source, nearest: float, farthest: float) -> None:
+        self.source, self.nearest, self.farthest = source, nearest, farthest
+        self.timestamps = source.timestamps
+        self.reference = source.reference
+        self.odometry = source.odometry
+        self.warnings = source.warnings
+        self.metadata = source.metadata
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        frame = self.source.read(index)
+        if isinstance(frame, RangeFrame):
+            return frame.keep((frame.z >= self.nearest) & (frame.z <= self.farthest))
+        distance = np.linalg.norm(frame.points - frame.origin, axis=1)
+        return frame.keep((distance >= self.nearest) & (distance <= self.farthest))
