@@ -1,46 +1,22 @@
-"""Loops that a person gives by hand, in a text file."""
+"""The file in which a person gives loops by hand."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.geometry import quaternion, se3
-from tofuse.posegraph.graph import LoopRecord
-from tofuse.posegraph.loops import LoopEdge
-
-Float64 = NDArray[np.float64]
-
-# A measurement given by hand is taken to be good to 1 cm and 0.01 rad (about half a degree).
-GIVEN_INFORMATION = np.diag([1e4] * 6)
+from tofuse.posegraph.loops import GivenLoop
 
 _UNIT = 1e-2  # how far a quaternion written with few digits may be from length 1
 
 
-@dataclass(frozen=True, eq=False)
-class GivenLoop:
-    """Frames i and j (indices, i < j) see the same place; T_i_j is None where not given."""
-
-    i: int
-    j: int
-    T_i_j: Float64 | None = None
-
-    def edge(self) -> tuple[LoopRecord, LoopEdge] | None:
-        """Return the record and edge of a loop that came with its motion, None otherwise."""
-        if self.T_i_j is None:
-            return None
-        record = LoopRecord(self.i, self.j, True, "given with its motion")
-        return record, LoopEdge(self.i, self.j, self.T_i_j, GIVEN_INFORMATION)
-
-
 def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[GivenLoop]:
-    """Read lines of ``i j`` or ``i j tx ty tz qx qy qz qw`` (the measured T_i_j, m).
+    """Read lines of ``i j`` or ``i j tx ty tz qx qy qz qw`` (frame indices; the measured T_i_j, m).
 
     ``#`` starts a comment. `frames` are the indices that exist, if they are to be checked.
 

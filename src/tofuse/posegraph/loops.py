@@ -1,195 +1,167 @@
-"""Loops: views that see again what an earlier view saw (section 3.4)."""
+"""Loops: what finding them gives, and how two views are confirmed to form one."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import RegistrationError
-from tofuse.geometry import se3
-from tofuse.parts import part
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.icp import algorithm_1
 
 Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # Keeps the draws of loops apart from those of other stages that register the same pair.
 SEED_STAGE = 2
 
+# A measurement given by hand is taken to be good to 1 cm and 0.01 rad (about half a degree).
+GIVEN_INFORMATION = np.diag([1e4] * 6)
+
 
 @dataclass(frozen=True, eq=False)
-class LoopEdge:
-    """A loop to close: the measured T_i_j of frames i and j (indices, i < j).
+class GivenLoop:
+    """A person says that frames i and j (indices, i < j) see the same place.
 
-    `information` is (6, 6), of the right perturbation in the frame of j.
+    `T_i_j` is the (4, 4) motion, or None if it is to be found by registration.
     """
 
     i: int
     j: int
-    T_i_j: Float64
-    information: Float64
+    T_i_j: Float64 | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """What was decided about a candidate, and what was measured if it was accepted.
+
+    `T_i_j` is the motion between the frames of the record, `information` (6, 6) that of its
+    right perturbation, in the frame of j; both None where the loop is rejected.
+    """
+
+    record: LoopRecord
+    T_i_j: Float64 | None = None
+    information: Float64 | None = None
+
+
+class Loops(Protocol):
+    """Loop detection at work: holds what it needs of the frames so far."""
+
+    def push(self, view: Frame, T_world_camera: Float64) -> None:
+        """Add the next frame that has a pose."""
+        ...
+
+    def finish(self, given: Sequence[GivenLoop] = ()) -> list[ClosedLoop]:
+        """Return every candidate and given loop with its decision, in the order of j, then i."""
+        ...
+
+
+class LoopDetector(Protocol):
+    """A method that finds places that the camera comes back to."""
+
+    part_kind: ClassVar[str] = "loops"
+
+    def start(self, seed: int) -> Loops:
+        """Begin a new recording."""
+        ...
 
 
 @dataclass(frozen=True)
 class Confirmation:
-    """How well two views must fit before they count as a loop (section 3.4).
+    """Register two views, and accept them if the error is low and enough points correspond (3.4).
+
+    E of Algorithm 1 falls when points lose their partners, as it is divided by the number of all
+    points; so it is the mean distance of the corresponding points that must be low here.
 
     Attributes
     ----------
-    max_error
-        Largest E of Algorithm 1, in units of its resolution. E is divided by all points, so it
-        also falls when points lose their partners: alone it confirms nothing.
+    registrations
+        Used one after another, each from where the one before arrived: coarse to fine, as a
+        trajectory has drifted when a loop closes. The last one is judged.
     min_share
-        Least share of the source's points that must have a correspondence, 0 to 1. How large it
-        can be depends on how densely the registration samples the views in units of its
-        resolution.
+        Least share of the source's points that must correspond, 0 to 1.
+    max_error
+        Largest mean distance of corresponding points in units of the resolution, that is, E over
+        the corresponding points alone.
     """
 
-    max_error: float = 0.35
+    registrations: tuple[Registrar, ...] = field(
+        default_factory=lambda: (algorithm_1(0.2), algorithm_1(0.05))
+    )
     min_share: float = 0.25
+    max_error: float = 0.65
+
+    def __post_init__(self) -> None:
+        if not self.registrations:
+            raise ValueError("registrations is empty")
+        if not 0 <= self.min_share <= 1:
+            raise ValueError(f"min_share is {self.min_share}, not 0 to 1")
+        if not self.max_error > 0:
+            raise ValueError(f"max_error is {self.max_error}, not above 0")
 
     def objection(self, registration: Registration) -> str:
         """Return why a registration is not good enough, or nothing if it is."""
-        if registration.share < self.min_share:
+        if registration.correspondences == 0 or registration.share < self.min_share:
             return (
-                f"too few correspondences: {registration.share:.0%} of the points, "
-                f"not {self.min_share:.0%}"
+                f"only {registration.share:.0%} of the points correspond, "
+                f"{self.min_share:.0%} are needed"
             )
-        if not registration.error <= self.max_error:
-            return f"too large an error: {registration.error:.3g}, not {self.max_error:.3g}"
+        error = mean_error(registration)
+        if not error <= self.max_error:
+            return f"the error is {error:.2f} of the resolution, above {self.max_error:.2f}"
         return ""
 
+    def confirm(self, source: Frame, target: Frame, guess: Float64, *, seed: int) -> ClosedLoop:
+        """Decide whether two views form a loop.
 
-class LoopDetector(Protocol):
-    """A method that says where the camera may be again, and how to make sure."""
+        Starts from the guess and, as the trajectory may be far off, from the identity; the
+        better end counts: one that is good enough before one that is not, then the one with more
+        corresponding points.
 
-    part_kind: ClassVar[str] = "loops"
-
-    @property
-    def confirmation(self) -> Confirmation:
-        """What a registration of the two views must reach."""
-        ...
-
-    def candidates(self, poses: Float64) -> Integers:
-        """Return the positions of earlier cameras that the newest may see again, best first.
-
-        `poses` is (N, 4, 4) T_world_camera in the order of the frames, NaN where there is none;
-        the newest comes last.
+        Parameters
+        ----------
+        source, target
+            The views of the later and of the earlier frame.
+        guess
+            (4, 4) T_target_source as the trajectory has it.
+        seed
+            Of the run: the same pair and seed give the same answer.
         """
-        ...
+        i, j = target.index, source.index
+        found: list[Registration] = []
+        failure = ""
+        for start in (guess, np.eye(4)):
+            try:
+                found.append(self._register(source, target, start, seed))
+            except RegistrationError as error:
+                failure = failure or str(error)
+        if not found:
+            return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))
+        best = max(found, key=lambda r: (not self.objection(r), r.share, -r.error))
+        objection = self.objection(best)
+        reason = objection or (
+            f"{best.share:.0%} of the points correspond, with an error of "
+            f"{mean_error(best):.2f} of the resolution"
+        )
+        record = LoopRecord(i, j, not objection, reason, overlap=best.share, rms_m=best.rms_m)
+        if objection:
+            return ClosedLoop(record)
+        return ClosedLoop(record, best.T_target_source, best.information)
+
+    def _register(self, source: Frame, target: Frame, guess: Float64, seed: int) -> Registration:
+        rng = np.random.default_rng([seed, SEED_STAGE, source.index, target.index])
+        registration = self.registrations[0].register(source, target, guess, rng)
+        for registrar in self.registrations[1:]:
+            guess = registration.T_target_source
+            registration = registrar.register(source, target, guess, rng)
+        return registration
 
 
-@part("loops", "given")
-@dataclass(frozen=True)
-class Given(LoopDetector):
-    """Look for no loops: only those given by hand are closed, as in chapter 4 of the thesis."""
-
-    confirmation: Confirmation = Confirmation()
-
-    def candidates(self, poses: Float64) -> Integers:
-        """See `LoopDetector.candidates`: there are none."""
-        return np.zeros(0, np.intp)
-
-
-@part("loops", "nearby", label="validated")
-@dataclass(frozen=True)
-class Nearby(LoopDetector):
-    """Take cameras as candidates that are close and look the same way (section 3.4).
-
-    Attributes
-    ----------
-    max_distance_m
-        Largest distance between the two cameras.
-    max_yaw_rad
-        Largest rotation about the camera's y axis between them.
-    min_gap
-        Cameras closer behind than this many frames are too recent to form a loop.
-    per_frame
-        At most so many candidates for each frame, the nearest in distance and yaw.
-    """
-
-    max_distance_m: float = 0.5
-    max_yaw_rad: float = 0.35
-    min_gap: int = 16
-    per_frame: int = 2
-    confirmation: Confirmation = Confirmation()
-
-    def __post_init__(self) -> None:
-        for name in ("max_distance_m", "max_yaw_rad"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("min_gap", "per_frame"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
-
-    def candidates(self, poses: Float64) -> Integers:
-        """See `LoopDetector.candidates`."""
-        old = poses[: max(0, len(poses) - self.min_gap)]
-        if len(old) == 0:
-            return np.zeros(0, np.intp)
-        distance = np.linalg.norm(old[:, :3, 3] - poses[-1, :3, 3], axis=1) / self.max_distance_m
-        angle = np.abs(yaw(se3.inverse(old) @ poses[-1])) / self.max_yaw_rad
-        # NaN, of a lost frame, compares as False.
-        near = np.flatnonzero((distance <= 1) & (angle <= 1))
-        order = np.argsort(distance[near] ** 2 + angle[near] ** 2, kind="stable")
-        return near[order[: self.per_frame]]
-
-
-def yaw(T: Float64) -> Float64:
-    """Heading of the z axis about the y axis, -pi to pi rad, of motions (..., 4, 4)."""
-    return np.arctan2(T[..., 0, 2], T[..., 2, 2])
-
-
-def confirm(
-    source: Frame,
-    target: Frame,
-    guess: Float64,
-    registrar: Registrar,
-    confirmation: Confirmation,
-    *,
-    seed: int,
-) -> tuple[LoopRecord, LoopEdge | None]:
-    """Register two views and decide whether they close a loop.
-
-    The registration is tried from the guess and, as a trajectory may have drifted far, from the
-    identity. Of those that are good enough (else of all) the one with more correspondences counts.
-
-    Parameters
-    ----------
-    source, target
-        The two views; the later one is registered to the earlier one, whatever their order here.
-    guess
-        (4, 4) T_target_source, as the trajectory has it.
-    seed
-        Of the run: the same pair and seed give the same answer.
-
-    Returns
-    -------
-    record, edge
-        What was decided and why; the edge is None where the loop is not accepted.
-    """
-    i, j = target.index, source.index
-    if j < i:
-        return confirm(target, source, se3.inverse(guess), registrar, confirmation, seed=seed)
-    found: list[Registration] = []
-    failure = ""
-    for start in (guess, np.eye(4)):
-        try:
-            rng = np.random.default_rng([seed, SEED_STAGE, i, j])
-            found.append(registrar.register(source, target, start, rng))
-        except RegistrationError as error:
-            failure = str(error)
-    if not found:
-        return LoopRecord(i, j, False, f"can't be registered: {failure}"), None
-    best = max(found, key=lambda r: (not confirmation.objection(r), r.share, -r.error))
-    objection = confirmation.objection(best)
-    reason = objection or f"{best.share:.0%} of the points correspond, error {best.error:.3g}"
-    record = LoopRecord(i, j, not objection, reason, overlap=best.share, rms_m=best.rms_m)
-    if objection:
-        return record, None
-    return record, LoopEdge(i, j, best.T_target_source, best.information)
+def mean_error(registration: Registration) -> float:
+    """E over the corresponding points alone: their mean distance in units of the resolution."""
+    return registration.error / registration.share if registration.share else np.inf

@@ -1,0 +1,122 @@
+"""Loops between cameras that are close together and look the same way (section 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.parts import part
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.loops import (
+    GIVEN_INFORMATION,
+    ClosedLoop,
+    Confirmation,
+    GivenLoop,
+    LoopDetector,
+    Loops,
+)
+from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+
+@part("loops", "nearby", label="validated")
+@dataclass(frozen=True)
+class Nearby(LoopDetector):
+    """Takes an earlier camera as a candidate if it is close and has about the same yaw.
+
+    Attributes
+    ----------
+    max_distance_m
+        Largest distance between the two cameras.
+    max_yaw_rad
+        Largest rotation about the camera's y axis between them.
+    min_gap
+        An earlier camera must be at least so many frames (with a pose) behind; nearer ones are
+        too recent to form a loop.
+    per_frame
+        At most so many candidates for each frame, the nearest in distance and yaw; 0 looks for
+        none, which leaves the loops given by hand (as in chapter 4 of the thesis).
+    confirmation
+        Tells a loop from two places that lie near each other.
+    """
+
+    max_distance_m: float = 0.5
+    max_yaw_rad: float = 0.35
+    min_gap: int = 16
+    per_frame: int = 2
+    confirmation: Confirmation = field(default_factory=Confirmation)
+
+    def __post_init__(self) -> None:
+        for name in ("max_distance_m", "max_yaw_rad"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+        if self.min_gap < 1:
+            raise ValueError(f"min_gap is {self.min_gap}, not 1 or more")
+        if self.per_frame < 0:
+            raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
+
+    def start(self, seed: int) -> Loops:
+        """See `LoopDetector.start`."""
+        return _NearbyLoops(self, seed)
+
+    def candidates(self, poses: Float64) -> Integers:
+        """Return the positions of the cameras that the newest may see again, best first.
+
+        `poses` is (N, 4, 4) T_world_camera in the order of the frames; the newest comes last.
+        """
+        old = poses[: max(0, len(poses) - self.min_gap)]
+        if len(old) == 0:
+            return np.zeros(0, np.intp)
+        distance = np.linalg.norm(old[:, :3, 3] - poses[-1, :3, 3], axis=1) / self.max_distance_m
+        angle = np.abs(yaw(se3.inverse(old) @ poses[-1])) / self.max_yaw_rad
+        near = np.flatnonzero((distance <= 1) & (angle <= 1))
+        order = np.argsort(distance[near] ** 2 + angle[near] ** 2, kind="stable")
+        return near[order[: self.per_frame]]
+
+
+class _NearbyLoops(Loops):
+    def __init__(self, options: Nearby, seed: int) -> None:
+        self._options = options
+        self._seed = seed
+        self._views: dict[int, Frame] = {}
+        self._poses: dict[int, Float64] = {}
+        self._closed: dict[tuple[int, int], ClosedLoop] = {}
+
+    def push(self, view: Frame, T_world_camera: Float64) -> None:
+        """See `Loops.push`."""
+        self._views[view.index] = view
+        self._poses[view.index] = T_world_camera
+        frames = list(self._poses)
+        for k in self._options.candidates(np.stack(list(self._poses.values()))):
+            self._closed[frames[k], view.index] = self._confirm(frames[k], view.index)
+
+    def finish(self, given: Sequence[GivenLoop] = ()) -> list[ClosedLoop]:
+        """See `Loops.finish`. What a person gives takes the place of what was found."""
+        for loop in given:
+            self._closed[loop.i, loop.j] = self._given(loop)
+        return [self._closed[pair] for pair in sorted(self._closed, key=lambda ij: ij[::-1])]
+
+    def _confirm(self, i: int, j: int) -> ClosedLoop:
+        guess = se3.inverse(self._poses[i]) @ self._poses[j]
+        confirmation = self._options.confirmation
+        return confirmation.confirm(self._views[j], self._views[i], guess, seed=self._seed)
+
+    def _given(self, loop: GivenLoop) -> ClosedLoop:
+        for frame in (loop.i, loop.j):
+            if frame not in self._poses:
+                return ClosedLoop(LoopRecord(loop.i, loop.j, False, f"frame {frame} has no pose"))
+        if loop.T_i_j is None:
+            return self._confirm(loop.i, loop.j)
+        record = LoopRecord(loop.i, loop.j, True, "given with its motion")
+        return ClosedLoop(record, loop.T_i_j, GIVEN_INFORMATION)
+
+
+def yaw(T: Float64) -> Float64:
+    """Heading of the z axis about the y axis, -pi to pi rad, of motions (..., 4, 4)."""
+    return np.arctan2(T[..., 0, 2], T[..., 2, 2])
