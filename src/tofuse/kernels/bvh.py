@@ -235,7 +235,6 @@ def cast_rays(
                     ay = triangles[f, ky] - py - sy * az
                     bx = triangles[f, 3 + kx] - px - sx * bz
                     by = triangles[f, 3 + ky] - py - sy * bz
-                    u = 0.0
                     cx = triangles[f, 6 + kx] - px - sx * cz
                     cy = triangles[f, 6 + ky] - py - sy * cz
                     u = cx * by - cy * bx

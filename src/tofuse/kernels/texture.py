@@ -49,10 +49,18 @@ def value_noise(table: Float64, x: float, y: float, z: float) -> float:
 
 @kernel
 def fractal_noise(table: Float64, x: float, y: float, z: float) -> float:
-    """Three octaves of `value_noise`, near unit variance on the average over a surface."""
-    total = value_noise(table, x, y, z)
-    total += 0.7 * value_noise(table, 2.13 * x + 31.7, 2.13 * y + 11.3, 2.13 * z + 47.1)
-    total += 0.5 * value_noise(table, 4.31 * x + 7.9, 4.31 * y + 53.9, 4.31 * z + 19.3)
+    """Three octaves of `value_noise`, near unit variance on the average over a surface.
+
+    Each octave is turned its own way: surfaces along the axes would show the lattice.
+    """
+    a = (2.0 * x + 2.0 * y - z) / 3.0
+    b = (2.0 * z - x + 2.0 * y) / 3.0
+    c = (2.0 * x - y + 2.0 * z) / 3.0
+    total = value_noise(table, a, b, c)
+    a, b, c = 0.6 * a - 0.8 * b, 0.8 * a + 0.6 * b, c
+    total += 0.7 * value_noise(table, 2.13 * a + 31.7, 2.13 * b + 11.3, 2.13 * c + 47.1)
+    b, c = 0.6 * b - 0.8 * c, 0.8 * b + 0.6 * c
+    total += 0.5 * value_noise(table, 4.31 * a + 7.9, 4.31 * b + 53.9, 4.31 * c + 19.3)
     return 1.3 * total
 
 
@@ -73,7 +81,6 @@ def pattern_at(table: Float64, row: Float64, x: float, y: float, z: float) -> fl
     if kind == TILES:
         # Joints between square tiles, with soft edges, and a tone for each tile.
         joint = 0.0
-        tone = 0.0
         for k in range(3):
             q = u if k == 0 else (v if k == 1 else w)
             away = abs(q - np.floor(q) - 0.5)

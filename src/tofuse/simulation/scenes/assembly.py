@@ -44,3 +44,13 @@ def shell(
     # The order of the faces of `box`: -z, +z, -y, +y, -x, +x, two triangles each.
     for k, material in enumerate([floor, ceiling, walls[2], walls[3], walls[0], walls[1]]):
         assembly.add(material, Mesh(hull.vertices, hull.faces[2 * k : 2 * k + 2], hull.surface[:2]))
+
+
+BACKDROP = Material("backdrop", 0.5, 0.15, "noise", (0.6, 0.6, 0.6))
+LINOLEUM = Material("linoleum", 0.4, 0.12, "speckle", (0.1, 0.1, 0.1))
+WHITE = Material("ceiling", 0.78)
+
+
+def studio(assembly: Assembly) -> None:
+    """Add a room around an object at the origin and a camera at -x: the background is 3 m off."""
+    shell(assembly, (-2.2, -2.6, 0), (3.0, 2.6, 2.6), [BACKDROP] * 4, LINOLEUM, WHITE)
