@@ -92,13 +92,14 @@ def point_information(points: Float64, i: Int64, weight: Float64) -> Float64:
         for a in range(3):
             x = w * points[i[k], a]
             first[a] += x
-            for b in range(3):
+            for b in range(a + 1):
                 second[a, b] += x * points[i[k], b]
     out = np.zeros((6, 6))
     for a in range(3):
         out[a, a] = total
-        for b in range(3):
+        for b in range(a + 1):
             out[3 + a, 3 + b] = -second[a, b]
+            out[3 + b, 3 + a] = -second[a, b]
     trace = second[0, 0] + second[1, 1] + second[2, 2]
     for a in range(3):
         out[3 + a, 3 + a] += trace
