@@ -1,0 +1,262 @@
+"""Cameras by name: lens, modulation and noise, as far as they are known.
+
+The SR4000's gain, noise, falloff and confidence thresholds are fitted to a real recording (see
+docs/simulator.md). The others follow data sheets and published lens parameters; their noise is
+set to the scale that the makers state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import BrownConrady, Pinhole, Rational
+
+Float64 = NDArray[np.float64]
+
+SPEED_OF_LIGHT = 299_792_458.0
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """One ToF camera.
+
+    Attributes
+    ----------
+    name
+        As in `CAMERAS`.
+    camera
+        Resolution, intrinsics and lens.
+    modulation_hz
+        Frequency that decides the precision.
+    unwrap_hz
+        Frequency that tells the periods of the former apart (the beat of a camera with several
+        frequencies), or None.
+    frame_rate_hz, integration_s
+        Frames a second; time from the begin of the first phase image to the end of the last.
+    depth_unit_m, depth_kind
+        Of the recorded images.
+    signal_electrons
+        Electrons in one phase image of a white wall (albedo 1) at 1 m, in the image's centre.
+    modulation_contrast
+        Demodulation contrast, 0 to 1.
+    ambient_electrons
+        Electrons of ambient light in one phase image of a white wall in a bright office.
+    read_noise_electrons
+        Standard deviation of reading one bucket.
+    full_well_electrons
+        What one bucket holds.
+    counts_per_electron
+        Of the amplitude image.
+    falloff
+        Light in a pixel falls as the cosine of its angle to the axis to this power (lens and
+        illumination, half each).
+    amplitude_kind
+        "raw", "ir", or "range_compensated": multiplied by the square of the measured range and
+        divided by the falloff, as the SR4000 does.
+    minimum_amplitude
+        Raw counts below which the camera drops a pixel; 0: never.
+    confidence_thresholds
+        Raw counts at which confidence rises by one step; empty: no confidence map.
+    reports_noise
+        Whether each frame comes with a standard deviation of the range.
+    harmonics
+        Third and fifth harmonic of the correlation, relative to the first.
+    readout_delay_m, pixel_delay_m
+        Range offset from the first to the last column along the read-out chain (and a quarter of
+        it over the rows), and standard deviation from pixel to pixel.
+    compression
+        Share by which a signal that fills the wells is measured too weak.
+    drift_m, drift_time_s
+        Range offset of a warm camera that was switched on at time 0, and its time constant.
+    """
+
+    name: str
+    camera: Pinhole
+    modulation_hz: float
+    frame_rate_hz: float
+    integration_s: float
+    depth_unit_m: float
+    signal_electrons: float
+    read_noise_electrons: float
+    full_well_electrons: float
+    unwrap_hz: float | None = None
+    depth_kind: Literal["z", "range"] = "z"
+    modulation_contrast: float = 0.8
+    ambient_electrons: float = 1500.0
+    counts_per_electron: float = 0.064
+    falloff: float = 4.0
+    amplitude_kind: Literal["raw", "range_compensated", "ir"] = "raw"
+    minimum_amplitude: float = 0.0
+    confidence_thresholds: tuple[float, ...] = ()
+    reports_noise: bool = False
+    harmonics: tuple[float, float] = (0.012, 0.004)
+    readout_delay_m: float = 0.02
+    pixel_delay_m: float = 0.003
+    compression: float = 0.1
+    drift_m: float = 0.012
+    drift_time_s: float = 240.0
+
+    @property
+    def period_m(self) -> float:
+        """Range over which the phase of the fine frequency repeats."""
+        return SPEED_OF_LIGHT / (2 * self.modulation_hz)
+
+    @property
+    def ambiguity_m(self) -> float:
+        """Range after which the measurement repeats."""
+        return SPEED_OF_LIGHT / (2 * (self.unwrap_hz or self.modulation_hz))
+
+    @property
+    def frequencies(self) -> tuple[float, ...]:
+        """Modulation frequencies in Hz, the fine one first."""
+        return (
+            (self.modulation_hz,)
+            if self.unwrap_hz is None
+            else (
+                self.modulation_hz,
+                self.unwrap_hz,
+            )
+        )
+
+    @property
+    def confidence_max(self) -> int | None:
+        """Highest value of the confidence map, or None without one."""
+        return len(self.confidence_thresholds) or None
+
+    @cached_property
+    def transmission(self) -> Float64:
+        """(H, W) light in each pixel relative to the axis; 0 where the lens shows nothing."""
+        rays = self.camera.rays().astype(float)
+        cosine = 1 / np.sqrt(1 + (rays * rays).sum(-1))
+        return np.where(np.isfinite(cosine), cosine**self.falloff, 0.0)
+
+
+CAMERAS: dict[str, CameraModel] = {
+    model.name: model
+    for model in (
+        # Mesa SwissRanger SR4000, 5 m version.
+        CameraModel(
+            name="sr4000",
+            camera=BrownConrady(176, 144, 229.0, 229.0, 87.1, 71.6, k1=-0.12, k2=0.08),
+            modulation_hz=29_979_245.8,
+            frame_rate_hz=30.0,
+            integration_s=0.030,
+            depth_unit_m=0.0001,
+            signal_electrons=68_000.0,
+            read_noise_electrons=45.0,
+            full_well_electrons=180_000.0,
+            amplitude_kind="range_compensated",
+            confidence_thresholds=(10.5, 16.4, 24.0, 33.0, 47.8, 73.1, 136.0),
+        ),
+        # Microsoft Kinect v2: 16, 80 and 120 MHz, in which 80 MHz carries the range here.
+        CameraModel(
+            name="kinect2",
+            camera=BrownConrady(512, 424, 365.5, 365.5, 257.0, 209.5, k1=0.093, k2=-0.27, k3=0.097),
+            modulation_hz=80e6,
+            unwrap_hz=8e6,
+            frame_rate_hz=30.0,
+            integration_s=0.020,
+            depth_unit_m=0.0002,
+            signal_electrons=90_000.0,
+            read_noise_electrons=50.0,
+            full_well_electrons=600_000.0,
+            amplitude_kind="ir",
+            minimum_amplitude=12.0,
+            harmonics=(0.010, 0.003),
+            readout_delay_m=0.01,
+            pixel_delay_m=0.001,
+        ),
+        # Azure Kinect, narrow field of view, unbinned.
+        CameraModel(
+            name="azure-nfov",
+            camera=Rational(
+                640,
+                576,
+                504.6,
+                504.7,
+                332.8,
+                348.8,
+                k1=0.548,
+                k2=-0.0210,
+                p1=2.06e-5,
+                p2=-7.21e-5,
+                k3=-0.00265,
+                k4=0.890,
+                k5=0.0861,
+                k6=-0.0139,
+            ),
+            modulation_hz=200e6,
+            unwrap_hz=15e6,
+            frame_rate_hz=30.0,
+            integration_s=0.0128,
+            depth_unit_m=0.001,
+            signal_electrons=20_000.0,
+            read_noise_electrons=14.0,
+            full_well_electrons=150_000.0,
+            ambient_electrons=400.0,
+            amplitude_kind="ir",
+            minimum_amplitude=8.0,
+            harmonics=(0.006, 0.002),
+            readout_delay_m=0.004,
+            pixel_delay_m=0.001,
+            drift_m=0.004,
+        ),
+        # pmd CamBoard pico flexx: 60 and 80 MHz.
+        CameraModel(
+            name="pico-flexx",
+            camera=BrownConrady(224, 171, 211.8, 211.8, 117.6, 87.2, k1=0.36, k2=-3.4, k3=6.4),
+            modulation_hz=80_320_000.0,
+            unwrap_hz=20_080_000.0,
+            frame_rate_hz=45.0,
+            integration_s=0.012,
+            depth_unit_m=0.00025,
+            signal_electrons=7_000.0,
+            read_noise_electrons=30.0,
+            full_well_electrons=90_000.0,
+            ambient_electrons=800.0,
+            minimum_amplitude=3.0,
+            confidence_thresholds=(6.0, 12.0, 25.0),
+            readout_delay_m=0.008,
+            pixel_delay_m=0.002,
+        ),
+        # ifm O3R, 3D head with 60 x 45 degrees.
+        CameraModel(
+            name="ifm-o3r",
+            camera=BrownConrady(224, 172, 186.0, 186.0, 111.5, 85.5, k1=-0.25, k2=0.07),
+            modulation_hz=80e6,
+            unwrap_hz=5e6,
+            frame_rate_hz=20.0,
+            integration_s=0.015,
+            depth_unit_m=1.52587890625e-4,
+            depth_kind="range",
+            signal_electrons=30_000.0,
+            read_noise_electrons=40.0,
+            full_well_electrons=300_000.0,
+            minimum_amplitude=6.0,
+            reports_noise=True,
+            readout_delay_m=0.008,
+            pixel_delay_m=0.002,
+        ),
+    )
+}
+
+
+def camera_model(name: str) -> CameraModel:
+    """Return the camera called `name`.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if name not in CAMERAS:
+        raise InputError(
+            f"there is no camera called {name!r}", where="camera", remedy=f"use one of {[*CAMERAS]}"
+        )
+    return CAMERAS[name]
