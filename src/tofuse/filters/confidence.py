@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -19,23 +20,31 @@ from tofuse.recordings.frames import Frame, RangeFrame
 class Confidence(Filter):
     """Keep points of at least a level of the camera's confidence map (section 2.8).
 
-    The SR4000 gives levels 0 to 7; chapter 4 keeps 7 alone. Other cameras count differently. A
-    view without a confidence map is kept whole.
+    The SR4000 gives levels 0 to 7; chapter 4 keeps 7 alone. Other cameras count differently: see
+    `on_scale`. A view without a confidence map is kept whole.
 
     Attributes
     ----------
     minimum
-        Lowest level that is kept, 0 to 255.
+        Lowest level that is kept, 0 to `highest`.
+    highest
+        The camera's highest level, 1 to 255.
     """
 
     minimum: int = 7
+    highest: int = 7
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         whole("minimum", self.minimum, 0)
-        if self.minimum > 255:
-            raise ValueError(f"minimum must be at most 255, not {self.minimum}")
+        whole("highest", self.highest, 1)
+        if not self.minimum <= self.highest <= 255:
+            raise ValueError(f"minimum {self.minimum} of {self.highest} is not a level up to 255")
+
+    def on_scale(self, highest: int) -> Confidence:
+        """Return the filter for a camera whose highest level is `highest`, as strict as this."""
+        return Confidence(math.ceil(self.minimum / self.highest * highest), highest)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

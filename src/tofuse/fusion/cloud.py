@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -157,14 +158,23 @@ def empty_cloud() -> Cloud:
     return Cloud(np.zeros((0, 3), np.float32), None, None, np.zeros(0, np.int32), np.zeros(3))
 
 
-def thin(frame: Frame, points: int) -> Frame:
-    """Return the view with at most about `points` points, taken at an even stride."""
-    step = -(-len(frame) // points)
-    if step <= 1:
-        return frame
-    mask = np.zeros(frame.valid.shape, bool)
-    mask.ravel()[np.flatnonzero(frame.valid.ravel())[::step]] = True
-    return frame.keep(mask)
+def as_cloud(frame: Frame, most: int) -> CloudFrame:
+    """Return the view as a cloud of at most `most` points, taken at an even stride."""
+    part = slice(None, None, max(1, -(-len(frame) // most)))
+
+    def cut(values: NDArray[Any] | None) -> Any:
+        return None if values is None else values[part].copy()
+
+    return CloudFrame(
+        frame.index,
+        frame.timestamp,
+        cut(frame.points),
+        cut(frame.normals),
+        cut(frame.sigma),
+        cut(frame.amplitude),
+        cut(frame.color),
+        frame.origin,
+    )
 
 
 def _voxel_keys(points: Float64, voxel: float) -> NDArray[np.int64]:

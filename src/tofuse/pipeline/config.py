@@ -15,6 +15,7 @@ from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import LoopDetector
+from tofuse.registration.base import Registrar
 from tofuse.results.output import read_run_json
 
 
@@ -31,7 +32,9 @@ class Config:
     odometry
         Turns frames into poses.
     loops
-        Finds and confirms places that the camera comes back to.
+        Finds places that the camera comes back to.
+    verification
+        Registers the two ends of a loop.
     optimiser
         Spreads the error of the loops.
     fusion
@@ -42,8 +45,14 @@ class Config:
     filters: tuple[Filter, ...]
     odometry: Odometry
     loops: LoopDetector
+    verification: Registrar
     optimiser: Optimiser
     fusion: CloudFusion
+
+    @property
+    def window(self) -> int:
+        """How many frames the filters look at, the current one included."""
+        return max([f.window for f in self.filters], default=1)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as in `run.json`."""
@@ -131,10 +140,15 @@ def check_views(config: Config, kind: str) -> None:
     kind
         "range" for images of a camera, "cloud" for bare clouds.
     """
-    for part in (*config.filters, config.odometry):
+    chosen: tuple[Filter | Odometry | Registrar, ...] = (
+        *config.filters,
+        config.odometry,
+        config.verification,
+    )
+    for part in chosen:
         if kind not in part.takes:
             raise InputError(
-                f"{type(part).part_kind} {parts.name_of(part)!r} takes {sorted(part.takes)} "
+                f"{part.part_kind} {parts.name_of(part)!r} takes {sorted(part.takes)} "
                 f"views, and this recording holds {kind} views",
                 where="configuration",
                 remedy="leave that part out with --config, or use another --method",

@@ -132,7 +132,7 @@ def write_result(
             cloud.points,
             normals=cloud.normals,
             color=cloud.color,
-            extra={"views": cloud.views},
+            scalars={"views": cloud.views},
         )
         if report is not None:
             report(result, staging)

@@ -1,0 +1,176 @@
+"""From what a run saw of itself to a verdict. Nothing here knows a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.evaluation.consistency import Consistency
+from tofuse.geometry import se3
+from tofuse.posegraph.graph import LoopRecord, Optimisation
+from tofuse.registration.base import Registration
+from tofuse.results.types import FrameRecord, Reason, Verdict
+from tofuse.results.verdict import verdict_of
+
+Float64 = NDArray[np.float64]
+
+# Below this share of corresponding points a registration is a guess.
+WEAK_SHARE = 0.05
+# More registrations than this that ran out of iterations are a pattern.
+UNSETTLED_SHARE = 0.05
+# A loop that moves the end by more than this share of the path (and these floors) bends the path.
+GAP_SHARE, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
+# Inliers of overlapping images: below the first most of what they saw contradicts the poses;
+# below the second share of what neighbours reach, or above that much more rms, they differ.
+CONTRADICTED_SHARE, AGREEMENT_RATIO, RMS_RATIO = 0.5, 0.9, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the judgement rests on.
+
+    Attributes
+    ----------
+    records, registrations
+        Of every frame, in order; a registration is None for the first and for lost frames.
+    loops
+        Every loop that was considered.
+    sequential
+        (N, 4, 4) poses before optimisation, of the frames with a pose.
+    optimisation
+        The graph after it.
+    agreement
+        Of all overlapping images under the final poses; None where there are too few.
+    given
+        Pairs (i, j) of loops given by hand.
+    """
+
+    records: tuple[FrameRecord, ...]
+    registrations: tuple[Registration | None, ...]
+    loops: tuple[LoopRecord, ...]
+    sequential: Float64
+    optimisation: Optimisation
+    agreement: Consistency | None
+    given: frozenset[tuple[int, int]] = frozenset()
+
+
+def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
+    """Return the verdict and the reasons for it, gravest first as they are listed."""
+    reasons = [
+        *_poses(evidence),
+        *_registrations(evidence),
+        *_loops(evidence),
+        *_images(evidence),
+    ]
+    return verdict_of(reasons), tuple(reasons)
+
+
+def _poses(e: Evidence) -> Iterator[Reason]:
+    readable = [r for r in e.records if r.status != "skipped"]
+    lost = [r for r in readable if r.status == "lost"]
+    everything = (e.records[0].index, e.records[-1].index)
+    if 2 * len(lost) > len(readable):
+        text = f"{len(lost)} of {len(readable)} readable frames have no pose."
+        yield Reason("few_poses", everything, text)
+    for first, last in stretches(e.records, "lost"):
+        yield Reason("lost_frames", (first, last), f"{_frames(first, last)} no pose.")
+    for first, last in stretches(e.records, "skipped"):
+        text = f"{_frames(first, last)} not been read."
+        yield Reason("unreadable_frames", (first, last), text)
+    if len(readable) - len(lost) == 1 and len(readable) == 1:
+        yield Reason("single_frame", everything, "There was one frame only, nothing to register.")
+
+
+def _registrations(e: Evidence) -> Iterator[Reason]:
+    pairs = [
+        (record.index, r)
+        for record, r in zip(e.records, e.registrations, strict=True)
+        if r is not None and record.status != "lost"
+    ]
+    if not pairs:
+        return
+    weak = [index for index, r in pairs if r.share < WEAK_SHARE]
+    if weak:
+        text = (
+            f"{len(weak)} frames have a partner for fewer than {WEAK_SHARE:.0%} of the points "
+            "that were compared."
+        )
+        yield Reason("weak_registration", (weak[0], weak[-1]), text)
+    unsettled = [index for index, r in pairs if not r.converged]
+    if len(unsettled) > UNSETTLED_SHARE * len(pairs):
+        text = f"{len(unsettled)} of {len(pairs)} registrations stopped before they settled."
+        yield Reason("not_converged", (unsettled[0], unsettled[-1]), text)
+
+
+def _loops(e: Evidence) -> Iterator[Reason]:
+    graph = e.optimisation.graph
+    first, last = int(graph.ids[0]), int(graph.ids[-1])
+    if len(graph.ids) > 1 and not graph.loop.any():
+        text = "No loop was closed, so nothing checks how much error has built up."
+        yield Reason("unchecked_drift", (first, last), text)
+    for loop in e.loops:
+        if (loop.i, loop.j) in e.given and not loop.accepted:
+            text = f"The loop {loop.i} to {loop.j} given by hand was not used: {loop.reason}."
+            yield Reason("loop_rejected", (loop.i, loop.j), text)
+    steps = np.linalg.norm(np.diff(e.sequential[:, :3, 3], axis=0), axis=1)
+    turns = se3.angle(se3.inverse(e.sequential[:-1]) @ e.sequential[1:])
+    for (i, j), measured in zip(
+        graph.edges[graph.loop], graph.measurements[graph.loop], strict=True
+    ):
+        a, b = min(i, j), max(i, j)
+        gap = se3.inverse(measured) @ se3.inverse(e.sequential[i]) @ e.sequential[j]
+        distance, angle = float(np.linalg.norm(gap[:3, 3])), float(se3.angle(gap))
+        too_far = distance > max(GAP_FLOOR_M, GAP_SHARE * float(steps[a:b].sum()))
+        too_bent = angle > max(GAP_FLOOR_RAD, GAP_SHARE * float(turns[a:b].sum()))
+        if too_far or too_bent:
+            ends = (int(graph.ids[a]), int(graph.ids[b]))
+            text = (
+                f"Before the loop {ends[0]} to {ends[1]} was closed its ends were "
+                f"{distance:.3f} m and {np.degrees(angle):.1f} degrees apart."
+            )
+            yield Reason("loop_gap", ends, text)
+    if not e.optimisation.converged:
+        text = "The optimiser ran out of iterations before it settled."
+        yield Reason("optimiser_gave_up", (first, last), text)
+
+
+def _images(e: Evidence) -> Iterator[Reason]:
+    a = e.agreement
+    if a is None or a.pairs == 0:
+        return
+    frames = (int(e.optimisation.graph.ids[0]), int(e.optimisation.graph.ids[-1]))
+    found = (
+        f"{a.inlier_share:.0%} of what overlapping images saw agrees, with "
+        f"{a.rms_m * 1e3:.0f} mm rms"
+    )
+    if a.inlier_share < CONTRADICTED_SHARE:
+        yield Reason("images_disagree", frames, f"Only {found}.")
+        return
+    # Images next to each other see the same errors of the sensor, but hardly any drift.
+    near = [p for p in a.agreements if p.j == p.i + 1]
+    if not near:
+        return
+    compared, inliers = sum(p.compared for p in near), sum(p.inliers for p in near)
+    share = inliers / max(compared, 1)
+    rms = float(np.sqrt(sum(p.squares for p in near) / max(inliers, 1)))
+    if a.inlier_share < AGREEMENT_RATIO * share or a.rms_m > RMS_RATIO * rms:
+        text = f"{found}; images next to each other reach {share:.0%} and {rms * 1e3:.0f} mm."
+        yield Reason("images_differ", frames, text)
+
+
+def stretches(records: Sequence[FrameRecord], status: str) -> list[tuple[int, int]]:
+    """Return (first, last) frame index of each unbroken stretch of frames with that status."""
+    has = np.array([False, *(r.status == status for r in records), False])
+    edges = np.flatnonzero([a != b for a, b in pairwise(has)])
+    return [
+        (records[a].index, records[b - 1].index)
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _frames(first: int, last: int) -> str:
+    return f"Frame {first} has" if first == last else f"Frames {first} to {last} have"

@@ -1,0 +1,333 @@
+"""The engine: frames go in one at a time, poses come out, and at the end a model."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.evaluation.consistency import Consistency, consistency_of_frames
+from tofuse.filters.base import apply_filters
+from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
+from tofuse.geometry import se3
+from tofuse.kernels.threads import thread_count, threads
+from tofuse.odometry.base import Step
+from tofuse.pipeline.config import Config, check_views, from_method
+from tofuse.pipeline.judge import WEAK_SHARE, Evidence, judge
+from tofuse.pipeline.progress import Progress, Silent, Stopwatch
+from tofuse.posegraph.build import graph_of
+from tofuse.posegraph.given import GivenLoop
+from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
+from tofuse.posegraph.loops import Confirmation, LoopEdge, confirm
+from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.registration.base import Registration
+from tofuse.results.types import Diagnostics, FrameRecord, Reconstruction
+
+Float64 = NDArray[np.float64]
+
+_NO_POSE = np.full((4, 4), np.nan)
+_KEPT_POINTS = 50_000  # of each view, for loops and fusion; bounds the memory of a long run
+_CHECKED_IMAGES = 60  # how many images the map-consistency check looks at
+
+
+class Mapper:
+    """Turns frames into a trajectory and a model, online.
+
+    >>> mapper = Mapper("default")
+    >>> for frame in frames:
+    ...     T_world_camera = mapper.push(frame)   # None where lost
+    >>> result = mapper.finish()
+
+    Parameters
+    ----------
+    config
+        A configuration, or the name of one.
+    seed
+        One seed, one result.
+    threads
+        How many threads to use; None: all cores. The result does not depend on it.
+    loops
+        Loops known beforehand, in frame indices.
+    progress
+        Hears about frames and stages.
+    """
+
+    def __init__(
+        self,
+        config: Config | str = "default",
+        *,
+        seed: int = 0,
+        threads: int | None = None,
+        loops: Sequence[GivenLoop] = (),
+        progress: Progress | None = None,
+    ) -> None:
+        self.config = from_method(config) if isinstance(config, str) else config
+        self.seed = seed
+        self.threads = threads if threads is not None else thread_count()
+        self._given_loops = tuple(loops)
+        self._progress = progress or Silent()
+        self._watch = Stopwatch()
+        self._tracker = self.config.odometry.start(seed)
+        self._loops: dict[tuple[int, int], tuple[LoopRecord, LoopEdge | None]] = {}
+        self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
+        self._kind = ""
+        self._records: list[FrameRecord] = []
+        self._steps: list[Step | None] = []  # None where a frame could not be read
+        self._poses: list[Float64] = []  # as found, NaN where lost; one for each record
+        self._views: dict[int, CloudFrame] = {}  # filtered and thinned, of frames with a pose
+        self._voxel_m = 0.01
+        self._checks = _EvenSample(_CHECKED_IMAGES)
+        self._seen: dict[str, int] = {}
+        self._removed: dict[str, int] = {}
+        self._finished = False
+
+    def push(
+        self,
+        frame: Frame,
+        *,
+        T_odometry: Float64 | None = None,
+        history: Sequence[Frame] | None = None,
+    ) -> Float64 | None:
+        """Add the next frame.
+
+        Parameters
+        ----------
+        frame
+            As the camera gave it. Its `index` must be larger than those before.
+        T_odometry
+            (4, 4) T_world_camera from odometry, in any fixed world frame.
+        history
+            Unfiltered frames just before this one, oldest first, for temporal filters; the
+            frames pushed before it unless given.
+
+        Returns
+        -------
+        T_world_camera (4, 4) as known so far (loops move it later), or None where it is lost.
+
+        Raises
+        ------
+        InputError
+            If the frame is of another kind than those before, or one that the configuration
+            can't work on, or its index does not grow.
+        """
+        self._check(frame)
+        with threads(self.threads):
+            with self._watch.timing("filters"):
+                past = tuple(self._history) if history is None else history
+                filtered, removals = apply_filters(self.config.filters, frame, past)
+                self._history.append(frame)
+            for removal in removals:
+                self._seen[removal.name] = self._seen.get(removal.name, 0) + removal.seen
+                self._removed[removal.name] = self._removed.get(removal.name, 0) + removal.removed
+            with self._watch.timing("tracking"):
+                step = self._tracker.push(filtered, T_odometry)
+            self._add(frame, filtered, step)
+            if step.T_world_camera is not None:
+                with self._watch.timing("loops"):
+                    self._look_for_loops()
+        self._progress.advance(self._records[-1])
+        return step.T_world_camera
+
+    def skip(self, index: int, timestamp: float, reason: str) -> None:
+        """Say that a frame could not be read."""
+        self._records.append(FrameRecord(index, timestamp, "skipped", reason))
+        self._steps.append(None)
+        self._poses.append(_NO_POSE)
+        self._progress.advance(self._records[-1])
+
+    def _check(self, frame: Frame) -> None:
+        if self._finished:
+            raise InputError("is finished", where="mapper", remedy="make a new Mapper")
+        kind = "range" if isinstance(frame, RangeFrame) else "cloud"
+        if not self._kind:
+            check_views(self.config, kind)
+            self._kind = kind
+        if kind != self._kind:
+            raise InputError(
+                f"is a {kind} view among {self._kind} views", where=f"frame {frame.index}"
+            )
+        if self._records and frame.index <= self._records[-1].index:
+            raise InputError(
+                f"comes after frame {self._records[-1].index}",
+                where=f"frame {frame.index}",
+                remedy="number the frames in the order in which they are pushed",
+            )
+
+    def _add(self, frame: Frame, filtered: Frame, step: Step) -> None:
+        registration = step.registration
+        self._records.append(
+            FrameRecord(
+                frame.index,
+                frame.timestamp,
+                step.status,
+                step.reason,
+                valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
+                inlier_share=None if registration is None else registration.share,
+                rms_m=None if registration is None else registration.rms_m,
+                covariance=None if registration is None else covariance_of(registration),
+                unobservable=np.zeros((0, 6))
+                if registration is None
+                else registration.unobservable,
+            )
+        )
+        self._steps.append(step)
+        self._poses.append(_NO_POSE if step.T_world_camera is None else step.T_world_camera)
+        if step.T_world_camera is None:
+            return
+        if not self._views:
+            self._voxel_m = self.config.fusion.voxel_m or choose_voxel(filtered)
+        self._views[frame.index] = as_cloud(filtered, _KEPT_POINTS)
+        if isinstance(filtered, RangeFrame):
+            # A fresh frame: the arrays derived from this one are not kept with it.
+            self._checks.add(replace(filtered))
+
+    def finish(self) -> Reconstruction:
+        """Close the loops, optimise, fuse and judge.
+
+        Raises
+        ------
+        InputError
+            If no frame has a pose: there is nothing to make a model of.
+        """
+        self._finished = True
+        if not self._views:
+            raise InputError(
+                f"none of the {len(self._records)} frames has enough valid points for a pose"
+                + (f" (first: {self._records[0].reason})" if self._records else ""),
+                where="recording",
+                remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
+            )
+        with threads(self.threads):
+            return self._finish()
+
+    def _finish(self) -> Reconstruction:
+        self._progress.stage("closing loops", len(self._given_loops))
+        with self._watch.timing("loops"):
+            self._close_given_loops()
+            loops = [self._loops[pair] for pair in sorted(self._loops)]
+            steps = {
+                r.index: s for r, s in zip(self._records, self._steps, strict=True) if s is not None
+            }
+            graph = graph_of(steps, [edge for _, edge in loops if edge is not None])
+        sequential = graph.poses
+        optimisation = Optimisation(graph, (), True)
+        if graph.loop.any():
+            self._progress.stage("optimising")
+            with self._watch.timing("optimisation"):
+                optimisation = self.config.optimiser.optimise(graph)
+        graph = optimisation.graph
+        self._progress.stage("fusing", len(graph.ids))
+        with self._watch.timing("fusion"):
+            cloud = self._fuse(graph)
+        self._progress.stage("checking")
+        with self._watch.timing("checking"):
+            evidence = Evidence(
+                tuple(self._records),
+                tuple(s.registration if s else None for s in self._steps),
+                tuple(record for record, _ in loops),
+                sequential,
+                optimisation,
+                self._agreement(graph),
+                frozenset((g.i, g.j) for g in self._given_loops),
+            )
+            verdict, reasons = judge(evidence)
+        return Reconstruction(
+            trajectory=self._scatter(graph.poses),
+            timestamps=np.array([r.timestamp for r in self._records]),
+            graph=graph,
+            cloud=cloud,
+            diagnostics=Diagnostics(
+                verdict,
+                reasons,
+                tuple(self._records),
+                tuple(record for record, _ in loops),
+                self._scatter(sequential),
+                optimisation.objective,
+                {n: self._removed[n] / max(self._seen[n], 1) for n in self._seen},
+                dict(self._watch.seconds),
+            ),
+            config=self.config.to_dict(),
+            recording={"path": None, "format": "frames", "frames": len(self._records)},
+            seed=self.seed,
+            threads=self.threads,
+        )
+
+    def _look_for_loops(self) -> None:
+        """Confirm the places that the newest camera may see again."""
+        for k in self.config.loops.candidates(np.stack(self._poses)):
+            self._confirm(int(k), len(self._records) - 1, self.config.loops.confirmation)
+
+    def _close_given_loops(self) -> None:
+        row = {r.index: k for k, r in enumerate(self._records)}
+        # A person says that it is one: only a registration without support is refused.
+        trusted = Confirmation(max_error=np.inf, min_share=WEAK_SHARE)
+        for loop in self._given_loops:
+            pair = (loop.i, loop.j)
+            if not {*pair} <= self._views.keys():
+                self._loops[pair] = (LoopRecord(*pair, False, "a frame without a pose"), None)
+            elif (given := loop.edge()) is not None:
+                self._loops[pair] = given
+            else:
+                self._confirm(row[loop.i], row[loop.j], trusted)
+            self._progress.advance()
+
+    def _confirm(self, a: int, b: int, confirmation: Confirmation) -> None:
+        i, j = self._records[a].index, self._records[b].index
+        self._loops[i, j] = confirm(
+            self._views[j],
+            self._views[i],
+            se3.inverse(self._poses[a]) @ self._poses[b],
+            self.config.verification,
+            confirmation,
+            seed=self.seed,
+        )
+
+    def _fuse(self, graph: PoseGraph) -> Cloud:
+        builder = CloudBuilder(self.config.fusion, self._voxel_m)
+        for frame, T in zip(graph.ids, graph.poses, strict=True):
+            builder.add(self._views[int(frame)], T)
+            self._progress.advance()
+        return builder.finish()
+
+    def _agreement(self, graph: PoseGraph) -> Consistency | None:
+        """How well overlapping images agree under the final poses."""
+        frames = self._checks.items
+        if len(frames) < 2:
+            return None
+        row = {int(frame): k for k, frame in enumerate(graph.ids)}
+        return consistency_of_frames(frames, np.stack([graph.poses[row[f.index]] for f in frames]))
+
+    def _scatter(self, poses: Float64) -> Float64:
+        out = np.full((len(self._records), 4, 4), np.nan)
+        has = [s is not None and s.T_world_camera is not None for s in self._steps]
+        out[np.array(has, bool)] = poses
+        return out
+
+
+class _EvenSample:
+    """Keeps at most `size` items of an endless stream, evenly spaced."""
+
+    def __init__(self, size: int) -> None:
+        self.items: list[RangeFrame] = []
+        self._size, self._step, self._count = size, 1, 0
+
+    def add(self, item: RangeFrame) -> None:
+        if self._count % self._step == 0:
+            self.items.append(item)
+            if len(self.items) > self._size:
+                self.items = self.items[::2]
+                self._step *= 2
+        self._count += 1
+
+
+def covariance_of(registration: Registration) -> Float64 | None:
+    """Inverse of the information, (6, 6); None where a direction is not held at all."""
+    H = registration.information
+    if not np.isfinite(H).all() or np.linalg.cond(H) > 1e14:
+        return None
+    C = np.linalg.inv(H)
+    return (C + C.T) / 2

@@ -1,0 +1,44 @@
+"""The named configurations, each readable from top to bottom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tofuse.filters.confidence import Confidence
+from tofuse.filters.neighbours import NeighbourShare
+from tofuse.fusion.cloud import CloudFusion
+from tofuse.odometry.sequential import Sequential
+from tofuse.pipeline.config import Config
+from tofuse.posegraph.castellani import Castellani
+from tofuse.posegraph.loops import Confirmation, Nearby
+from tofuse.registration.cascade import Cascade
+from tofuse.registration.icp import algorithm_1
+
+
+def thesis() -> Config:
+    """Return the method of the thesis: chapter 3, with the settings of chapter 4.
+
+    Sequential point-to-point ICP on 1000 random points of each frame, started from the previous
+    motion; loops by distance and yaw; Castellani's optimisation.
+    """
+    icp = algorithm_1(resolution=0.01, points=1000)
+    return Config(
+        method="thesis",
+        filters=(Confidence(minimum=7), NeighbourShare(share=0.5, k=3)),
+        odometry=Sequential(registration=icp, guess="previous"),
+        loops=Nearby(
+            max_distance_m=0.5,
+            max_yaw_rad=0.35,
+            min_gap=30,
+            confirmation=Confirmation(max_error=0.5, min_share=0.25),
+        ),
+        # A trajectory has drifted when a loop closes: first bring the ends near each other.
+        verification=Cascade((algorithm_1(resolution=0.2), algorithm_1(resolution=0.05))),
+        optimiser=Castellani(normalisation="thesis"),
+        fusion=CloudFusion(),
+    )
+
+
+def default() -> Config:
+    """Return what `tofuse run` does unless told otherwise: the thesis's method."""
+    return replace(thesis(), method="default")

@@ -1,0 +1,56 @@
+"""What a long job tells while it works."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Protocol
+
+from tofuse.results.types import FrameRecord
+
+
+class Progress(Protocol):
+    """Hears what a long job does; a terminal shows it, a test ignores it."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Begin a stage of `total` steps (None: unknown)."""
+        ...
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """Finish one step of the stage; `record` says what became of a frame."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Say something that a person should know."""
+        ...
+
+
+class Silent:
+    """Hears and says nothing."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """See `Progress`."""
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """See `Progress`."""
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+
+
+@dataclass
+class Stopwatch:
+    """Wall time of each stage, summed over its visits."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def timing(self, stage: str) -> Iterator[None]:
+        """Add the time of the block to the stage."""
+        start = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - start

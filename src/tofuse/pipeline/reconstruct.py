@@ -1,0 +1,140 @@
+"""From a recording to a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.geometry import se3
+from tofuse.pipeline.config import Config, from_method
+from tofuse.pipeline.mapper import Mapper
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.posegraph.given import GivenLoop
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.recording import Recording
+from tofuse.results.types import Reconstruction
+
+Float64 = NDArray[np.float64]
+
+
+def reconstruct(
+    recording: Recording,
+    config: Config | str = "default",
+    *,
+    seed: int = 0,
+    threads: int | None = None,
+    loops: Sequence[GivenLoop] = (),
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Reconstruct a recording: trajectory, pose graph, fused cloud, diagnostics.
+
+    Frames that can't be read are skipped and counted.
+
+    Parameters
+    ----------
+    recording
+        What `tofuse.open` gives.
+    config
+        A configuration or the name of one ("default", "thesis").
+    seed
+        One seed, one result.
+    threads
+        How many threads to use; None: all cores. The result does not depend on it.
+    loops
+        Loops known beforehand, in frame indices.
+
+    Raises
+    ------
+    InputError
+        If no frame can be read, or none has enough valid points for a pose.
+    """
+    progress = progress or Silent()
+    config = from_method(config) if isinstance(config, str) else config
+    mapper = Mapper(config, seed=seed, threads=threads, loops=loops, progress=progress)
+    progress.stage("tracking", len(recording))
+    odometry = recording.odometry
+    recent: dict[int, Frame] = {}
+    unreadable: list[UnreadableFrameError] = []
+    # BLAS sums differ with its number of threads; ours don't.
+    with threadpool_limits(1):
+        for k, item in enumerate(recording.read_all()):
+            index, time = int(recording.indices[k]), float(recording.timestamps[k])
+            if isinstance(item, UnreadableFrameError):
+                unreadable.append(item)
+                mapper.skip(index, time, str(item))
+                continue
+            T = None if odometry is None or not np.isfinite(odometry[k]).all() else odometry[k]
+            past = past_frames(recording, index, config.window - 1, recent)
+            recent = {f.index: f for f in [*past, item]}
+            mapper.push(item, T_odometry=T, history=past)
+        if len(unreadable) == len(recording):
+            raise InputError(
+                f"none of the {len(recording)} frames can be read (first: {unreadable[0]})",
+                where=recording.path,
+                remedy="check that the files are complete, or give --format",
+            )
+        result = mapper.finish()
+    return replace(result, recording=describe(recording))
+
+
+def past_frames(
+    recording: Recording, index: int, count: int, known: Mapping[int, Frame] = MappingProxyType({})
+) -> list[Frame]:
+    """Return the `count` readable frames of the source just before frame `index`, oldest first.
+
+    They are the recording's own neighbours, whatever was selected of it; `known` are frames that
+    need not be read again.
+    """
+    past = []
+    for k in range(max(0, index - count), index):
+        try:
+            past.append(known.get(k) or recording.source.read(k))
+        except UnreadableFrameError:
+            continue
+    return past
+
+
+def describe(recording: Recording) -> dict[str, Any]:
+    """Return plain facts about a recording, the `input` of `run.json`."""
+    return {
+        "path": recording.path,
+        "format": recording.format,
+        "frames": len(recording),
+        "warnings": list(recording.warnings),
+    }
+
+
+def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 | None:
+    """Return the reference poses (N, 4, 4) in the result's world, NaN where there is none.
+
+    The world is the first frame with a pose; where that has no reference, the first frame with
+    both decides.
+    """
+    reference = recording.reference
+    if reference is None:
+        return None
+    both = np.flatnonzero(np.isfinite(reference[:, 0, 0]) & result.has_pose)
+    if len(both) == 0:
+        return None
+    k = both[0]
+    T_world_reference = result.trajectory[k] @ se3.inverse(reference[k])
+    return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
+
+
+def truth_points(recording: Recording, count: int = 200_000) -> NDArray[np.float32] | None:
+    """Return points (K, 3) on the true surfaces of a simulated recording, in its world frame."""
+    path = Path(recording.path) / "truth" / "surface.ply"
+    if not path.is_file():
+        return None
+    from tofuse.files.ply import read_ply
+
+    points: NDArray[np.float32] = read_ply(path).points
+    return points[:: max(1, len(points) // count)]

@@ -1,0 +1,194 @@
+"""The whole job of ``tofuse run``: options, recording, reconstruction, output folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.filters.base import apply_filters
+from tofuse.filters.confidence import Confidence
+from tofuse.pipeline.config import Config, changed, from_method, read_changes
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.reconstruct import (
+    past_frames,
+    reconstruct,
+    reference_in_world,
+    truth_points,
+)
+from tofuse.posegraph.given import read_loops
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+from tofuse.results.output import OutputFolder, read_run_json, write_result
+from tofuse.results.types import Reconstruction
+
+_THUMBNAILS = 12
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of ``tofuse run``; see its ``--help``."""
+
+    out: Path
+    method: str | None = None
+    config: Path | None = None
+    camera: Path | None = None
+    format: str | None = None
+    seed: int | None = None
+    threads: int | None = None
+    start: int = 0
+    end: int | None = None
+    every: int = 1
+    min_depth: float | None = None
+    max_depth: float | None = None
+    guess: Literal["identity", "previous", "odometry"] | None = None
+    loops: Path | None = None
+    object: bool = False
+    overwrite: bool = False
+
+
+def run(
+    inputs: Sequence[str | Path], options: Options, progress: Progress | None = None
+) -> Reconstruction:
+    """Reconstruct recordings and write the output folder.
+
+    Raises
+    ------
+    InputError, OutputError
+        If nothing could be written; see the message for the remedy.
+    """
+    progress = progress or Silent()
+    config = resolve(options)
+    seed = _seed(options)
+    recording = open_recording(*inputs, format=options.format, camera=options.camera)
+    recording = recording.select(options.start, options.end, options.every)
+    _check_guess(options, recording)
+    config = fitted(config, recording)
+    loops = (
+        read_loops(options.loops, frozenset(recording.indices.tolist())) if options.loops else ()
+    )
+    for warning in recording.warnings:
+        progress.note(warning)
+    folder = OutputFolder(options.out, overwrite=options.overwrite)
+    try:
+        result = reconstruct(
+            recording,
+            config,
+            seed=seed,
+            threads=options.threads,
+            loops=loops,
+            progress=progress,
+        )
+        progress.stage("writing")
+        write_result(result, folder, lambda r, f: _report(recording, config, r, f))
+    finally:
+        folder.discard()
+    return result
+
+
+def resolve(options: Options) -> Config:
+    """Return the configuration that the options ask for, before the recording is known."""
+    changes: dict[str, Any] = read_changes(options.config) if options.config else {}
+    method = options.method or changes.get("method") or "default"
+    if not isinstance(method, str):
+        raise InputError(f"is {method!r}", where=f"{options.config}: method")
+    config = from_method(method)
+    config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
+    if options.guess:
+        config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
+    front: list[dict[str, Any]] = []
+    if options.min_depth is not None or options.max_depth is not None:
+        low = options.min_depth or 0.0
+        if options.max_depth is not None and options.max_depth <= low:
+            raise InputError(
+                f"is {options.max_depth} m and the least depth {low} m",
+                where="--max-depth",
+                remedy="give a larger one",
+            )
+        front.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
+    if options.object and options.max_depth is None:
+        front.append({"part": "foreground"})
+    if front:
+        filters = [*front, *config.to_dict()["filters"]]
+        config = changed(config, {"filters": filters}, where="--max-depth")
+    return config
+
+
+def fitted(config: Config, recording: Recording) -> Config:
+    """Return the configuration with levels of confidence on the recording's own scale."""
+    highest = recording.metadata.get("confidence_max")
+    if not isinstance(highest, int):
+        return config
+    filters = tuple(f.on_scale(highest) if isinstance(f, Confidence) else f for f in config.filters)
+    return replace(config, filters=filters)
+
+
+def _seed(options: Options) -> int:
+    if options.seed is not None:
+        return options.seed
+    if options.config is not None and options.config.suffix == ".json":
+        seed = read_run_json(options.config).get("seed", 0)
+        if isinstance(seed, int) and seed >= 0:
+            return seed
+    return 0
+
+
+def _check_guess(options: Options, recording: Recording) -> None:
+    if options.guess == "odometry" and recording.odometry is None:
+        raise InputError(
+            "is odometry, and the recording holds none",
+            where="--guess",
+            remedy="put an odometry.txt beside the images, or use --guess previous",
+        )
+
+
+def exit_status(result: Reconstruction) -> int:
+    """Return 0 if every readable frame has a pose, else 3."""
+    return 3 if any(f.status == "lost" for f in result.diagnostics.frames) else 0
+
+
+def _report(recording: Recording, config: Config, result: Reconstruction, folder: Path) -> None:
+    from tofuse.report.extras import ReportExtras
+    from tofuse.report.html import write_report
+
+    frames = _sample(recording)
+    extras = ReportExtras(
+        title=Path(recording.path).name or recording.path,
+        filter_steps=_filter_steps(config, recording, result),
+        reference=reference_in_world(recording, result),
+        truth_points=truth_points(recording),
+        thumbnails=tuple(frames),
+    )
+    write_report(result, folder / "report.html", extras)
+
+
+def _sample(recording: Recording) -> list[Frame]:
+    chosen = np.unique(np.linspace(0, len(recording) - 1, _THUMBNAILS).round().astype(int))
+    frames = []
+    for k in chosen:
+        try:
+            frames.append(recording[int(k)])
+        except UnreadableFrameError:
+            continue
+    return frames
+
+
+def _filter_steps(
+    config: Config, recording: Recording, result: Reconstruction
+) -> tuple[tuple[str, Frame], ...]:
+    """One frame, raw and after each filter in turn (figure 3.2)."""
+    posed = np.flatnonzero(result.has_pose)
+    k = int(posed[len(posed) // 2])
+    frame = recording[k]
+    index = int(recording.indices[k])
+    history = past_frames(recording, index, config.window - 1)
+    steps: list[tuple[str, Frame]] = [("raw", frame)]
+    for item in config.filters:
+        frame, removals = apply_filters([item], frame, history)
+        steps.append((removals[0].name, frame))
+    return tuple(steps)
