@@ -15,7 +15,6 @@ from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import LoopDetector
-from tofuse.registration.base import Registrar
 from tofuse.results.output import read_run_json
 
 
@@ -32,9 +31,7 @@ class Config:
     odometry
         Turns frames into poses.
     loops
-        Finds places that the camera comes back to.
-    verification
-        Registers the two ends of a loop.
+        Finds and confirms places that the camera comes back to.
     optimiser
         Spreads the error of the loops.
     fusion
@@ -45,7 +42,6 @@ class Config:
     filters: tuple[Filter, ...]
     odometry: Odometry
     loops: LoopDetector
-    verification: Registrar
     optimiser: Optimiser
     fusion: CloudFusion
 
@@ -140,11 +136,7 @@ def check_views(config: Config, kind: str) -> None:
     kind
         "range" for images of a camera, "cloud" for bare clouds.
     """
-    chosen: tuple[Filter | Odometry | Registrar, ...] = (
-        *config.filters,
-        config.odometry,
-        config.verification,
-    )
+    chosen: tuple[Filter | Odometry, ...] = (*config.filters, config.odometry)
     for part in chosen:
         if kind not in part.takes:
             raise InputError(

@@ -13,23 +13,20 @@ from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, consistency_of_frames
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
-from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
 from tofuse.pipeline.config import Config, check_views, from_method
-from tofuse.pipeline.judge import WEAK_SHARE, Evidence, judge
+from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
-from tofuse.posegraph.build import graph_of
-from tofuse.posegraph.given import GivenLoop
-from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
-from tofuse.posegraph.loops import Confirmation, LoopEdge, confirm
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.graph import Optimisation, PoseGraph
+from tofuse.posegraph.loops import ClosedLoop, GivenLoop
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registration
 from tofuse.results.types import Diagnostics, FrameRecord, Reconstruction
 
 Float64 = NDArray[np.float64]
 
-_NO_POSE = np.full((4, 4), np.nan)
 _KEPT_POINTS = 50_000  # of each view, for loops and fusion; bounds the memory of a long run
 _CHECKED_IMAGES = 60  # how many images the map-consistency check looks at
 
@@ -72,12 +69,11 @@ class Mapper:
         self._progress = progress or Silent()
         self._watch = Stopwatch()
         self._tracker = self.config.odometry.start(seed)
-        self._loops: dict[tuple[int, int], tuple[LoopRecord, LoopEdge | None]] = {}
+        self._loops = self.config.loops.start(seed)
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
         self._kind = ""
         self._records: list[FrameRecord] = []
         self._steps: list[Step | None] = []  # None where a frame could not be read
-        self._poses: list[Float64] = []  # as found, NaN where lost; one for each record
         self._views: dict[int, CloudFrame] = {}  # filtered and thinned, of frames with a pose
         self._voxel_m = 0.01
         self._checks = _EvenSample(_CHECKED_IMAGES)
@@ -128,7 +124,7 @@ class Mapper:
             self._add(frame, filtered, step)
             if step.T_world_camera is not None:
                 with self._watch.timing("loops"):
-                    self._look_for_loops()
+                    self._loops.push(self._views[frame.index], step.T_world_camera)
         self._progress.advance(self._records[-1])
         return step.T_world_camera
 
@@ -136,7 +132,6 @@ class Mapper:
         """Say that a frame could not be read."""
         self._records.append(FrameRecord(index, timestamp, "skipped", reason))
         self._steps.append(None)
-        self._poses.append(_NO_POSE)
         self._progress.advance(self._records[-1])
 
     def _check(self, frame: Frame) -> None:
@@ -175,7 +170,6 @@ class Mapper:
             )
         )
         self._steps.append(step)
-        self._poses.append(_NO_POSE if step.T_world_camera is None else step.T_world_camera)
         if step.T_world_camera is None:
             return
         if not self._views:
@@ -205,14 +199,10 @@ class Mapper:
             return self._finish()
 
     def _finish(self) -> Reconstruction:
-        self._progress.stage("closing loops", len(self._given_loops))
+        self._progress.stage("closing loops")
         with self._watch.timing("loops"):
-            self._close_given_loops()
-            loops = [self._loops[pair] for pair in sorted(self._loops)]
-            steps = {
-                r.index: s for r, s in zip(self._records, self._steps, strict=True) if s is not None
-            }
-            graph = graph_of(steps, [edge for _, edge in loops if edge is not None])
+            loops = self._loops.finish(self._given_loops)
+            graph = self._graph(loops)
         sequential = graph.poses
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any():
@@ -228,7 +218,7 @@ class Mapper:
             evidence = Evidence(
                 tuple(self._records),
                 tuple(s.registration if s else None for s in self._steps),
-                tuple(record for record, _ in loops),
+                tuple(c.record for c in loops),
                 sequential,
                 optimisation,
                 self._agreement(graph),
@@ -244,7 +234,7 @@ class Mapper:
                 verdict,
                 reasons,
                 tuple(self._records),
-                tuple(record for record, _ in loops),
+                tuple(c.record for c in loops),
                 self._scatter(sequential),
                 optimisation.objective,
                 {n: self._removed[n] / max(self._seen[n], 1) for n in self._seen},
@@ -256,35 +246,23 @@ class Mapper:
             threads=self.threads,
         )
 
-    def _look_for_loops(self) -> None:
-        """Confirm the places that the newest camera may see again."""
-        for k in self.config.loops.candidates(np.stack(self._poses)):
-            self._confirm(int(k), len(self._records) - 1, self.config.loops.confirmation)
-
-    def _close_given_loops(self) -> None:
-        row = {r.index: k for k, r in enumerate(self._records)}
-        # A person says that it is one: only a registration without support is refused.
-        trusted = Confirmation(max_error=np.inf, min_share=WEAK_SHARE)
-        for loop in self._given_loops:
-            pair = (loop.i, loop.j)
-            if not {*pair} <= self._views.keys():
-                self._loops[pair] = (LoopRecord(*pair, False, "a frame without a pose"), None)
-            elif (given := loop.edge()) is not None:
-                self._loops[pair] = given
-            else:
-                self._confirm(row[loop.i], row[loop.j], trusted)
-            self._progress.advance()
-
-    def _confirm(self, a: int, b: int, confirmation: Confirmation) -> None:
-        i, j = self._records[a].index, self._records[b].index
-        self._loops[i, j] = confirm(
-            self._views[j],
-            self._views[i],
-            se3.inverse(self._poses[a]) @ self._poses[b],
-            self.config.verification,
-            confirmation,
-            seed=self.seed,
-        )
+    def _graph(self, loops: Sequence[ClosedLoop]) -> PoseGraph:
+        ids, poses, sequence = [], [], []
+        for record, step in zip(self._records, self._steps, strict=True):
+            if step is None or step.T_world_camera is None:
+                continue
+            ids.append(record.index)
+            poses.append(step.T_world_camera)
+            r = step.registration
+            if step.reference is not None and r is not None:
+                edge = Measured(step.reference, record.index, r.T_target_source, r.information)
+                sequence.append(edge)
+        closed = [
+            Measured(c.record.i, c.record.j, c.T_i_j, c.information)
+            for c in loops
+            if c.T_i_j is not None and c.information is not None
+        ]
+        return build_graph(ids, np.stack(poses), sequence, closed)
 
     def _fuse(self, graph: PoseGraph) -> Cloud:
         builder = CloudBuilder(self.config.fusion, self._voxel_m)

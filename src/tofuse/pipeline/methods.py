@@ -10,8 +10,7 @@ from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.config import Config
 from tofuse.posegraph.castellani import Castellani
-from tofuse.posegraph.loops import Confirmation, Nearby
-from tofuse.registration.cascade import Cascade
+from tofuse.posegraph.nearby import Nearby
 from tofuse.registration.icp import algorithm_1
 
 
@@ -26,14 +25,7 @@ def thesis() -> Config:
         method="thesis",
         filters=(Confidence(minimum=7), NeighbourShare(share=0.5, k=3)),
         odometry=Sequential(registration=icp, guess="previous"),
-        loops=Nearby(
-            max_distance_m=0.5,
-            max_yaw_rad=0.35,
-            min_gap=30,
-            confirmation=Confirmation(max_error=0.5, min_share=0.25),
-        ),
-        # A trajectory has drifted when a loop closes: first bring the ends near each other.
-        verification=Cascade((algorithm_1(resolution=0.2), algorithm_1(resolution=0.05))),
+        loops=Nearby(max_distance_m=0.5, max_yaw_rad=0.35, min_gap=30),
         optimiser=Castellani(normalisation="thesis"),
         fusion=CloudFusion(),
     )

@@ -17,7 +17,7 @@ from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.posegraph.given import GivenLoop
+from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
