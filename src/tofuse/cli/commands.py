@@ -1,0 +1,228 @@
+"""What each command does. Heavy imports happen here, when a command runs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from tofuse.cli.progress import emit, progress_for
+from tofuse.results.types import Reconstruction
+
+_COLORS = {"good": "green", "degraded": "yellow", "failed": "red"}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """``tofuse run``."""
+    from tofuse.pipeline.run import Options, exit_status
+    from tofuse.pipeline.run import run as run_pipeline
+
+    options = Options(
+        out=arguments.out,
+        method=arguments.method,
+        config=arguments.config,
+        camera=arguments.camera,
+        format=arguments.format,
+        seed=arguments.seed,
+        threads=arguments.threads,
+        start=arguments.start,
+        end=arguments.end,
+        every=arguments.every,
+        min_depth=arguments.min_depth,
+        max_depth=arguments.max_depth,
+        guess=arguments.guess,
+        loops=arguments.loops,
+        object=arguments.object,
+        overwrite=arguments.overwrite,
+    )
+    with progress_for(as_json=arguments.json) as progress:
+        result = run_pipeline(arguments.inputs, options, progress)
+    _tell(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def demo(arguments: argparse.Namespace) -> int:
+    """``tofuse demo``."""
+    from tofuse.kernels.threads import threads
+    from tofuse.pipeline.demo import demo as run_demo
+    from tofuse.pipeline.run import exit_status
+
+    with progress_for(as_json=arguments.json) as progress, threads(arguments.threads):
+        result = run_demo(
+            arguments.scene,
+            arguments.out,
+            method=arguments.method,
+            seed=arguments.seed or 0,
+            threads=arguments.threads,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
+    _tell(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
+    """Say in a few lines what came out."""
+    d = result.diagnostics
+    counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
+    skipped = sum(f.status == "skipped" for f in d.frames)
+    if as_json:
+        emit(
+            {
+                "event": "result",
+                "out": str(out),
+                "verdict": d.verdict,
+                "reasons": [{"code": r.code, "text": r.text} for r in d.reasons],
+                "frames": {**counts, "skipped": skipped},
+                "loops": sum(p.accepted for p in d.loops),
+                "points": len(result.cloud),
+                "seconds": round(sum(d.seconds.values()), 2),
+            }
+        )
+        return
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"[bold {_COLORS[d.verdict]}]{d.verdict}[/]")
+    for reason in d.reasons:
+        console.print(f"  {reason.text}", markup=False)
+    parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
+    parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
+    parts += [f"{skipped} unreadable"] if skipped else []
+    closed = sum(p.accepted for p in d.loops)
+    parts.append(f"{closed} loop{'' if closed == 1 else 's'} closed")
+    parts.append(f"{len(result.cloud):,} points")
+    console.print(", ".join(parts), markup=False)
+    console.print(f"see {out / 'report.html'}", markup=False)
+
+
+def simulate(arguments: argparse.Namespace) -> int:
+    """``tofuse simulate``."""
+    from tofuse.kernels.threads import threads
+    from tofuse.pipeline.demo import simulate_to
+
+    with progress_for(as_json=False) as progress, threads(arguments.threads):
+        frames = simulate_to(
+            arguments.scene,
+            arguments.out,
+            camera=arguments.camera,
+            seed=arguments.seed or 0,
+            every=arguments.every,
+            frames=arguments.frames,
+            texture=not arguments.uniform,
+            without=tuple(w for w in arguments.without.split(",") if w),
+            correction=not arguments.no_correction,
+            sigma=arguments.sigma,
+            progress=progress,
+        )
+    print(f"{frames} frames in {arguments.out}")
+    return 0
+
+
+def inspect(arguments: argparse.Namespace) -> int:
+    """``tofuse inspect``."""
+    from tofuse.inspection.inspect import inspect_recording
+    from tofuse.recordings.open import open_recording
+
+    recording = open_recording(*arguments.inputs, format=arguments.format, camera=arguments.camera)
+    found = inspect_recording(recording)
+    if arguments.json:
+        emit(found.to_dict())
+        return 0
+    console = Console(highlight=False, soft_wrap=True)
+    table = Table.grid(padding=(0, 2))
+    for name, value in found.facts.items():
+        table.add_row(f"[bold]{name}[/]", _escape(value))
+    console.print(table)
+    for warning in found.warnings:
+        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    return 0
+
+
+def evaluate(arguments: argparse.Namespace) -> int:
+    """``tofuse evaluate``."""
+    from tofuse.evaluation.consistency import map_consistency, poses_of_frames
+    from tofuse.evaluation.trajectory import evaluate_trajectory
+    from tofuse.files.trajectory import read_tum
+    from tofuse.recordings.open import open_recording
+
+    estimate_file, reference_file = arguments.estimate, arguments.reference
+    if estimate_file.is_dir():
+        estimate_file = estimate_file / "trajectory.txt"
+    if reference_file.is_dir():
+        reference_file = reference_file / "groundtruth.txt"
+    times, poses = read_tum(estimate_file)
+    reference_times, reference = read_tum(reference_file)
+    recording = None if arguments.recording is None else open_recording(arguments.recording)
+    frame_times = None if recording is None else recording.timestamps
+    error = evaluate_trajectory(times, poses, reference_times, reference, frame_times)
+    data: dict[str, Any] = error.to_dict()
+    if recording is not None:
+        poses_here = poses_of_frames(recording.timestamps, times, poses)
+        data["map_consistency"] = map_consistency(recording, poses_here).to_dict()
+    if arguments.json:
+        emit(data)
+        return 0
+    table = Table.grid(padding=(0, 2))
+    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of the reference)")
+    table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
+    table.add_row("ATE largest", f"{error.ate_max_m:.4f} m")
+    for r in error.relative:
+        value = "too few poses"
+        if r.pairs:
+            angle = r.to_dict()["rotation_rms_deg"]
+            value = f"{r.translation_rms_m:.4f} m, {angle:.3f} deg"
+        table.add_row(f"RPE over {r.frames} frame{'' if r.frames == 1 else 's'}", value)
+    if recording is not None:
+        m = data["map_consistency"]
+        value = "no two images overlap enough"
+        if m["pairs"]:
+            value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
+        table.add_row("map consistency", value)
+    Console(highlight=False, soft_wrap=True).print(table)
+    return 0
+
+
+def optimize(arguments: argparse.Namespace) -> int:
+    """``tofuse optimize``."""
+    from tofuse.errors import OutputError
+    from tofuse.pipeline.config import from_method
+    from tofuse.posegraph.g2o import read_g2o, write_g2o
+
+    if arguments.out.exists() and not arguments.overwrite:
+        raise OutputError(
+            "is there already", where=arguments.out, remedy="give --overwrite to replace it"
+        )
+    graph = read_g2o(arguments.input)
+    done = from_method("default").optimiser.optimise(graph)
+    write_g2o(arguments.out, done.graph)
+    start, end = (done.objective[0], done.objective[-1]) if done.objective else (0.0, 0.0)
+    print(
+        f"{len(graph.ids)} poses, {len(graph.edges)} edges: objective {start:.6g} to {end:.6g} "
+        f"in {max(len(done.objective) - 1, 0)} iterations"
+        + ("" if done.converged else " (not converged)")
+    )
+    return 0
+
+
+def experiments(arguments: argparse.Namespace) -> int:
+    """``tofuse experiments``."""
+    from tofuse.experiments.page import run_experiments
+    from tofuse.kernels.threads import threads
+
+    with progress_for(as_json=False) as progress, threads(arguments.threads):
+        page = run_experiments(
+            arguments.out,
+            cases=tuple(c for c in arguments.cases.split(",") if c),
+            seeds=arguments.seeds,
+            seed=arguments.seed or 0,
+            overwrite=arguments.overwrite,
+            progress=progress,
+        )
+    print(f"see {page}")
+    return 0
+
+
+def _escape(text: str) -> str:
+    return text.replace("[", r"\[")
