@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -40,11 +39,14 @@ class Confidence(Filter):
         whole("minimum", self.minimum, 0)
         whole("highest", self.highest, 1)
         if not self.minimum <= self.highest <= 255:
-            raise ValueError(f"minimum {self.minimum} of {self.highest} is not a level up to 255")
+            raise ValueError(
+                f"minimum must be at most highest and that at most 255, not {self.minimum} of "
+                f"{self.highest}"
+            )
 
     def on_scale(self, highest: int) -> Confidence:
         """Return the filter for a camera whose highest level is `highest`, as strict as this."""
-        return Confidence(math.ceil(self.minimum / self.highest * highest), highest)
+        return Confidence(-(-self.minimum * highest // self.highest), highest)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -1,0 +1,176 @@
+"""Filters that judge each point by itself: confidence, amplitude, distance, box, foreground."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tofuse import parts
+from tofuse.errors import InputError
+from tofuse.filters.amplitude import Amplitude
+from tofuse.filters.base import Filter, Removal, apply_filters
+from tofuse.filters.confidence import Confidence
+from tofuse.filters.distance import Box, Distance
+from tofuse.filters.foreground import Foreground, otsu
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+
+NAN = float("nan")
+
+
+def frame(z: Any, **images: Any) -> RangeFrame:
+    z = np.asarray(z, np.float32)
+    camera = Pinhole(z.shape[1], z.shape[0], 100.0, 100.0, 0.0, 0.0)
+    return RangeFrame(0, 0.0, camera, z, **images)
+
+
+def test_confidence_keeps_its_level_and_above() -> None:
+    levels = np.array([[0, 3, 6], [7, 7, 255]], np.uint8)
+    f = frame(np.ones((2, 3)), confidence_image=levels)
+    assert np.array_equal(Confidence(7).mask(f, ()), levels >= 7)
+    assert np.array_equal(Confidence(3).mask(f, ()), levels >= 3)
+    assert Confidence(0).mask(f, ()).all()
+
+
+@pytest.mark.parametrize(("highest", "level"), [(7, 5), (2, 2), (255, 183), (1, 1)])
+def test_confidence_on_another_scale_is_as_strict(highest: int, level: int) -> None:
+    assert Confidence(5).on_scale(highest) == Confidence(level, highest)
+    assert Confidence(7).on_scale(highest).minimum == highest
+    assert Confidence(0).on_scale(highest).minimum == 0
+
+
+def test_views_without_the_measurement_are_kept_whole() -> None:
+    f = frame(np.ones((2, 3)))
+    cloud = CloudFrame.of(np.ones((5, 3)))
+    for item in (Confidence(7), Amplitude(100.0, 200.0)):
+        assert item.mask(f, ()).all()
+        assert item.mask(cloud, ()).shape == (5,)
+        assert item.mask(cloud, ()).all()
+
+
+def test_amplitude_window_and_saturation() -> None:
+    counts = np.array([[0, 99, 100, 150], [200, 201, 65534, 65535]], np.float32)
+    f = frame(np.ones((2, 4)), amplitude_image=counts)
+    assert np.array_equal(Amplitude(100, 200).mask(f, ()), (counts >= 100) & (counts <= 200))
+    assert np.array_equal(Amplitude().mask(f, ()), counts < 65535)
+    counts[0, 0] = np.nan
+    assert not Amplitude().mask(f, ())[0, 0]
+
+
+def test_amplitude_of_a_cloud() -> None:
+    cloud = CloudFrame(0, 0.0, np.ones((3, 3), np.float32), amplitude=np.float32([1, 5, 65535]))
+    assert Amplitude(2).mask(cloud, ()).tolist() == [False, True, False]
+
+
+def test_distance_tells_z_from_range() -> None:
+    # 3-4-5: the second pixel looks along (0.75, 0, 1), so z = 4 lies at a range of 5.
+    camera = Pinhole(2, 2, 1 / 0.75, 1.0, 0.0, 0.0)
+    f = RangeFrame(0, 0.0, camera, np.float32([[4, 4], [0, 9]]))
+    assert Distance(3.9, 4.1).mask(f, ()).tolist() == [[True, True], [False, False]]
+    assert Distance(3.9, 4.1, "range").mask(f, ()).tolist() == [[True, False], [False, False]]
+    assert Distance(4.9, 5.1, "range").mask(f, ()).tolist() == [[False, True], [False, False]]
+    assert Distance(5.0).mask(f, ())[1, 1]
+
+
+def test_distance_of_a_cloud_is_from_its_origin() -> None:
+    cloud = CloudFrame(0, 0.0, np.float32([[0, 0, -5], [10, 0, 0]]), origin=np.array([9.0, 0, 0]))
+    assert Distance(0.0, 2.0).mask(cloud, ()).tolist() == [False, True]
+
+
+def test_box_keeps_or_cuts() -> None:
+    points = np.float32([[0, 0, 1], [1, 1, 2], [1.001, 1, 2], [0, 0, 3]])
+    cloud = CloudFrame.of(points)
+    box = Box((-1.0, -1.0, 1.0), (1.0, 1.0, 2.0))
+    assert box.mask(cloud, ()).tolist() == [True, True, False, False]
+    cut = Box((-1.0, -1.0, 1.0), (1.0, 1.0, 2.0), "inside")
+    assert cut.mask(cloud, ()).tolist() == [False, False, True, True]
+    f = frame(np.full((3, 3), 1.5))
+    wide = Box((-9.0, -9.0, 1.0), (9.0, 9.0, 2.0))
+    assert wide.mask(f, ()).all()
+
+
+def test_foreground_finds_the_gap_before_the_background() -> None:
+    rng = np.random.default_rng(0)
+    z = np.full((40, 40), 3.0) + 0.05 * rng.standard_normal((40, 40))
+    z[10:30, 12:24] = 1.0 + 0.05 * rng.standard_normal((20, 12))
+    z[0, :5] = 0
+    keep = Foreground().mask(frame(z), ())
+    expected = np.zeros((40, 40), bool)
+    expected[10:30, 12:24] = True
+    assert np.array_equal(keep & (z > 0), expected)
+
+
+def test_foreground_keeps_what_is_one_thing() -> None:
+    rng = np.random.default_rng(1)
+    even = frame(rng.uniform(1, 2, (60, 60)))
+    bell = frame(2 + 0.1 * rng.standard_normal((60, 60)))
+    flat = frame(np.full((4, 4), 2.0))
+    for f in (even, bell, flat, frame(np.zeros((4, 4)))):
+        assert Foreground().mask(f, ()).all()
+    assert not Foreground(separability=0.0).mask(even, ()).all()
+    assert Foreground(limit=1.5).mask(frame([[1.5, 1.6], [1, 9]]), ()).tolist() == [
+        [True, False],
+        [True, False],
+    ]
+
+
+def test_otsu_maximises_the_variance_between_classes() -> None:
+    rng = np.random.default_rng(2)
+    values = np.concatenate([rng.normal(1, 0.1, 300), rng.normal(2, 0.2, 900)]).astype(np.float32)
+    limit, eta = otsu(values)
+
+    def between(t: float) -> float:
+        low, high = values[values <= t], values[values > t]
+        return len(low) * len(high) / len(values) ** 2 * float(low.mean() - high.mean()) ** 2
+
+    best = max(between(t) for t in np.sort(values)[:-1])
+    assert between(limit) == pytest.approx(best, rel=1e-3)
+    assert eta == pytest.approx(best / float(values.var()), rel=1e-2)
+    assert otsu(np.zeros(0, np.float32)) == (np.inf, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("cls", "options"),
+    [
+        (Confidence, {"minimum": -1}),
+        (Confidence, {"minimum": 8}),
+        (Confidence, {"minimum": 8, "highest": 256}),
+        (Confidence, {"minimum": True}),
+        (Confidence, {"minimum": NAN}),
+        (Amplitude, {"minimum": NAN}),
+        (Amplitude, {"minimum": 5.0, "maximum": 5.0}),
+        (Amplitude, {"maximum": float("inf")}),
+        (Distance, {"minimum": -0.1}),
+        (Distance, {"maximum": NAN}),
+        (Distance, {"minimum": 2.0, "maximum": 1.0}),
+        (Distance, {"measure": "y"}),
+        (Box, {"lower": (0.0, 0.0, 0.0), "upper": (1.0, 0.0, 1.0)}),
+        (Box, {"lower": (0.0, 0.0, NAN), "upper": (1.0, 1.0, 1.0)}),
+        (Box, {"lower": (0.0, 0.0), "upper": (1.0, 1.0)}),
+        (Box, {"lower": (0.0,) * 3, "upper": (1.0,) * 3, "remove": "all"}),
+        (Foreground, {"limit": 0.0}),
+        (Foreground, {"separability": 1.5}),
+    ],
+)
+def test_nonsense_options_are_refused(cls: type, options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"must|lower"):
+        cls(**options)
+
+
+def test_options_from_a_file_name_the_field() -> None:
+    parts.discover("tofuse.filters")
+    data = {"part": "distance", "minimum": 2, "maximum": 1}
+    with pytest.raises(InputError, match=r"my.toml: filters\[0\].*maximum must be above 2"):
+        parts.from_dict(Filter, data, where="my.toml: filters[0]")
+    built = parts.from_dict(Filter, {"part": "confidence", "minimum": 5}, where="x")
+    assert built == Confidence(5)
+    assert parts.to_dict(built) == {"part": "confidence", "minimum": 5, "highest": 7}
+
+
+def test_each_filter_sees_what_the_ones_before_left() -> None:
+    z = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 0.0]])
+    left, removals = apply_filters([Distance(2.0), Distance(0.0, 4.0)], frame(z))
+    assert removals == [Removal("distance", 5, 1), Removal("distance", 4, 1)]
+    assert np.array_equal(left.z, [[0, 2, 3], [4, 0, 0]])

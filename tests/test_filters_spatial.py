@@ -1,0 +1,332 @@
+"""Filters that compare a point with its neighbours: angle, median, nearest neighbours, time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tofuse import parts
+from tofuse.filters.angle import NeighbourhoodAngle, neighbourhood_angle
+from tofuse.filters.base import Filter, apply_filters
+from tofuse.filters.distance import Box
+from tofuse.filters.median import Median, local_median
+from tofuse.filters.neighbours import NeighbourDistance, NeighbourShare, mean_neighbour_distance
+from tofuse.filters.temporal import TemporalDeviation, z_deviation
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels.threads import threads
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+
+NAN = float("nan")
+
+
+def frame(z: Any, focal: float = 230.0, **images: Any) -> RangeFrame:
+    z = np.asarray(z, np.float32)
+    h, w = z.shape
+    camera = Pinhole(w, h, focal, focal, (w - 1) / 2, (h - 1) / 2)
+    return RangeFrame(0, 0.0, camera, z, **images)
+
+
+def line(z: Any, focal: float = 1.0) -> RangeFrame:
+    """Two rows, the lower one invalid, so that pixels have neighbours to the sides only."""
+    camera = Pinhole(len(z), 2, focal, focal, 0.0, 0.0)
+    return RangeFrame(0, 0.0, camera, np.float32([z, [0] * len(z)]))
+
+
+# Neighbourhood angle -------------------------------------------------------------------------
+
+
+def test_angle_of_triangles_solved_by_hand() -> None:
+    # Camera at O, p = (0, 0, 1), n = (1, 0, 1): at p a right angle, at n 45 degrees.
+    angle = neighbourhood_angle(line([1, 1]))
+    assert angle[0] == pytest.approx([math.pi / 2, math.pi / 4], abs=1e-6)
+    # p = (0, 0, 1), n = (2, 0, 2): from p, O is at -z and n at (2, 0, 1)/sqrt(5):
+    # cos = -1/sqrt(5), obtuse; at n the camera is at 45 degrees, p at atan2(2, 1) from -z.
+    angle = neighbourhood_angle(line([1, 2]))
+    assert angle[0, 0] == pytest.approx(math.acos(-1 / math.sqrt(5)), abs=1e-6)
+    assert angle[0, 1] == pytest.approx(math.atan2(2, 1) - math.pi / 4, abs=1e-6)
+
+
+def test_angle_is_that_of_equation_2_6_where_an_arcsine_can_give_it() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        z = rng.uniform(0.5, 5, 2)
+        f = line(z, focal=float(rng.uniform(1, 50)))
+        p, n = f.point_image[0].astype(float)
+        phi = math.acos(p @ n / np.linalg.norm(p) / np.linalg.norm(n))
+        sine = np.linalg.norm(n) / np.linalg.norm(n - p) * math.sin(phi)
+        xi = float(neighbourhood_angle(f)[0, 0])
+        assert math.sin(xi) == pytest.approx(sine, abs=1e-4)
+        # Beyond 90 degrees if n is further away than the foot of the perpendicular to O p at p.
+        assert (xi > math.pi / 2) == (n @ p > p @ p)
+
+
+def test_angle_finds_jump_edges_and_believes_slopes() -> None:
+    """May et al.: points between foreground and background go, tilted surfaces stay."""
+    step = np.full((20, 30), 2.0)
+    step[:, 15:] = 4.0
+    step[:, 14] = 2.7  # a mixed pixel
+    keep = NeighbourhoodAngle().mask(frame(step), ())
+    assert not keep[:, 13:15].any()  # the rim and the mixed pixels
+    assert keep[:, :13].all()
+    assert keep[:, 15:].all()  # the background, which only sees something before it
+    # A wall seen at 15 degrees stays, at 5 degrees it goes.
+    for grazing, believed in ((15, True), (5, False)):
+        u = (np.arange(30) - 14.5) / 230
+        z = 2 / (1 - u / math.tan(math.radians(grazing)))
+        inside = NeighbourhoodAngle().mask(frame(np.tile(z, (20, 1))), ())[1:-1, 1:-1]
+        assert inside.all() == believed
+        assert inside.any() == believed
+
+
+def test_angle_ignores_invalid_neighbours() -> None:
+    z = np.zeros((5, 5))
+    z[2, 2] = 1.0
+    assert neighbourhood_angle(frame(z)).max() == 0
+    assert NeighbourhoodAngle().mask(frame(z), ()).all()
+
+
+# Median --------------------------------------------------------------------------------------
+
+
+def median_twin(z: np.ndarray, size: int) -> np.ndarray:
+    half, out = size // 2, np.zeros_like(z)
+    for i, j in np.ndindex(z.shape):
+        window = z[max(0, i - half) : i + half + 1, max(0, j - half) : j + half + 1]
+        if (window > 0).any():
+            out[i, j] = np.median(window[window > 0])
+    return out
+
+
+@pytest.mark.parametrize("size", [3, 5, 7])
+def test_local_median_is_that_of_the_valid_pixels(size: int) -> None:
+    rng = np.random.default_rng(size)
+    z = rng.uniform(0.5, 3, (17, 23)).astype(np.float32)
+    z[rng.random(z.shape) < 0.4] = 0
+    z[5:15, 5:15] = 0
+    assert np.array_equal(local_median(z, size), median_twin(z, size))
+
+
+def test_median_removes_outliers_and_keeps_steps() -> None:
+    z = np.full((20, 20), 2.0)
+    z[:, 10:] = 3.0
+    z[5, 5] = 2.3
+    z[15, 15] = 0.4
+    keep = Median(threshold=0.1, size=3).mask(frame(z), ())
+    assert not keep[5, 5]
+    assert not keep[15, 15]
+    assert keep.sum() == 398
+
+
+# Nearest neighbours --------------------------------------------------------------------------
+
+
+def distance_twin(points: np.ndarray, k: int) -> np.ndarray:
+    d = np.linalg.norm(points[:, None].astype(float) - points[None].astype(float), axis=2)
+    return np.sort(d, axis=1)[:, 1 : k + 1].mean(1)
+
+
+def cloud_of(seed: int, n: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (n, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("k", [1, 3, 8])
+def test_mean_neighbour_distance_by_brute_force(k: int) -> None:
+    points = cloud_of(k, 300)
+    points[10] = points[11] = points[12]
+    assert mean_neighbour_distance(points, k) == pytest.approx(distance_twin(points, k), abs=1e-12)
+
+
+def test_mean_neighbour_distance_of_few_points() -> None:
+    assert mean_neighbour_distance(np.zeros((0, 3), np.float32), 3).shape == (0,)
+    assert mean_neighbour_distance(np.zeros((1, 3), np.float32), 3).tolist() == [np.inf]
+    assert mean_neighbour_distance(np.float32([[0, 0, 0], [0, 3, 4]]), 3).tolist() == [5, 5]
+
+
+def test_neighbour_distance_removes_the_far_ones() -> None:
+    points = np.float32([[0, 0, 1], [0.01, 0, 1], [0, 0.01, 1], [0.01, 0.01, 1], [1, 1, 1]])
+    keep = NeighbourDistance(0.05, 3).mask(CloudFrame.of(points), ())
+    assert keep.tolist() == [True] * 4 + [False]
+
+
+def test_neighbour_share_removes_the_most_distant() -> None:
+    points = cloud_of(0, 401)
+    f = CloudFrame.of(points)
+    keep = NeighbourShare(0.5, 3).mask(f, ())
+    distance = distance_twin(points, 3)
+    assert keep.sum() == 201
+    assert distance[keep].max() <= distance[~keep].min()
+    assert NeighbourShare(0.0).mask(f, ()).all()
+    assert not NeighbourShare(1.0).mask(f, ()).any()
+    assert NeighbourShare(0.29).mask(CloudFrame.of(cloud_of(1, 100)), ()).sum() == 71
+
+
+def test_neighbour_share_decides_ties_by_order() -> None:
+    # On a regular grid all inner points have the same distance.
+    x, y = np.meshgrid(np.arange(8.0), np.arange(8.0))
+    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    keep = NeighbourShare(0.5, 2).mask(CloudFrame.of(points), ())
+    assert np.flatnonzero(keep).tolist() == list(range(32))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(2, 80), k=st.integers(1, 6))
+def test_neighbours_don_t_care_about_order_or_frame(seed: int, n: int, k: int) -> None:
+    points = cloud_of(seed, n)
+    rng = np.random.default_rng([seed, 1])
+    order = rng.permutation(n)
+    distance = mean_neighbour_distance(points, k)
+    assert np.array_equal(mean_neighbour_distance(points[order], k), distance[order])
+    T = se3.exp(rng.uniform(-2, 2, 6))
+    moved = se3.transform(T, points).astype(np.float32)
+    assert mean_neighbour_distance(moved, k) == pytest.approx(distance, abs=2e-6)
+    share = NeighbourShare(0.4, k)
+    keep = share.mask(CloudFrame.of(points), ())
+    if len(np.unique(distance)) == n:
+        assert np.array_equal(share.mask(CloudFrame.of(points[order]), ()), keep[order])
+
+
+def test_masks_of_images_lie_where_the_points_are() -> None:
+    z = np.full((12, 12), 1.0)
+    z[0, :] = 0
+    z[6, 6] = 2.0
+    keep = NeighbourDistance(0.05, 3).mask(frame(z), ())
+    assert keep.shape == (12, 12)
+    assert not keep[6, 6]
+    assert keep[1:].sum() == 11 * 12 - 1
+
+
+# Time ----------------------------------------------------------------------------------------
+
+
+def test_temporal_deviation_is_the_sample_deviation_of_z() -> None:
+    z = np.zeros((3, 2, 2), np.float32)
+    z[:, 0, 0] = [1.0, 1.02, 1.04]  # 20 mm
+    z[:, 0, 1] = [1.0, 0, 1.06]  # 42 mm over the two that are valid
+    z[:, 1, 0] = [0, 0, 1.0]
+    expected = [[0.02, 0.06 / math.sqrt(2)], [NAN, NAN]]
+    assert z_deviation(list(z)) == pytest.approx(np.array(expected), abs=1e-6, nan_ok=True)
+    frames = [frame(image) for image in z]
+    part = TemporalDeviation(0.025, 3)
+    assert part.mask(frames[-1], frames[:-1]).tolist() == [[True, False], [True, True]]
+
+
+def test_temporal_uses_z_not_range() -> None:
+    camera = Pinhole(2, 2, 0.1, 0.1, 0.0, 0.0)  # z is a tenth of the range beside the axis
+    frames = [
+        RangeFrame(0, 0.0, camera, np.full((2, 2), r, np.float32), "range") for r in (1.0, 1.1)
+    ]
+    keep = TemporalDeviation(0.025, 2).mask(frames[1], frames[:1])
+    assert keep.tolist() == [[False, True], [True, True]]
+
+
+def test_temporal_without_history_keeps_all() -> None:
+    f = frame(np.random.default_rng(0).uniform(1, 5, (6, 6)))
+    other_size = frame(np.ones((4, 4)))
+    assert TemporalDeviation().mask(f, ()).all()
+    assert TemporalDeviation().mask(f, [other_size]).all()
+
+
+def test_history_is_cut_to_the_window() -> None:
+    frames = [frame(np.full((3, 3), z)) for z in (9.0, 1.0, 1.0)]
+    left, _ = apply_filters([TemporalDeviation(0.025, 2)], frames[2], frames[:2])
+    assert left.valid.all()
+    left, removals = apply_filters([TemporalDeviation(0.025, 3)], frames[2], frames[:2])
+    assert not left.valid.any()
+    assert removals[0].removed == 9
+
+
+def test_temporal_removes_edges_and_keeps_faces() -> None:
+    """What the thesis saw (figure 3.2 c): edges go, surfaces facing the camera stay."""
+    rng = np.random.default_rng(3)
+    frames = []
+    for _ in range(6):
+        z = np.full((30, 30), 3.0) + 0.01 * rng.standard_normal((30, 30))
+        z[8:22, 8:22] = 1.5 + 0.01 * rng.standard_normal((14, 14))
+        share = rng.random(14)  # what a pixel on the edge gets of either side, each time anew
+        z[8:22, 22] = 1.5 * share + 3.0 * (1 - share)
+        frames.append(frame(z))
+    keep = TemporalDeviation(0.025, 6).mask(frames[-1], frames[:-1])
+    assert not keep[8:22, 22].any()
+    keep[8:22, 22] = True
+    assert keep.all()
+
+
+# All of them ---------------------------------------------------------------------------------
+
+
+def every_filter() -> list[Filter]:
+    parts.discover("tofuse.filters")
+    box = Box((-1.0, -1.0, 0.5), (1.0, 1.0, 3.0))
+    known = parts.known("filter")
+    return [box if name == "box" else cls() for name, cls in known.items()]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.tuples(st.integers(2, 12), st.integers(2, 12)))
+def test_no_filter_adds_or_moves_points(seed: int, size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(seed)
+
+    def random_frame() -> RangeFrame:
+        z = rng.choice([0.0, np.nan, np.inf, -1.0, 0.7, 2.0, 5.0], size) * rng.uniform(0.9, 1, size)
+        amplitude = rng.choice([0.0, 100.0, 65535.0], size).astype(np.float32)
+        confidence = rng.integers(0, 8, size).astype(np.uint8)
+        return frame(z, amplitude_image=amplitude, confidence_image=confidence)
+
+    history, f = [random_frame() for _ in range(3)], random_frame()
+    cloud = CloudFrame.of(f.points)
+    for item in every_filter():
+        left, (removal,) = apply_filters([item], f, history)
+        assert item.mask(f, history).shape == f.valid.shape
+        assert not (left.valid & ~f.valid).any()
+        assert np.array_equal(left.depth[left.valid], f.depth[left.valid])
+        assert removal.seen == len(f)
+        assert removal.removed == len(f) - len(left)
+        if "cloud" in item.takes:
+            assert len(apply_filters([item], cloud)[0]) <= len(cloud)
+
+
+@pytest.mark.parametrize("z", [np.zeros((4, 4)), np.eye(4)[:1].repeat(2, 0) * [[1], [0]]])
+def test_empty_and_one_pixel_frames(z: np.ndarray) -> None:
+    f = frame(z)
+    for item in every_filter():
+        left, _ = apply_filters([item], f, [f])
+        assert len(left) <= len(f) <= 1
+
+
+def test_masks_do_not_depend_on_threads() -> None:
+    f = frame(np.random.default_rng(5).uniform(1, 1.2, (90, 110)))
+    for item in every_filter():
+        with threads(1):
+            one = item.mask(f, [f])
+        with threads(3):
+            assert np.array_equal(one, item.mask(f, [f]))
+
+
+@pytest.mark.parametrize(
+    ("cls", "options"),
+    [
+        (NeighbourhoodAngle, {"threshold": NAN}),
+        (NeighbourhoodAngle, {"threshold": 170.0}),
+        (Median, {"size": 4}),
+        (Median, {"size": 33}),
+        (Median, {"size": 3.0}),
+        (Median, {"threshold": 0.0}),
+        (Median, {"threshold": float("inf")}),
+        (NeighbourDistance, {"threshold": NAN}),
+        (NeighbourDistance, {"k": 0}),
+        (NeighbourShare, {"share": 1.1}),
+        (NeighbourShare, {"share": NAN}),
+        (NeighbourShare, {"k": True}),
+        (TemporalDeviation, {"frames": 1}),
+        (TemporalDeviation, {"threshold": -0.025}),
+    ],
+)
+def test_nonsense_options_are_refused(cls: type, options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="must"):
+        cls(**options)

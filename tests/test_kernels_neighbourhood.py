@@ -1,0 +1,40 @@
+"""Neighbourhood kernels against slow twins in NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.kernels.neighbourhood import largest_angle, window_median
+
+
+def angle_twin(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    out = np.zeros(valid.shape)
+    h, w = valid.shape
+    for i, j in np.argwhere(valid):
+        p = points[i, j].astype(float)
+        for v in range(i - 1, i + 2):
+            for u in range(j - 1, j + 2):
+                if (v, u) != (i, j) and 0 <= v < h and 0 <= u < w and valid[v, u]:
+                    d = points[v, u] - p
+                    cosine = -(p @ d) / np.linalg.norm(p) / np.linalg.norm(d)
+                    out[i, j] = max(out[i, j], np.arccos(np.clip(cosine, -1, 1)))
+    return out
+
+
+def test_largest_angle() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -1, 1], [1, 1, 3], (9, 11, 3)).astype(np.float32)
+    valid = rng.random((9, 11)) < 0.7
+    out = np.full((9, 11), -1, np.float32)
+    largest_angle(points, valid, 0, 4, out)
+    assert (out[4:] == -1).all()  # only its own rows
+    largest_angle(points, valid, 4, 9, out)
+    assert out == pytest.approx(angle_twin(points, valid), abs=1e-5)
+
+
+def test_window_median_writes_its_rows_only() -> None:
+    z = np.float32([[1, 2, 3], [4, 0, 6], [7, 8, 9]])
+    out = np.full((3, 3), -1, np.float32)
+    window_median(z, 1, 1, 2, out)
+    assert out.tolist() == [[-1, -1, -1], [4, 5, 6], [-1, -1, -1]]
