@@ -215,6 +215,20 @@ def test_fewer_than_three_pairs_are_refused(m):
         PointToPoint().motion(pairs(m), a)
 
 
+def test_the_kernels_equal_their_twins():
+    rng = np.random.default_rng(6)
+    p, q, weight = rng.normal(size=(20, 3)), rng.normal(size=(30, 3)), rng.uniform(0.1, 2, 12)
+    i, j = rng.integers(0, 20, 12), rng.integers(0, 30, 12)
+    T = se3.exp(rng.normal(size=6))
+    np.testing.assert_allclose(transform_points(T, p), se3.transform(T, p), rtol=1e-12)
+    p0, q0, H, size = weighted_moments(p, q, i, j, weight)
+    a, b = p[i] - np.average(p[i], 0, weight), q[j] - np.average(q[j], 0, weight)
+    np.testing.assert_allclose(p0, np.average(p[i], 0, weight), rtol=1e-12)
+    np.testing.assert_allclose(q0, np.average(q[j], 0, weight), rtol=1e-12)
+    np.testing.assert_allclose(H, (weight[:, None] * a).T @ b, rtol=1e-10, atol=1e-12)
+    assert size == pytest.approx((weight * ((p[i] ** 2).sum(1) + (q[j] ** 2).sum(1))).sum())
+
+
 def test_information_is_that_of_the_right_perturbation():
     rng = np.random.default_rng(3)
     T = se3.exp(rng.normal(size=6))
