@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation.mesh import Mesh
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
 
 
 class Assembly:
@@ -21,10 +21,18 @@ class Assembly:
 
     def add(self, material: Material, *parts: Mesh) -> None:
         """Add parts made of a material."""
+        surface = self._id(material)
+        self._parts.extend(part.of_surface(surface) for part in parts)
+
+    def add_mixed(self, materials: Sequence[Material], part: Mesh) -> None:
+        """Add one part whose surfaces are numbered as in `materials`."""
+        ids = np.array([self._id(material) for material in materials])
+        self._parts.append(replace(part, surface=ids[part.surface]))
+
+    def _id(self, material: Material) -> int:
         if material not in self.materials:
             self.materials.append(material)
-        surface = self.materials.index(material)
-        self._parts.extend(part.of_surface(surface) for part in parts)
+        return self.materials.index(material)
 
     def mesh(self) -> Mesh:
         """Return everything added so far."""

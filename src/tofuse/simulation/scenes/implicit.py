@@ -94,7 +94,7 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
     used = np.flatnonzero(crossings.ravel())
     corner = np.stack(np.unravel_index(used, cells), -1)
     vertices = start + step * (corner + total.reshape(-1, 3)[used] / crossings.ravel()[used, None])
-    vertices = _settled(shape, vertices, step)
+    vertices = settled(shape, vertices, step)
     number = np.full(index.size, -1)
     number[used] = np.arange(len(used))
     q = number[np.concatenate(quads)]
@@ -124,7 +124,7 @@ def _quads(cut: NDArray[np.bool_], inside: NDArray[np.bool_], index: Int64, axis
     return np.where(outward[:, None], quads, quads[:, ::-1])
 
 
-def _settled(shape: Shape, vertices: Float64, step: float) -> Float64:
+def settled(shape: Shape, vertices: Float64, step: float) -> Float64:
     """Move vertices onto the surface along its gradient, by no more than half a cell."""
     moved = vertices
     h = 1e-4
