@@ -247,7 +247,8 @@ class Sequence:
         The world is the object where one moves, else the room; its frame is that of the camera
         at time `first`, so the pose at `first` is the identity.
         """
-        return self.T_world_truth(first) @ self._T_subject_camera(t)
+        # Exactly the identity, which the product is only to within rounding.
+        return np.eye(4) if t == first else self.T_world_truth(first) @ self._T_subject_camera(t)
 
     def T_world_truth(self, first: float = 0.0) -> Float64:
         """(4, 4) motion that maps `Scene.truth_mesh` into the recording's world."""

@@ -1,0 +1,149 @@
+"""Procedural albedo against its NumPy twin, and its promises."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.kernels import texture as kernels
+from tofuse.simulation.texture import Material, noise_table, parameter_rows
+
+
+def noise_twin(table, points):
+    cell = np.floor(points)
+    u = points - cell
+    w = u * u * (3 - 2 * u)
+    cell = cell.astype(int)
+    permutation = table[0].astype(int)
+    total = np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        c = cell + corner
+        p = permutation[c[:, 0] % 256]
+        p = permutation[(p + c[:, 1]) % 256]
+        p = permutation[(p + c[:, 2]) % 256]
+        share = np.where(np.array(corner) == 1, w, 1 - w).prod(1)
+        total += share * table[1, p]
+    return total
+
+
+def fractal_twin(table, points):
+    """Three octaves, each turned and shifted."""
+    turns = np.array([[2, 2, -1], [-1, 2, 2], [2, -1, 2]]) / 3
+    second = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    third = np.array([[1, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])
+    p = points @ turns.T
+    total = noise_twin(table, p)
+    p = p @ second.T
+    total += 0.7 * noise_twin(table, 2.13 * p + (31.7, 11.3, 47.1))
+    p = p @ third.T
+    return 1.3 * (total + 0.5 * noise_twin(table, 4.31 * p + (7.9, 53.9, 19.3)))
+
+
+def patterns(material, points, seed=0):
+    row = parameter_rows([material], seed)[0]
+    table = noise_table(seed)
+    return np.array([kernels.pattern_at(table, row, *p) for p in points])
+
+
+def test_noise_equals_its_twin():
+    table = noise_table(3)
+    points = np.random.default_rng([0, 1]).uniform(-400, 400, (500, 3))
+    got = [kernels.value_noise(table, *p) for p in points]
+    np.testing.assert_allclose(got, noise_twin(table, points), atol=1e-12)
+
+
+def test_octaves_equal_their_twin():
+    table = noise_table(4)
+    points = np.random.default_rng([0, 3]).uniform(-50, 50, (300, 3))
+    got = [kernels.fractal_noise(table, *p) for p in points]
+    np.testing.assert_allclose(got, fractal_twin(table, points), atol=1e-11)
+
+
+def test_shading_equals_its_twin():
+    rng = np.random.default_rng([0, 4])
+    faces, rays = 20, 400
+    materials = [
+        Material("a", 0.5, 0.2, "noise", (0.3, 0.4, 0.5), gloss=0.1),
+        Material("b", 0.7, 0.0, "plain", gloss=0.3),
+    ]
+    rows, table = parameter_rows(materials, 2), noise_table(2)
+    flat = rng.normal(size=(faces, 3))
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    corner = flat[:, None] + 0.4 * rng.normal(size=(faces, 3, 3))
+    of_face = rng.integers(0, 2, faces).astype(np.int32)
+    origins, directions = rng.normal(size=(2, rays, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    distance = rng.uniform(1, 4, rays)
+    face = rng.integers(-1, faces, rays).astype(np.int32)
+    weights = rng.dirichlet([1, 1, 1], rays)
+    normal = np.zeros((rays, 3), np.float32)
+    albedo, gloss = np.zeros((2, rays), np.float32)
+    surface = np.full(rays, -1, np.int32)
+    kernels.shade_hits(
+        corner.reshape(faces, 9), flat, of_face, rows, table, origins, directions, rotation,
+        distance, face, np.ascontiguousarray(weights[:, 1:]), normal, albedo, gloss, surface,
+    )  # fmt: skip
+    hit = face >= 0
+    assert (surface[~hit] == -1).all()
+    assert not normal[~hit].any()
+    f, d = face[hit], directions[hit]
+    n = (weights[hit, :, None] * corner[f]).sum(1)
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    sign = np.where((flat[f] * d).sum(1) > 0, -1.0, 1.0)
+    away = sign * (n * d).sum(1) >= 0
+    assert 0 < away.sum() < len(f) / 2
+    n = np.where(away[:, None], flat[f], n) * sign[:, None]
+    np.testing.assert_allclose(normal[hit], n @ rotation.T, atol=1e-6)
+    s = of_face[f]
+    np.testing.assert_array_equal(surface[hit], s)
+    np.testing.assert_allclose(gloss[hit], np.array([0.1, 0.3])[s], rtol=1e-6)
+    points = origins[hit] + distance[hit, None] * d
+    pattern = fractal_twin(table, (points + rows[0, 7:10]) / rows[0, 2:5]).clip(-2.5, 2.5)
+    wanted = np.where(s == 0, 0.5 * (1 + 0.2 * pattern), 0.7)
+    np.testing.assert_allclose(albedo[hit], wanted, atol=1e-6)
+
+
+def test_noise_has_the_values_of_the_table_on_the_lattice_with_unit_variance():
+    table = noise_table(0)
+    assert table[1].std() == pytest.approx(1.0, abs=0.01)
+    value = kernels.value_noise(table, 3.0, -7.0, 11.0)
+    assert np.abs(table[1] - value).min() < 1e-12
+
+
+@pytest.mark.parametrize("pattern", ["noise", "wood", "tiles", "print", "speckle"])
+def test_contrast_is_about_the_standard_deviation(pattern):
+    material = Material("any", 0.5, 0.2, pattern, (0.3, 0.3, 0.3))
+    spread = []
+    for seed in range(4):
+        points = np.random.default_rng([seed, 2]).uniform(-20, 20, (1500, 3))
+        values = patterns(material, points, seed)
+        assert abs(values.mean()) < 0.35
+        spread.append(values.std())
+    assert 0.6 < np.mean(spread) < 1.4
+
+
+@pytest.mark.parametrize("pattern", ["noise", "wood", "tiles", "print", "speckle"])
+def test_patterns_are_continuous(pattern):
+    material = Material("any", 0.5, 0.2, pattern, (0.3, 0.3, 0.3))
+    along = np.linspace(0, 2, 20001)
+    line = np.stack([along, np.full_like(along, 0.7), np.full_like(along, 1.3)], -1)
+    steps = np.abs(np.diff(patterns(material, line)))
+    # 0.1 mm is 1 / 3000 of a blotch.
+    assert steps.max() < 0.05
+    assert steps.max() > 1e-5
+
+
+def test_seed_and_place_in_the_list_choose_the_pattern():
+    material = Material("any", 0.5, 0.2, "noise", (0.3, 0.3, 0.3))
+    assert (parameter_rows([material], 5) == parameter_rows([material], 5)).all()
+    assert (parameter_rows([material], 5) != parameter_rows([material], 6)).any()
+    rows = parameter_rows([material, material], 5)
+    assert (rows[0] != rows[1]).any()
+    assert (noise_table(5) == noise_table(5)).all()
+
+
+def test_a_plain_surface_has_no_pattern():
+    row = parameter_rows([Material("any", 0.5, 0.4, "plain")], 0)[0]
+    assert row[kernels.CONTRAST] == 0.0
+    assert kernels.pattern_at(noise_table(0), row, 0.3, 0.2, 0.1) == 0.0

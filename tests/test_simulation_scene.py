@@ -1,0 +1,316 @@
+"""Scenes and paths: sizes, counts and motion of the test cases, and exact truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.simulation.scene import SCENES, Scene, build
+from tofuse.simulation.scenes import furniture
+from tofuse.simulation.scenes.assembly import Assembly
+
+
+def sr4000_rays(step=4):
+    """Unit directions (N, 3) in the camera's frame: 43.6 x 34.6 degrees."""
+    f = 88 / np.tan(np.deg2rad(43.6 / 2))
+    v, u = np.mgrid[:144:step, :176:step].reshape(2, -1)
+    d = np.stack([(u - 87.5) / f, (v - 71.5) / f, np.ones(len(u))], -1)
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def look(scene, sequence, t, rays):
+    T = sequence.T_room_camera(t)
+    return scene.cast(T[:3, 3], rays @ T[:3, :3].T, sequence.T_room_object(t))
+
+
+def sphere_rays(count, seed=0):
+    d = np.random.default_rng([seed, 30]).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def built():
+    return {name: build(name) for name in SCENES}
+
+
+@pytest.mark.parametrize(
+    ("name", "raw", "stride", "used"),
+    [
+        ("rail", 315, 5, 63),
+        ("room", 384, 3, 128),
+        ("empty-room", 405, 3, 135),
+        ("torso", 222, 6, 37),
+        ("box", 570, 10, 57),
+    ],
+)
+def test_frame_counts_are_the_theses(built, name, raw, stride, used):
+    sequence = built[name][1]
+    assert (sequence.frames, sequence.stride) == (raw, stride)
+    assert len(range(0, sequence.frames, sequence.stride)) == used
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_is_seen_is_sound(built, name):
+    scene, sequence = built[name]
+    rays = sr4000_rays()
+    for t in np.linspace(0, sequence.frames / sequence.frame_rate_hz, 5):
+        hits = look(scene, sequence, t, rays)
+        assert np.isfinite(hits.distance).all()
+        assert hits.distance.min() > 0.3
+        d = rays @ sequence.T_room_camera(t)[:3, :3].T
+        np.testing.assert_allclose(np.linalg.norm(hits.normal, axis=1), 1, atol=1e-5)
+        assert ((hits.normal * d).sum(1) < 0).all()
+        assert 0.02 <= hits.albedo.min() <= hits.albedo.max() <= 0.98
+        assert 0.0 <= hits.gloss.min() <= hits.gloss.max() < 1.0
+        assert (hits.surface >= 0).all()
+        assert hits.surface.max() < len(scene.materials)
+
+
+@pytest.mark.parametrize("name", ["room", "empty-room", "rail", "torso", "box", "corridor"])
+def test_closed_rooms_let_no_ray_out(built, name):
+    scene, sequence = built[name]
+    origin = sequence.T_room_camera(0)[:3, 3]
+    assert np.isfinite(scene.cast(origin, sphere_rays(60000)).distance).all()
+
+
+@pytest.mark.parametrize("name", ["room", "empty-room"])
+def test_room_measures_6_by_3_2_m(built, name):
+    scene, _ = built[name]
+    hits = scene.cast((0.0, 0.0, 2.3), np.concatenate([np.eye(3), -np.eye(3)]))
+    d = hits.distance.astype(float)
+    np.testing.assert_allclose(d[:2] + d[3:5], [6.0, 3.2], atol=1e-6)
+    np.testing.assert_allclose(hits.normal, np.concatenate([-np.eye(3), np.eye(3)]), atol=1e-6)
+
+
+def test_seven_chairs_are_around_and_one_is_always_in_view(built):
+    scene, sequence = built["room"]
+    chairs = [k for k, m in enumerate(scene.materials) if m.name.startswith("chair ")]
+    fabrics = [k for k in chairs if scene.materials[k].name[-1].isdigit()]
+    assert len(fabrics) == 7
+    rays = sr4000_rays(6)
+    seen = set()
+    for frame in range(0, sequence.frames, 12):
+        surface = look(scene, sequence, frame / 30, rays).surface
+        assert np.isin(surface, chairs).mean() > 0.01
+        seen.update(surface)
+    assert seen.issuperset(fabrics)
+    empty = built["empty-room"][0]
+    assert not any(m.name.startswith("chair") for m in empty.materials)
+
+
+def test_chairs_stand_on_the_floor_with_five_legs():
+    assembly = Assembly([])
+    furniture.chair(assembly, furniture.PAPER, np.eye(4))
+    vertices = assembly.mesh().vertices
+    assert vertices[:, 2].min() == pytest.approx(0.0, abs=2e-3)
+    assert 0.95 < vertices[:, 2].max() < 1.2
+    low = vertices[vertices[:, 2] < 0.05]
+    angles = np.sort(np.unique(np.round(np.arctan2(low[:, 1], low[:, 0]) / (2 * np.pi / 5)) % 5))
+    assert len(angles) == 5
+    away = np.abs((np.arctan2(low[:, 1], low[:, 0]) / (2 * np.pi / 5) + 0.5) % 1 - 0.5)
+    assert away.max() < 0.12
+
+
+def test_rail_goes_90_cm_to_the_side_and_back_faster_on_the_way_out(built):
+    _, sequence = built["rail"]
+    times = np.arange(sequence.frames) / 30
+    poses = np.array([sequence.T_world_camera(t) for t in times])
+    x = poses[:, 0, 3]
+    assert x.max() == pytest.approx(0.90, abs=1e-4)
+    assert x.min() >= 0.0
+    assert x[-1] < 0.01
+    np.testing.assert_allclose(poses[:, 1:3, 3], 0, atol=1e-12)
+    np.testing.assert_allclose(poses[:, :3, :3], np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-12)
+    speed = np.diff(x) * 30
+    assert speed.max() > 1.4 * -speed.min()
+    assert np.abs(np.diff(speed)).max() * 30 < 1.0  # m/s^2: no jerks
+    turning = np.argmax(x)
+    assert turning < len(x) - turning
+
+
+@pytest.mark.parametrize("name", ["room", "empty-room"])
+def test_turn_closes_just_after_the_last_frame(built, name):
+    _, sequence = built[name]
+    whole = sequence.frames / 30
+    np.testing.assert_array_equal(sequence.T_world_camera(0.0), np.eye(4))
+    np.testing.assert_allclose(sequence.T_world_camera(whole), np.eye(4), atol=1e-9)
+    last = sequence.T_world_camera((sequence.frames - sequence.stride) / 30)
+    assert 1.0 < np.rad2deg(se3.angle(last)) < 4.0
+    half = sequence.T_world_camera(whole / 2)
+    assert np.rad2deg(se3.angle(half)) > 175
+    # Turning to the right is positive about the camera's y axis, which points down.
+    quarter = sequence.T_world_camera(whole / 4)
+    np.testing.assert_allclose(quarter[:3, 2], [1, 0, 0], atol=0.03)
+    np.testing.assert_allclose(quarter[:3, 3], 0, atol=1e-12)
+
+
+def test_axis_offset_puts_the_optical_centre_on_a_circle():
+    _, sequence = build("room", axis_offset_m=0.02)
+    half = sequence.T_world_camera(sequence.frames / 60)
+    assert np.linalg.norm(half[:3, 3]) == pytest.approx(0.04, abs=1e-6)
+    np.testing.assert_allclose(half[:3, 3], [0, 0, -0.04], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_motion_is_smooth_and_no_faster_than_a_hand(built, name):
+    _, sequence = built[name]
+    t = np.arange(0, sequence.frames / 30, 1 / 120)
+    poses = np.array([sequence.T_world_camera(s) for s in t])
+    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) * 120
+    turning = np.linalg.norm(steps[:, 3:], axis=1)
+    assert turning.max() < np.deg2rad(60)
+    assert np.abs(np.diff(steps, axis=0)).max() < 0.1  # no jumps in velocity
+    assert max(turning.max(), np.linalg.norm(steps[:, :3], axis=1).max()) > 0.01
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_points_seen_at_any_time_lie_on_the_true_surface_of_the_world(built, name):
+    """Hits, mapped by the true pose into the world and back onto the truth mesh."""
+    scene, sequence = built[name]
+    vertices, faces = scene.truth_mesh()
+    T = sequence.T_world_truth()
+    truth = se3.transform(T, vertices)
+    moving = sequence.T_room_object(0.0) is not None
+    rays = sr4000_rays(12)
+    alone = Scene("truth", scene.materials, _mesh(truth, faces))
+    for t in (0.0, 0.31 * sequence.frames / 30, 0.77 * sequence.frames / 30):
+        hits = look(scene, sequence, t, rays)
+        pose = sequence.T_world_camera(t)
+        again = alone.cast(pose[:3, 3], rays @ pose[:3, :3].T)
+        near = np.isfinite(again.distance) if moving else np.ones(len(rays), bool)
+        assert near.mean() > 0.05
+        np.testing.assert_allclose(again.distance[near], hits.distance[near], atol=1e-5)
+
+
+def _mesh(vertices, faces):
+    from tofuse.simulation.mesh import Mesh
+
+    return Mesh.of(vertices, faces)
+
+
+def test_box_is_300_by_300_by_400_mm_with_its_top_in_view(built):
+    scene, sequence = built["box"]
+    vertices, faces = scene.truth_mesh()
+    box = scene.surface_named("box")
+    hits = look(scene, sequence, 0.0, sr4000_rays(1))
+    top = (hits.surface == box) & (hits.normal[:, 2] > 0.999)
+    assert top.sum() > 300
+    side = (hits.surface == box) & (np.abs(hits.normal[:, 2]) < 1e-3)
+    assert side.sum() > 2000
+    corners = vertices[np.unique(faces[:12])]
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.3, 0.3, 0.4], atol=1e-15)
+    # All of the box is in the picture, all around, and nearer than the cut; the rest is beyond.
+    rays = sr4000_rays(4)
+    for t in np.linspace(0, 19, 7):
+        hits = look(scene, sequence, t, rays)
+        edge = (np.abs(rays[:, 0] / rays[:, 2]) > 0.385) | (np.abs(rays[:, 1] / rays[:, 2]) > 0.30)
+        assert not (hits.surface[edge] == box).any()
+        on = hits.surface == box
+        assert hits.distance[on].max() < scene.max_depth_m
+        steel = hits.surface == scene.surface_named("stand")
+        beyond = (hits.distance * rays[:, 2])[~on & ~steel]
+        assert beyond.min() > scene.max_depth_m
+
+
+def test_torso_turns_in_view_nearer_than_the_cut(built):
+    scene, sequence = built["torso"]
+    rays = sr4000_rays(4)
+    person = [scene.surface_named(n) for n in ("shirt", "skin", "hair", "trousers", "seat")]
+    for t in np.linspace(0, 7, 6):
+        hits = look(scene, sequence, t, rays)
+        on = np.isin(hits.surface, person)
+        assert 0.2 < on.mean() < 0.6
+        assert hits.distance[on].max() < scene.max_depth_m
+        assert (hits.distance * rays[:, 2])[~on].min() > scene.max_depth_m
+    assert np.rad2deg(se3.angle(sequence.T_world_camera(3.7))) > 170
+
+
+@pytest.mark.parametrize("name", ["torso", "box"])
+def test_with_a_moving_object_the_camera_circles_it(built, name):
+    _, sequence = built[name]
+    np.testing.assert_array_equal(
+        sequence.T_room_camera(0.0), sequence.T_room_camera(sequence.frames / 60)
+    )
+    T_object_world = se3.inverse(sequence.T_world_truth())
+    whole = sequence.frames / 30
+    centres = np.array(
+        [(T_object_world @ sequence.T_world_camera(t))[:3, 3] for t in np.linspace(0, whole, 9)]
+    )
+    radius = np.hypot(centres[:, 0], centres[:, 1])
+    assert radius.min() > 1.0
+    np.testing.assert_allclose(radius, radius[0], atol=1e-9)
+    np.testing.assert_allclose(centres[0], centres[-1], atol=1e-9)
+
+
+def test_uniform_albedo_changes_nothing_but_the_albedo(built):
+    textured, sequence = built["empty-room"]
+    uniform, _ = build("empty-room", texture=False)
+    rays = sr4000_rays(4)
+    contrast = []
+    for t in np.linspace(0, 13, 6):
+        a, b = look(textured, sequence, t, rays), look(uniform, sequence, t, rays)
+        np.testing.assert_array_equal(a.distance, b.distance)
+        np.testing.assert_array_equal(a.normal, b.normal)
+        assert np.ptp(b.albedo) == 0.0
+        assert not b.gloss.any()
+        contrast.append(a.albedo.std() / a.albedo.mean())
+    # Enough for a tracker that follows the amplitude, in every direction.
+    assert min(contrast) > 0.06
+    assert max(contrast) > 0.15
+
+
+def test_seed_changes_the_look_and_the_same_seed_does_not(built):
+    rays = sr4000_rays(8)
+    first, sequence = built["room"]
+    same, other = build("room")[0], build("room", seed=1)[0]
+    a, b, c = (look(s, sequence, 1.0, rays) for s in (first, same, other))
+    assert a.albedo.tobytes() == b.albedo.tobytes()
+    assert a.distance.tobytes() == b.distance.tobytes()
+    assert (a.albedo != c.albedo).mean() > 0.5
+
+
+def test_threads_change_no_bit(built):
+    scene, sequence = built["torso"]
+    rays = sr4000_rays(1)
+    with threads(1):
+        a = look(scene, sequence, 1.0, rays)
+    with threads(3):
+        b = look(scene, sequence, 1.0, rays)
+    for name in ("distance", "normal", "albedo", "gloss", "surface"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+
+
+def test_one_origin_and_an_origin_for_each_ray_agree(built):
+    scene, _ = built["rail"]
+    d = sphere_rays(3000)
+    origin = np.array([0.1, 0.2, 1.0])
+    a = scene.cast(origin, d)
+    b = scene.cast(np.tile(origin, (len(d), 1)).astype(np.float32), d.astype(np.float32))
+    np.testing.assert_allclose(np.median(np.abs(a.distance - b.distance)), 0, atol=1e-6)
+    assert a.distance.dtype == b.distance.dtype == np.float32
+    with pytest.raises(ValueError, match="shapes"):
+        scene.cast(np.zeros((7, 3)), d)
+    assert len(scene.cast(origin, np.zeros((0, 3))).distance) == 0
+
+
+def test_fewer_frames_stop_earlier_on_the_same_path():
+    _, whole = build("wall")
+    _, part = build("wall", frames=7)
+    assert part.frames == 7
+    np.testing.assert_array_equal(whole.T_room_camera(0.2), part.T_room_camera(0.2))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("kitchen", {}, "use one of"),
+        ("room", {"frames": 0}, "frames"),
+        ("rail", {"axis_offset_m": 0.1}, "axis_offset_m"),
+    ],
+)
+def test_bad_requests_say_what_to_do(name, options, words):
+    with pytest.raises(InputError, match=words):
+        build(name, **options)
