@@ -1,1 +1,1 @@
-"""report.html: the run, explained to a person."""
+"""`report.html`: one file, made for a person, that shows what came out and how far to trust it."""

@@ -1,0 +1,39 @@
+"""What a report shows beyond the result itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.recordings.frames import Frame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ReportExtras:
+    """Samples of the recording, and the truth where it is known.
+
+    Attributes
+    ----------
+    title
+        For example the name of the input.
+    filter_steps
+        ("raw", frame), then (name, frame) after each filter in order, for one sample frame.
+    reference
+        (N, 4, 4) reference T_world_camera in the world of the result (its first pose is the
+        identity), NaN where there is none; rows as `Reconstruction.trajectory`. Or None.
+    truth_points
+        (K, 3) points in m on the true surfaces, in the world frame; None if not known.
+    thumbnails
+        About a dozen evenly spaced, unfiltered frames.
+    """
+
+    title: str
+    filter_steps: tuple[tuple[str, Frame], ...] = ()
+    reference: Float64 | None = None
+    truth_points: Float32 | None = None
+    thumbnails: tuple[Frame, ...] = ()

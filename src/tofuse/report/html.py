@@ -1,0 +1,64 @@
+"""`report.html`: the result laid out for a person, in one file without outside resources."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tofuse._version import __version__
+from tofuse.report.extras import ReportExtras
+from tofuse.report.sections import sections
+from tofuse.results.types import Reconstruction
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+
+def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> None:
+    """Write the report to `path`, beside it first and then renamed.
+
+    Raises
+    ------
+    OSError
+        If the file can't be written; an earlier one is left as it was.
+    """
+    text = render(result, extras)
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def render(result: Reconstruction, extras: ReportExtras) -> str:
+    """Return the report as HTML."""
+    shown: dict[str, Any] = sections(result, extras)
+    scene = shown.pop("scene")
+    return _template().render(
+        **shown,
+        version=__version__,
+        style=_asset("style.css"),
+        script=_asset("viewer.js"),
+        # Only numbers and base64 are in it, so nothing can end the script element early.
+        scene_json=None if scene is None else json.dumps(scene, separators=(",", ":")),
+    )
+
+
+def _asset(name: str) -> str:
+    folder = resources.files("tofuse.report") / "templates"
+    return (folder / name).read_text(encoding="utf-8")
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_asset("report.html.j2"))

@@ -1,0 +1,213 @@
+"""Small pictures as data URIs: depth, amplitude and colour images, and splatted clouds."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+GONE = (128, 128, 132)  # no measurement: a grey that differs from both ends of the colour map
+REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
+BACKGROUND = (22, 25, 30)  # of the 3D view
+
+# Viridis at nine places (matplotlib's, CC0): near is dark, far is bright, in grey print as well.
+_VIRIDIS = np.array(
+    [
+        [68, 1, 84],
+        [71, 44, 122],
+        [59, 81, 139],
+        [44, 113, 142],
+        [33, 144, 141],
+        [39, 173, 129],
+        [92, 200, 99],
+        [170, 220, 50],
+        [253, 231, 37],
+    ],
+    float,
+)
+
+
+def viridis(value: Float64) -> UInt8:
+    """Colours (..., 3) of values from 0 to 1."""
+    place = np.clip(np.nan_to_num(value), 0, 1) * (len(_VIRIDIS) - 1)
+    low = np.minimum(place.astype(int), len(_VIRIDIS) - 2)
+    t = (place - low)[..., None]
+    return np.round(_VIRIDIS[low] * (1 - t) + _VIRIDIS[low + 1] * t).astype(np.uint8)
+
+
+def data_uri(image: UInt8, *, jpeg: bool = False) -> str:
+    """Encode an (H, W, 3) RGB or (H, W, 4) RGBA image as PNG (or JPEG, for photographs)."""
+    import cv2
+
+    code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    flipped = cv2.cvtColor(np.ascontiguousarray(image), code)
+    if jpeg:
+        _, data = cv2.imencode(".jpg", flipped, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    else:
+        _, data = cv2.imencode(".png", flipped, [cv2.IMWRITE_PNG_COMPRESSION, 7])
+    kind = "jpeg" if jpeg else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def shrink(image: UInt8, width: int) -> UInt8:
+    """Take every n-th pixel until the image is at most `width` wide.
+
+    Averaging would invent depths between an edge and what is behind it.
+    """
+    step = -(-image.shape[1] // width)
+    return np.ascontiguousarray(image[::step, ::step])
+
+
+def depth_limits(frame: Frame) -> tuple[float, float]:
+    """Return the depths in m between which colours are spread: the middle 96 % of the points."""
+    if isinstance(frame, RangeFrame):
+        values = frame.z[frame.valid].astype(float)
+    else:
+        values = np.linalg.norm(frame.points - frame.origin, axis=1)
+    if len(values) == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(values, [2, 98])
+    return float(low), float(max(high, low + 1e-3))
+
+
+def depth_image(frame: RangeFrame, limits: tuple[float, float], removed: Bool | None) -> UInt8:
+    """Colour the z depth; pixels without a measurement are grey, those in `removed` marked."""
+    low, high = limits
+    image = viridis((frame.z.astype(float) - low) / (high - low))
+    image[~frame.valid] = GONE
+    if removed is not None:
+        image[removed] = REMOVED
+    return image
+
+
+def amplitude_image(frame: RangeFrame) -> UInt8 | None:
+    """Amplitude as grey, stretched and with the gamma of a screen; None if not recorded."""
+    amplitude = frame.amplitude_image
+    if amplitude is None:
+        return None
+    lit = (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
+    low, high = np.percentile(amplitude[lit], [1, 99]) if lit.any() else (0.0, 1.0)
+    level = ((amplitude - low) / max(high - low, 1e-9)).clip(0, 1) ** (1 / 2.2)
+    grey = np.round(255 * level).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def splat(
+    points: Float64,
+    colors: UInt8,
+    T_view_world: Float64,
+    size: tuple[int, int],
+    *,
+    scale: float,
+    distance: float | None = None,
+    radius: int = 1,
+) -> UInt8:
+    """Draw points as squares, the nearest in front.
+
+    Parameters
+    ----------
+    points, colors
+        (N, 3) m, and (N, 3) RGB.
+    T_view_world
+        (4, 4) into a view whose axes are x right, y down, z into the picture.
+    size
+        Width and height in pixels.
+    scale
+        Pixels per metre (at the centre, where there is a perspective).
+    distance
+        Of the eye from the view's origin in m; None for a parallel projection.
+
+    Returns
+    -------
+    (H, W, 4) RGBA, transparent where there is no point.
+    """
+    width, height = size
+    view = points @ T_view_world[:3, :3].T + T_view_world[:3, 3]
+    depth = view[:, 2]
+    zoom: Float64 | float = scale
+    if distance is not None:
+        depth = depth + distance
+        zoom = scale * distance / np.maximum(depth, 1e-6)
+    u = np.round(width / 2 + view[:, 0] * zoom).astype(int)
+    v = np.round(height / 2 + view[:, 1] * zoom).astype(int)
+    seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    if distance is not None:
+        seen &= depth > 0.02 * distance
+    order = np.flatnonzero(seen)
+    order = order[np.argsort(-depth[order], kind="stable")]  # far first: the nearest is left
+    image = np.zeros((height + radius, width + radius, 4), np.uint8)
+    # One offset after another: a far point may cover the edge of a nearer square, which is
+    # invisible at a few pixels.
+    for dv in range(radius):
+        for du in range(radius):
+            rows, columns = v[order] + dv, u[order] + du
+            image[rows, columns, :3] = colors[order]
+            image[rows, columns, 3] = 255
+    return image[:height, :width]
+
+
+def turned(yaw: float, pitch: float) -> Float64:
+    """Rotation (3, 3) into a view turned by `yaw` and looking down by `pitch` (rad)."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    return about_x @ about_y
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """A parallel projection that shows all but the outermost points.
+
+    Attributes
+    ----------
+    T_view_world
+        (4, 4).
+    scale
+        Pixels per metre.
+    size
+        Width and height in pixels.
+    """
+
+    T_view_world: Float64
+    scale: float
+    size: tuple[int, int]
+
+    @classmethod
+    def around(
+        cls, points: Float64, size: tuple[int, int], *, yaw: float = 0.7, pitch: float = 0.45
+    ) -> Framing:
+        """Frame (N, 3) points, seen from above and to the side."""
+        R = turned(yaw, pitch)
+        T = np.eye(4)
+        T[:3, :3] = R
+        if len(points) == 0:
+            return cls(T, 1.0, size)
+        view = points @ R.T
+        low, high = np.percentile(view, [1, 99], axis=0)
+        T[:3, 3] = -(low + high) / 2
+        extent = np.maximum(high - low, 1e-6)
+        return cls(T, float(0.92 * min(size[0] / extent[0], size[1] / extent[1])), size)
+
+
+def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
+    """Draw a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
+    points = frame.points.astype(float)
+    if isinstance(frame, RangeFrame):
+        depth = points[:, 2]
+    else:
+        depth = np.linalg.norm(points - frame.origin, axis=1)
+    low, high = limits
+    colors = viridis((depth - low) / (high - low))
+    radius = 1 if len(points) > 20_000 else 2
+    return splat(
+        points, colors, framing.T_view_world, framing.size, scale=framing.scale, radius=radius
+    )

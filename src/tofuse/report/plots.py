@@ -1,0 +1,350 @@
+"""Plots as inline SVG whose colours are the page's, so that they follow its light or dark look."""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Float64 = NDArray[np.float64]
+
+# Stand-ins that `svg` replaces by the page's variables of the same names.
+INK, MUTED, GRID = "#010101", "#020202", "#030303"
+BEFORE, AFTER, REFERENCE, LOOP, BAD = "#040404", "#050505", "#060606", "#070707", "#080808"
+_VARIABLES = {
+    INK: "ink",
+    MUTED: "muted",
+    GRID: "grid",
+    BEFORE: "before",
+    AFTER: "after",
+    REFERENCE: "reference",
+    LOOP: "loop",
+    BAD: "bad",
+}
+_MODEL = (112, 138, 176)  # of the model's points: readable on white and on near-black
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "image.composite_image": False,
+    "font.size": 11,
+    "axes.unicode_minus": True,
+    "path.simplify": True,
+}
+
+
+def _new(width: float, height: float, margins: tuple[float, float, float, float]) -> Any:
+    """Make a figure of that many pixels, and axes; margins are left, bottom, right, top."""
+    # A first use builds or misses a font cache and says so: not on the person's terminal.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width / 72, height / 72), dpi=72)
+    left, bottom, right, top = margins
+    axes = figure.add_axes(
+        (
+            left / width,
+            bottom / height,
+            (width - left - right) / width,
+            (height - bottom - top) / height,
+        )
+    )
+    axes.patch.set_visible(False)
+    figure.patch.set_visible(False)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(MUTED)
+    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=10.5, length=3)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def svg(figure: Figure, label: str) -> str:
+    """Return the figure as an `<svg>` element; `label` is plain text without markup."""
+    import matplotlib
+
+    out = io.StringIO()
+    nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    # Salted with the label, identifiers differ between the plots of a page.
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": label}):
+        figure.savefig(out, format="svg", metadata=nothing)
+    text = out.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", text, count=1, flags=re.DOTALL)
+    text = re.sub(r'<g id="[^"]*"', "<g", text)
+    view = re.search(r'viewBox="[^"]*"', text)
+    # Namespaces are implied in HTML, and so no address is left in the page.
+    head = f'<svg class="plot" role="img" aria-label="{label}" {view.group() if view else ""}>'
+    text = head + text[text.index(">") + 1 :]
+    text = text.replace("xlink:href", "href")
+    text = re.sub(r"'?DejaVu Sans'?(, '[^']*'|, [A-Za-z -]+)*", "inherit", text)
+    for color, name in _VARIABLES.items():
+        text = text.replace(color, f"var(--{name})")
+    return text.strip()
+
+
+def lines(
+    x: Float64,
+    series: Sequence[tuple[Float64, str, str]],
+    *,
+    label: str,
+    ylabel: str,
+    xlabel: str = "frame",
+    log: bool = False,
+    zero: bool = False,
+    floor: bool = False,
+    bad: Float64 | None = None,
+    size: tuple[int, int] = (400, 210),
+) -> str:
+    """Plot lines over frames or iterations.
+
+    Parameters
+    ----------
+    series
+        (y, colour, line style); NaN leaves a gap.
+    log
+        A logarithmic y axis, linear near 0 if a value is 0.
+    zero
+        Draw the line y = 0.
+    floor
+        Begin the y axis at 0.
+    bad
+        x of frames without a value, marked by crosses on the axis.
+    """
+    figure, axes = _new(*size, (52, 36, 10, 20))
+    one = len(x) == 1
+    for y, color, style in series:
+        few = int(np.isfinite(y).sum()) <= 30
+        axes.plot(
+            x,
+            y,
+            color=color,
+            linestyle=style,
+            linewidth=1.6,
+            marker="o" if one or (few and style == "-") else None,
+            markersize=3,
+        )
+    if log:
+        values = np.concatenate([y for y, _, _ in series])
+        above = values[np.isfinite(values) & (values > 0)]
+        if len(above) and (values[np.isfinite(values)] > 0).all():
+            axes.set_yscale("log")
+        elif len(above):
+            axes.set_yscale("symlog", linthresh=float(above.min()))
+    if zero:
+        axes.axhline(0, color=MUTED, linewidth=0.8)
+    if floor:
+        axes.set_ylim(bottom=0)
+    if bad is not None and len(bad):
+        axes.plot(
+            bad,
+            np.zeros(len(bad)),
+            "x",
+            color=BAD,
+            markersize=5,
+            transform=axes.get_xaxis_transform(),
+            clip_on=False,
+        )
+    if not one and len(x):
+        pad = 0.01 * (x[-1] - x[0])
+        axes.set_xlim(x[0] - pad, x[-1] + pad)
+    axes.set_xlabel(xlabel, color=MUTED, fontsize=10.5, labelpad=2)
+    axes.set_title(ylabel, color=INK, fontsize=11, loc="left", pad=6, x=-0.1)
+    axes.locator_params(axis="x", nbins=6, integer=True)
+    if not log:
+        axes.locator_params(axis="y", nbins=5)
+    return svg(figure, label)
+
+
+# Views of the world: x right, y down, z forward. Each is (horizontal, vertical) as (axis, sign).
+VIEWS: dict[str, tuple[tuple[int, int], tuple[int, int]]] = {
+    "above": ((0, 1), (2, 1)),
+    "side": ((2, 1), (1, -1)),
+}
+_NAMES = {0: "x (right)", 1: "y (down)", 2: "z (forward)"}
+
+
+def project(points: Float64, view: str) -> Float64:
+    """Return (N, 2) picture coordinates in m, up and right positive, of (N, 3) world points."""
+    (a, sa), (b, sb) = VIEWS[view]
+    return np.stack([sa * points[:, a], sb * points[:, b]], axis=1)
+
+
+def limits(*groups: Float64, outer: float = 0.0, least: float = 0.02) -> Float64:
+    """Return (2, 2) low and high corners around groups of (N, 2) points, with some room.
+
+    `outer` percent of the points are left out at each end; `least` is the smallest size in m.
+    """
+    boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in groups if len(g)]
+    if not boxes:
+        return np.array([[-0.5, -0.5], [0.5, 0.5]])
+    low = np.min([b[0] for b in boxes], axis=0)
+    high = np.max([b[1] for b in boxes], axis=0)
+    room = np.maximum(0.06 * (high - low).max(), least)
+    return np.stack([low - room, high + room])
+
+
+def _plan(box: Float64, view: str, width: int) -> Any:
+    """Make axes with equal scales for a (2, 2) box, as high as it needs."""
+    left, bottom, right, top = 46, 36, 12, 8
+    extent = box[1] - box[0]
+    inner = width - left - right
+    height = float(np.clip(inner * extent[1] / extent[0], 90, 1.1 * inner))
+    figure, axes = _new(width, height + bottom + top, (left, bottom, right, top))
+    # Grow the box to the shape of the axes, about its middle.
+    scale = max(extent[0] / inner, extent[1] / height)
+    middle = box.mean(0)
+    axes.set_xlim(middle[0] - scale * inner / 2, middle[0] + scale * inner / 2)
+    axes.set_ylim(middle[1] - scale * height / 2, middle[1] + scale * height / 2)
+    (a, sa), (b, sb) = VIEWS[view]
+    for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
+        axis.set_major_locator(_locator())
+        if sign < 0:
+            axis.set_major_formatter(lambda value, _: f"{-value + 0.0:.6g}".replace("-", "−"))
+    axes.set_xlabel(f"{_NAMES[a]}, m", color=MUTED, fontsize=10.5, labelpad=2)
+    axes.set_ylabel(f"{_NAMES[b]}, m", color=MUTED, fontsize=10.5, labelpad=2)
+    return figure, axes
+
+
+def _locator() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=6, steps=[1, 2, 5, 10])
+
+
+def model(
+    points: Float64,
+    cameras: Float64,
+    truth: Float64 | None,
+    view: str,
+    *,
+    measured: Float64 | None,
+    label: str,
+    width: int = 440,
+) -> str:
+    """Draw the model from above or the side, as density of points.
+
+    Parameters
+    ----------
+    points, cameras, truth
+        (N, 3) of the model, camera centres, and points on the true surfaces, m.
+    measured
+        (2, 3) low and high corner of the measured extents, drawn as a box.
+    """
+    flat, path = project(points, view), project(cameras, view)
+    true = None if truth is None else project(truth, view)
+    box = limits(flat, outer=0.25)
+    box = limits(box, path, *([] if true is None else [true]))
+    figure, axes = _plan(box, view, width)
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    columns = 2 * (width - 58)
+    rows = max(2, int(columns * (y1 - y0) / (x1 - x0)))
+    density, _, _ = np.histogram2d(
+        flat[:, 1], flat[:, 0], bins=(rows, columns), range=((y0, y1), (x0, x1))
+    )
+    top = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
+    image = np.zeros((rows, columns, 4), np.uint8)
+    image[..., :3] = _MODEL
+    alpha = (np.log1p(density) / np.log1p(top)).clip(0, 1)
+    image[..., 3] = np.round(255 * np.where(density > 0, 0.25 + 0.75 * alpha, 0))
+    axes.imshow(
+        image,
+        extent=(x0, x1, y0, y1),
+        origin="lower",
+        interpolation="none",
+        aspect="auto",
+    )
+    if true is not None and len(true):
+        _outline(axes, true)
+    if measured is not None:
+        low, high = np.sort(project(measured, view), axis=0)
+        axes.plot(
+            [low[0], high[0], high[0], low[0], low[0]],
+            [low[1], low[1], high[1], high[1], low[1]],
+            color=AFTER,
+            linewidth=1.2,
+        )
+    if len(path):
+        axes.plot(path[:, 0], path[:, 1], color=INK, linewidth=1)
+        axes.plot(path[0, 0], path[0, 1], "o", color=INK, markersize=4)
+    return svg(figure, label)
+
+
+def _outline(axes: Axes, flat: Float64) -> None:
+    """Draw the outer outline of (K, 2) points as a dashed line."""
+    from scipy import ndimage
+
+    low, high = flat.min(0), flat.max(0)
+    extent = np.maximum(high - low, 1e-3)
+    # Cells wide enough for a few samples in each, so that surfaces have no holes.
+    cell = max(extent.max() / 160, 1.5 * np.sqrt(extent[0] * extent[1] / len(flat)))
+    shape = tuple(int(n) + 9 for n in np.ceil(extent / cell))
+    ij = np.floor((flat - low) / cell).astype(int) + 4
+    mask = np.zeros(shape, bool)
+    mask[ij[:, 0], ij[:, 1]] = True
+    mask = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=3))
+    # Draw half a cell inside the cells' rim, which is half a cell outside the surface.
+    x = low[0] + cell * (np.arange(shape[0]) - 3.5)
+    y = low[1] + cell * (np.arange(shape[1]) - 3.5)
+    axes.contour(
+        x, y, mask.T.astype(float), levels=[0.5], colors=BAD, linewidths=1.6, linestyles="dashed"
+    )
+
+
+def cameras(
+    poses: Float64,
+    box: Float64,
+    view: str,
+    *,
+    color: str,
+    label: str,
+    loops: Float64 | None = None,
+    reference: Float64 | None = None,
+    width: int = 440,
+) -> str:
+    """Draw camera positions and viewing directions (figures 5.4 and 5.5).
+
+    Parameters
+    ----------
+    poses
+        (n, 4, 4) T_world_camera.
+    box
+        (2, 2) corners of the picture, m, so that pictures compare.
+    loops
+        (L, 2, 3) ends of loops.
+    reference
+        (m, 4, 4) true poses.
+    """
+    from matplotlib.collections import LineCollection
+
+    figure, axes = _plan(box, view, width)
+    size = 0.045 * float((box[1] - box[0]).max())
+    centers = project(poses[:, :3, 3], view)
+    if reference is not None and len(reference):
+        path = project(reference[:, :3, 3], view)
+        axes.plot(path[:, 0], path[:, 1], color=REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2)))
+    if loops is not None and len(loops):
+        ends = np.stack([project(loops[:, 0], view), project(loops[:, 1], view)], axis=1)
+        axes.add_collection(LineCollection(list(ends), colors=LOOP, linewidths=1, alpha=0.8))
+    axes.plot(centers[:, 0], centers[:, 1], color=color, linewidth=1)
+    step = -(-len(poses) // 150)
+    shape = np.array([[-0.5, 0, 1], [0, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]])
+    if view == "side":
+        shape = shape[:, [1, 0, 2]]
+    for k in range(0, len(poses), step):
+        grow = 1.7 if k == 0 else 1.0
+        world = poses[k, :3, :3] @ (grow * size * shape.T) + poses[k, :3, 3:]
+        flat = project(world.T, view)
+        axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=1.8 if k == 0 else 0.9)
+    axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
+    return svg(figure, label)

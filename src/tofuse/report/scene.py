@@ -1,0 +1,247 @@
+"""The 3D view's data: points, cameras and loops as compact arrays, and a still of them."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.cloud import Cloud
+from tofuse.geometry import se3
+from tofuse.report import images
+from tofuse.results.types import Reconstruction
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+Integers = NDArray[np.intp]
+
+MAX_POINTS = 150_000
+MAX_CAMERAS = 300
+YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the 3D view shows, in the world frame.
+
+    Attributes
+    ----------
+    points, colors, normals
+        (K, 3) float64 m, (K, 3) uint8, (K, 3) float or None where the cloud has none.
+    total
+        Points in the whole model.
+    spacing
+        Typical distance between neighbouring points shown, m.
+    before, after, reference
+        (n, 4, 4) poses, finite ones only; `reference` may be empty.
+    loops
+        (L, 2, 3) ends of the accepted loops.
+    """
+
+    points: Float64
+    colors: UInt8
+    normals: Float32 | None
+    total: int
+    spacing: float
+    before: Float64
+    after: Float64
+    reference: Float64
+    loops: Float64
+
+    @property
+    def center(self) -> Float64:
+        """(3,) what the view turns about: the middle of all but the outermost points."""
+        spots = self._spots()
+        if len(spots) == 0:
+            return np.zeros(3)
+        return np.percentile(spots, [1, 99], axis=0).mean(0)
+
+    @property
+    def size(self) -> float:
+        """Diagonal in m of the box around all but the outermost points; never 0."""
+        spots = self._spots()
+        if len(spots) == 0:
+            return 1.0
+        low, high = np.percentile(spots, [1, 99], axis=0)
+        return max(float(np.linalg.norm(high - low)), 1e-3)
+
+    def _spots(self) -> Float64:
+        return self.points if len(self.points) else self.after[:, :3, 3]
+
+
+def finite(poses: Float64 | None) -> Float64:
+    """Return the poses that are there, (n, 4, 4)."""
+    if poses is None or len(poses) == 0:
+        return np.zeros((0, 4, 4))
+    return poses[np.isfinite(poses).all((1, 2))]
+
+
+def make_scene(
+    result: Reconstruction, rows: dict[int, int], reference: Float64 | None = None
+) -> Scene:
+    """Gather and thin what is to be shown; `rows` gives the row of each frame index."""
+    cloud = result.cloud
+    chosen = _choose(len(cloud), MAX_POINTS)
+    points = cloud.points[chosen].astype(float) + cloud.offset
+    good = np.isfinite(points).all(1)
+    points, chosen = points[good], chosen[good]
+    ends = [
+        (result.trajectory[rows[p.i], :3, 3], result.trajectory[rows[p.j], :3, 3])
+        for p in result.diagnostics.loops
+        if p.accepted and p.i in rows and p.j in rows
+    ]
+    loops = np.array(ends, float).reshape(-1, 2, 3)
+    return Scene(
+        points,
+        _colors(cloud, chosen, points),
+        None if cloud.normals is None else cloud.normals[chosen],
+        len(cloud),
+        _spacing(points),
+        finite(result.diagnostics.sequential),
+        finite(result.trajectory),
+        finite(reference),
+        loops[np.isfinite(loops).all((1, 2))],
+    )
+
+
+def packed(scene: Scene) -> dict[str, Any]:
+    """Return the scene for the viewer: plain data, arrays as base64 (little endian)."""
+    low = scene.points.min(0) if len(scene.points) else np.zeros(3)
+    high = scene.points.max(0) if len(scene.points) else np.ones(3)
+    extent = np.maximum(high - low, 1e-6)
+    steps = np.round((scene.points - low) / extent * 65535).astype("<u2")
+    normals = scene.normals
+    step = -(-max(len(scene.after), len(scene.before), 1) // MAX_CAMERAS)
+    edge = 0.02 * scene.size
+    return {
+        "count": len(scene.points),
+        "low": low.tolist(),
+        "extent": extent.tolist(),
+        "center": scene.center.tolist(),
+        "size": scene.size,
+        "spacing": scene.spacing,
+        "heights": list(height_range(scene.points)),
+        "yaw": YAW,
+        "pitch": PITCH,
+        "points": _base64(steps),
+        "colors": _base64(scene.colors),
+        "normals": None
+        if normals is None
+        else _base64(np.round(np.nan_to_num(normals) * 127).astype(np.int8)),
+        "lines": {
+            "before": _base64(camera_lines(scene.before, edge, step).astype("<f4")),
+            "after": _base64(camera_lines(scene.after, edge, step).astype("<f4")),
+            "reference": _base64(path_lines(scene.reference).astype("<f4")),
+            "loops": _base64(scene.loops.reshape(-1, 3).astype("<f4")),
+        },
+    }
+
+
+def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
+    """Return ends of lines (2 n, 3): every step-th camera as a pyramid, the path through all.
+
+    The first camera is larger, as in the thesis.
+    """
+    if len(poses) == 0:
+        return np.zeros((0, 3))
+    w, h, d = 0.5, 0.4, 0.8
+    tip = np.zeros(3)
+    a, b, c, e = ([x * w, y * h, d] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    shape = np.array([tip, a, tip, b, tip, c, tip, e, a, b, b, c, c, e, e, a], float) * edge
+    drawn = poses[::step]
+    out = [se3.transform(drawn, shape[None]).reshape(-1, 3), path_lines(poses)]
+    out.append(se3.transform(poses[0], 1.8 * shape))
+    return np.concatenate(out)
+
+
+def path_lines(poses: Float64) -> Float64:
+    """Return ends of the lines (2 n, 3) that join the camera centres in order."""
+    centers = poses[:, :3, 3]
+    return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
+
+
+def still(scene: Scene, size: tuple[int, int] = (960, 600)) -> UInt8:
+    """Draw the view that the report opens with, for where there is no WebGL: (H, W, 3)."""
+    R = images.turned(YAW, PITCH)
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = -R @ scene.center
+    distance = 1.25 * scene.size
+    scale = size[1] / (2 * np.tan(0.35) * distance)
+    points, colors = scene.points, scene.colors
+    if scene.normals is not None and len(points):
+        # Surfaces that face away are walls between us and the inside.
+        eye = scene.center - R.T @ np.array([0, 0, distance])
+        facing = ((eye - points) * np.nan_to_num(scene.normals)).sum(1) >= 0
+        points, colors = points[facing], colors[facing]
+    radius = int(np.clip(np.ceil(scene.spacing * scale), 1, 6))
+    drawn = images.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
+    out = np.empty((*drawn.shape[:2], 3), np.uint8)
+    out[:] = images.BACKGROUND
+    seen = drawn[..., 3] > 0
+    out[seen] = drawn[seen, :3]
+    edge, step = 0.02 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
+    for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
+        dots = _sampled(camera_lines(poses, edge, step))
+        ink = images.splat(
+            dots,
+            np.broadcast_to(np.array(color, np.uint8), dots.shape),
+            T,
+            size,
+            scale=scale,
+            distance=distance,
+        )
+        seen = ink[..., 3] > 0
+        out[seen] = ink[seen, :3]
+    return out
+
+
+def _sampled(lines: Float64, number: int = 24) -> Float64:
+    ends = lines.reshape(-1, 2, 3)
+    t = np.linspace(0, 1, number)[None, :, None]
+    return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
+
+
+def _choose(number: int, most: int) -> Integers:
+    """Choose at random, so that any even pattern of the cloud's order is gone."""
+    if number <= most:
+        return np.arange(number)
+    return np.sort(np.random.default_rng([0, number]).permutation(number)[:most])
+
+
+def _colors(cloud: Cloud, chosen: Integers, points: Float64) -> UInt8:
+    if cloud.color is not None:
+        return cloud.color[chosen]
+    return height_colors(points)
+
+
+def height_colors(points: Float64) -> UInt8:
+    """Colours (N, 3) by height, which is -y."""
+    low, high = height_range(points)
+    return images.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
+
+
+def height_range(points: Float64) -> tuple[float, float]:
+    """Return the heights (-y) in m that bound the middle 96 % of the points."""
+    if len(points) == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(-points[:, 1], [2, 98])
+    return float(low), float(high)
+
+
+def _spacing(points: Float64) -> float:
+    if len(points) < 2:
+        return 0.01
+    from scipy.spatial import cKDTree
+
+    sample = points[:: max(1, len(points) // 2000)]
+    near, _ = cKDTree(points).query(sample, k=2)
+    return float(max(np.median(near[:, 1]), 1e-5))
+
+
+def _base64(array: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

@@ -1,0 +1,254 @@
+"use strict";
+(function () {
+  const box = document.getElementById("viewer");
+  const data = document.getElementById("scene");
+  if (!box || !data) return;
+  const canvas = box.querySelector("canvas");
+  const gl = canvas.getContext("webgl", { antialias: true, alpha: false });
+  if (!gl) { box.classList.add("without"); return; }
+
+  const scene = JSON.parse(data.textContent);
+  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+
+  const POINTS = `
+    attribute vec3 place, color, normal;
+    uniform mat4 view, lens;
+    uniform vec3 low, extent, eye;
+    uniform float size, peel, byHeight, most;
+    uniform vec2 heights;
+    varying vec3 tint;
+    vec3 ramp(float t) {
+      vec3 a = vec3(.27, .0, .33), b = vec3(.13, .57, .55), c = vec3(.99, .91, .15);
+      return t < .5 ? mix(a, b, t * 2.) : mix(b, c, t * 2. - 1.);
+    }
+    void main() {
+      vec3 p = low + place * extent;
+      vec4 v = view * vec4(p, 1.);
+      gl_Position = lens * v;
+      if (peel > .5 && dot(normal, eye - p) < 0.) gl_Position = vec4(2., 2., 2., 1.);
+      gl_PointSize = clamp(size / max(-v.z, 1e-6), 1., most);
+      tint = byHeight > .5 ? ramp(clamp((-p.y - heights.x) / heights.y, 0., 1.)) : color;
+    }`;
+  const LINES = `
+    attribute vec3 place;
+    uniform mat4 view, lens;
+    void main() { gl_Position = lens * view * vec4(place, 1.); }`;
+  const TINT = `precision mediump float; varying vec3 tint;
+    void main() { gl_FragColor = vec4(tint, 1.); }`;
+  const FLAT = `precision mediump float; uniform vec3 ink;
+    void main() { gl_FragColor = vec4(ink, 1.); }`;
+
+  function program(vertex, fragment) {
+    const p = gl.createProgram();
+    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const s = gl.createShader(kind);
+      gl.shaderSource(s, text);
+      gl.compileShader(s);
+      gl.attachShader(p, s);
+    }
+    gl.linkProgram(p);
+    if (!gl.getProgramParameter(p, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(p));
+    return p;
+  }
+  function buffer(array) {
+    const b = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, b);
+    gl.bufferData(gl.ARRAY_BUFFER, array, gl.STATIC_DRAW);
+    return b;
+  }
+  let dots, wires;
+  try { dots = program(POINTS, TINT); wires = program(LINES, FLAT); } catch (error) {
+    box.classList.add("without");
+    return;
+  }
+  const buffers = {
+    place: buffer(bytes(scene.points)),
+    color: buffer(bytes(scene.colors)),
+    normal: scene.normals ? buffer(bytes(scene.normals)) : null,
+  };
+  const lines = {};
+  for (const name in scene.lines) {
+    const raw = bytes(scene.lines[name]);
+    lines[name] = { buffer: buffer(raw), count: raw.length / 12 };
+  }
+  const inks = {
+    before: [0.94, 0.63, 0.24], after: [0.35, 0.69, 0.96],
+    reference: [0.92, 0.92, 0.92], loops: [0.37, 0.85, 0.55],
+  };
+
+  const start = { yaw: scene.yaw, pitch: scene.pitch, distance: 1.25 * scene.size, target: scene.center };
+  const eye = {};
+  function reset(changes) {
+    Object.assign(eye, start, { target: start.target.slice() }, changes || {});
+    draw();
+  }
+
+  // The world is x right, y down, z forward; rows of the turn into such a view.
+  function turn() {
+    const cy = Math.cos(eye.yaw), sy = Math.sin(eye.yaw), cp = Math.cos(eye.pitch), sp = Math.sin(eye.pitch);
+    return [[cy, 0, sy], [sp * sy, cp, -sp * cy], [-cp * sy, sp, cp * cy]];
+  }
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const on = (name) => { const input = box.querySelector(`[name=${name}]`); return Boolean(input && input.checked); };
+
+  let waiting = false;
+  function draw() {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => { waiting = false; paint(); });
+  }
+  function paint() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
+    const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(22 / 255, 25 / 255, 30 / 255, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+
+    const R = turn();
+    const t = R.map((row) => -dot(row, eye.target));
+    t[2] += eye.distance;
+    // OpenGL looks along -z with y up: the second and third rows change sign.
+    const view = new Float32Array([
+      R[0][0], -R[1][0], -R[2][0], 0, R[0][1], -R[1][1], -R[2][1], 0,
+      R[0][2], -R[1][2], -R[2][2], 0, t[0], -t[1], -t[2], 1]);
+    const f = 1 / Math.tan(0.35), near = 0.01 * eye.distance, far = eye.distance + 50 * scene.size;
+    const narrow = Math.min(1, (width / height) / 1.2);
+    const lens = new Float32Array([
+      f * narrow * height / width, 0, 0, 0, 0, f * narrow, 0, 0,
+      0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0]);
+    const at = [0, 1, 2].map((k) => eye.target[k] - R[2][k] * eye.distance);
+
+    if (on("points") && scene.count) {
+      gl.useProgram(dots);
+      const u = (name) => gl.getUniformLocation(dots, name);
+      gl.uniformMatrix4fv(u("view"), false, view);
+      gl.uniformMatrix4fv(u("lens"), false, lens);
+      gl.uniform3fv(u("low"), scene.low);
+      gl.uniform3fv(u("extent"), scene.extent);
+      gl.uniform3fv(u("eye"), at);
+      gl.uniform1f(u("size"), 1.5 * scene.spacing * f * narrow * height / 2);
+      gl.uniform1f(u("most"), 10 * ratio);
+      gl.uniform1f(u("peel"), on("peel") && buffers.normal ? 1 : 0);
+      gl.uniform1f(u("byHeight"), on("height") ? 1 : 0);
+      gl.uniform2f(u("heights"), scene.heights[0], Math.max(scene.heights[1] - scene.heights[0], 1e-6));
+      attribute(dots, "place", buffers.place, gl.UNSIGNED_SHORT, true);
+      attribute(dots, "color", buffers.color, gl.UNSIGNED_BYTE, true);
+      if (buffers.normal) attribute(dots, "normal", buffers.normal, gl.BYTE, true);
+      gl.drawArrays(gl.POINTS, 0, scene.count);
+      for (const name of ["color", "normal"]) {
+        const place = gl.getAttribLocation(dots, name);
+        if (place >= 0) gl.disableVertexAttribArray(place);
+      }
+    }
+    gl.useProgram(wires);
+    gl.uniformMatrix4fv(gl.getUniformLocation(wires, "view"), false, view);
+    gl.uniformMatrix4fv(gl.getUniformLocation(wires, "lens"), false, lens);
+    for (const name in lines) {
+      if (!lines[name].count || !on(name)) continue;
+      gl.uniform3fv(gl.getUniformLocation(wires, "ink"), inks[name]);
+      attribute(wires, "place", lines[name].buffer, gl.FLOAT, false);
+      gl.drawArrays(gl.LINES, 0, lines[name].count);
+    }
+  }
+  function attribute(of, name, source, type, scaled) {
+    const place = gl.getAttribLocation(of, name);
+    if (place < 0) return;
+    gl.bindBuffer(gl.ARRAY_BUFFER, source);
+    gl.enableVertexAttribArray(place);
+    gl.vertexAttribPointer(place, 3, type, scaled, 0, 0);
+  }
+
+  function orbit(dx, dy) {
+    eye.yaw -= dx * 0.006;
+    eye.pitch = Math.max(-1.57, Math.min(1.57, eye.pitch + dy * 0.006));
+    draw();
+  }
+  function pan(dx, dy) {
+    const R = turn(), step = 2 * eye.distance * Math.tan(0.35) / canvas.clientHeight;
+    for (let k = 0; k < 3; k++) eye.target[k] -= step * (dx * R[0][k] + dy * R[1][k]);
+    draw();
+  }
+  function zoom(factor) {
+    eye.distance = Math.max(0.005 * scene.size, Math.min(20 * scene.size, eye.distance * factor));
+    draw();
+  }
+
+  const fingers = new Map();
+  const middle = () => {
+    const [a, b] = [...fingers.values()];
+    return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, span: Math.hypot(a.x - b.x, a.y - b.y) };
+  };
+  canvas.addEventListener("pointerdown", (e) => {
+    canvas.setPointerCapture(e.pointerId);
+    canvas.focus({ preventScroll: true });
+    fingers.set(e.pointerId, { x: e.clientX, y: e.clientY });
+    e.preventDefault();
+  });
+  canvas.addEventListener("pointermove", (e) => {
+    const last = fingers.get(e.pointerId);
+    if (!last) return;
+    const now = { x: e.clientX, y: e.clientY };
+    if (fingers.size === 1) {
+      const move = e.shiftKey || e.buttons & 6 ? pan : orbit;
+      move(now.x - last.x, now.y - last.y);
+      fingers.set(e.pointerId, now);
+    } else if (fingers.size === 2) {
+      const old = middle();
+      fingers.set(e.pointerId, now);
+      const fresh = middle();
+      pan(fresh.x - old.x, fresh.y - old.y);
+      if (fresh.span > 0) zoom(old.span / fresh.span);
+    }
+  });
+  for (const end of ["pointerup", "pointercancel"]) {
+    canvas.addEventListener(end, (e) => fingers.delete(e.pointerId));
+  }
+  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
+  canvas.addEventListener("dblclick", () => reset());
+  canvas.addEventListener("wheel", (e) => {
+    if (document.activeElement !== canvas && !e.ctrlKey) return;  // the page scrolls on
+    e.preventDefault();
+    zoom(Math.exp(Math.max(-60, Math.min(60, e.deltaMode ? 20 * e.deltaY : e.deltaY)) * 0.002));
+  }, { passive: false });
+  canvas.addEventListener("keydown", (e) => {
+    const move = e.shiftKey ? pan : orbit, step = 20;
+    const keys = {
+      ArrowLeft: () => move(-step, 0), ArrowRight: () => move(step, 0),
+      ArrowUp: () => move(0, -step), ArrowDown: () => move(0, step),
+      "+": () => zoom(0.85), "=": () => zoom(0.85), "-": () => zoom(1.18), 0: () => reset(),
+    };
+    if (!keys[e.key] || e.ctrlKey || e.metaKey) return;
+    keys[e.key]();
+    e.preventDefault();
+  });
+  const views = {
+    above: { yaw: 0, pitch: 1.57 }, side: { yaw: 1.5708, pitch: 0 }, front: { yaw: 0, pitch: 0 }, start: {},
+  };
+  box.addEventListener("click", (e) => {
+    const button = e.target.closest("button");
+    if (!button) return;
+    if (button.dataset.view) reset(views[button.dataset.view]);
+    if (button.dataset.zoom) zoom(Number(button.dataset.zoom));
+  });
+  box.addEventListener("change", draw);
+  canvas.addEventListener("webglcontextlost", () => box.classList.replace("live", "without"));
+  new ResizeObserver(draw).observe(canvas);
+  box.classList.add("live");
+  reset();
+})();
+
+(function () {
+  // What is said of a frame on hover can also be tapped.
+  const strip = document.getElementById("strip");
+  const said = document.getElementById("strip-said");
+  if (!strip || !said) return;
+  const tell = (e) => {
+    const title = e.target.querySelector && e.target.closest("rect") && e.target.querySelector("title");
+    if (title) said.textContent = title.textContent;
+  };
+  strip.addEventListener("pointerover", tell);
+  strip.addEventListener("click", tell);
+})();

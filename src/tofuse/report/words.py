@@ -1,0 +1,137 @@
+"""Numbers and findings in words: lengths, ranges of frames, the verdict in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.results.types import Reason, Reconstruction, Verdict
+from tofuse.results.verdict import REASONS
+
+STATUSES = ("tracked", "predicted", "lost", "skipped")
+
+# What a person can do about each reason for a verdict.
+ADVICE: dict[str, str] = {
+    "few_poses": "Record again with smaller steps between frames, or use every frame.",
+    "images_disagree": "Look at the model from above: walls that appear twice show where it broke.",
+    "lost_frames": "Move more slowly there, and keep corners and furniture in view.",
+    "images_differ": "Surfaces may be doubled there; measure distances elsewhere.",
+    "weak_registration": "Smaller steps between frames, or more structure in view, would help.",
+    "not_converged": "More iterations or smaller steps between frames would help.",
+    "unchecked_drift": "Come back to where you started, so that a loop can check the path.",
+    "loop_gap": "Distances across the loop may be stretched; check one that you know.",
+    "optimiser_gave_up": "Give the optimiser more iterations.",
+}
+
+
+def length(metres: float | None) -> str:
+    """Write a length for a person: mm below 10 cm, else m."""
+    if metres is None or not np.isfinite(metres):
+        return "–"
+    if abs(metres) < 0.1:
+        mm = metres * 1000
+        return f"{mm:.0f} mm" if abs(mm) >= 10 else f"{mm:.1f} mm"
+    return f"{metres:.2f} m"
+
+
+def signed_length(metres: float) -> str:
+    """Write a difference of lengths with its sign."""
+    return ("+" if metres >= 0 else "−") + length(abs(metres))
+
+
+def share(value: float | None) -> str:
+    """Write a share of 1 in percent."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{100 * value:.1f} %"
+
+
+def seconds(value: float) -> str:
+    """Write a duration."""
+    if value < 1:
+        return f"{1000 * value:.0f} ms"
+    return f"{value:.1f} s" if value < 120 else f"{int(value) // 60} min {int(value) % 60:02d} s"
+
+
+def count(number: int, noun: str) -> str:
+    """Write a number of things: "1 frame", "12,000 points"."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+
+
+def frame_range(first: int, last: int) -> str:
+    """Write "frame 3" or "frames 3–17"."""
+    return f"frame {first}" if first == last else f"frames {first}–{last}"
+
+
+def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str, str]]:
+    """Join neighbouring (index, status, reason) that say the same.
+
+    Returns (first index, last index, how many, status, reason). A recording read with a stride
+    has gaps in its indices; neighbours in the list count as neighbours.
+    """
+    out: list[tuple[int, int, int, str, str]] = []
+    for position, status, reason in items:
+        if out and out[-1][3:] == (status, reason):
+            first, _, number, _, _ = out[-1]
+            out[-1] = (first, position, number + 1, status, reason)
+        else:
+            out.append((position, position, 1, status, reason))
+    return out
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A reason for the verdict, as the report shows it."""
+
+    level: Verdict | str
+    text: str
+    where: str
+    meaning: str
+    advice: str
+
+
+def findings(reasons: Sequence[Reason]) -> list[Finding]:
+    """Return the reasons for a person, the gravest first."""
+    order = {"failed": 0, "degraded": 1, "note": 2}
+    out = []
+    for reason in reasons:
+        level, meaning = REASONS.get(reason.code, ("note", ""))
+        text = reason.text or meaning
+        out.append(
+            Finding(
+                level,
+                text,
+                frame_range(*reason.frames),
+                "" if meaning == text else meaning,
+                ADVICE.get(reason.code, ""),
+            )
+        )
+    return sorted(out, key=lambda f: order[str(f.level)])
+
+
+def sentence(text: str) -> str:
+    """End a text with a full stop and begin it with a capital."""
+    text = text.strip()
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) or not text else text + "."
+
+
+def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
+    """Say in a sentence or two how far the result can be trusted."""
+    d = result.diagnostics
+    readable = sum(f.status != "skipped" for f in d.frames)
+    placed = int(result.has_pose.sum())
+    have = f"{placed} of {readable} readable frames have a pose"
+    if placed == readable:
+        have = f"all {placed} frames have a pose" if placed > 1 else "the only frame has a pose"
+    grave = [f for f in found if f.level == d.verdict]
+    if d.verdict == "good":
+        return f"Good: {have}, and no check found fault with the result."
+    first = sentence(grave[0].text) if grave else ""
+    more = f" {count(len(grave) - 1, 'more reason')} below." if len(grave) > 1 else ""
+    if d.verdict == "degraded":
+        look = f" Look first at {grave[0].where}." if grave else ""
+        return f"Degraded: use this model with care. {first}{look}{more}"
+    return f"Failed: do not rely on this model; {have}. {first}{more}"
