@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import read_text
+from tofuse.files.reading import input_error, is_file, read_text
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
 from tofuse.geometry.se3 import check_pose
 from tofuse.recordings.frames import DepthKind
@@ -148,6 +148,56 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         color,
         tuple(key for key in data if key not in _KEYS),
     )
+
+
+def load_camera(path: str | Path) -> tuple[CameraFile, Camera]:
+    """Read a camera.json and the rays.npy beside it, which overrides the lens model.
+
+    Raises
+    ------
+    InputError
+        As `read_camera_file`; also if the sizes disagree, or the model is "rays" without a table.
+    """
+    path = Path(path)
+    description = read_camera_file(path)
+    table = path.parent / "rays.npy"
+    if not is_file(table):
+        if description.camera is None:
+            raise InputError(
+                "is 'rays' and there is no rays.npy",
+                where=f"{path}: model",
+                remedy="add rays.npy, or give a lens model",
+            )
+        return description, description.camera
+    camera = read_rays(table)
+    if description.size != (camera.width, camera.height):
+        raise InputError(
+            f"is {camera.width} x {camera.height}, {path.name} says "
+            f"{' x '.join(map(str, description.size or ()))}",
+            where=table,
+            remedy="use the table of this camera",
+        )
+    return description, camera
+
+
+def read_rays(path: Path) -> RayTable:
+    """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
+    try:
+        # Mapped first, so that a header can't make us allocate more than the file holds.
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
+            raise ValueError("no array of floats")
+        if table.ndim != 3 or table.shape[2] != 2:
+            raise ValueError(f"shape {table.shape}, not (H, W, 2)")
+        return RayTable(np.array(table, np.float32))
+    except OSError as error:
+        raise input_error(error, path) from error
+    except InputError as error:
+        raise InputError(error.problem, where=path, remedy=error.remedy) from error
+    except Exception as error:  # NumPy parses the header as Python: anything may come out
+        raise InputError(
+            f"is no table of rays ({error})", where=path, remedy="save (H, W, 2) float32 by NumPy"
+        ) from error
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, replacing, write_text
 from tofuse.files.images import read_color, read_header, read_image, write_png
 from tofuse.files.ply import write_ply
-from tofuse.files.reading import files_with, input_error, is_file, is_folder
+from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import exact, read_columns, read_numbers, write_columns
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry.cameras import Camera, RayTable, range_from_z, z_from_range
@@ -23,6 +23,7 @@ from tofuse.recordings.camera_file import (
     CameraFile,
     ColorCamera,
     camera_fields,
+    load_camera,
     read_camera_file,
 )
 from tofuse.recordings.frames import (
@@ -73,7 +74,7 @@ class NativeSource(FileSource):
                 where=folder / name,
                 remedy="check that the recording is complete",
             )
-        self.description, self.camera = self._read_camera(camera_file or folder / "camera.json")
+        self.description, self.camera = self._read_camera(camera_file)
         rate = self.description.frame_rate_hz
         super().__init__(np.arange(len(self.files)) / (rate or 1.0))
         self._read_timestamps()
@@ -100,7 +101,7 @@ class NativeSource(FileSource):
         depth = depth_from_counts(counts, self.description.depth_unit_m)
         kind = self.description.depth_kind
         if self.correction is not None:
-            depth = _corrected(self.correction, self.camera, depth, kind)
+            depth = corrected_depth(self.correction, self.camera, depth, kind)
         frame = RangeFrame(index, timestamp, self.camera, depth, kind)
         amplitude = confidence = color = None
         if self.amplitude:
@@ -115,35 +116,17 @@ class NativeSource(FileSource):
             index, timestamp, self.camera, frame.depth, kind, amplitude, confidence, color
         )
 
-    def _read_camera(self, path: Path) -> tuple[CameraFile, Camera | None]:
-        if self.is_clouds:
-            if not is_file(path):
-                return CameraFile(None, None), None
-            return read_camera_file(path, clouds=True), None
-        description = read_camera_file(path)
-        table = self.folder / "rays.npy"
-        # A camera given by hand replaces the folder's own lens, table included.
-        if path.parent != self.folder and description.camera is not None:
-            return description, description.camera
-        if is_file(path.parent / "rays.npy"):
-            table = path.parent / "rays.npy"
-        if is_file(table):
-            camera = read_rays(table)
-            if description.size != (camera.width, camera.height):
-                raise InputError(
-                    f"is {camera.width} x {camera.height}, camera.json says "
-                    f"{' x '.join(map(str, description.size or ()))}",
-                    where=table,
-                    remedy="use the table of this camera",
-                )
-            return description, camera
-        if description.camera is None:
+    def _read_camera(self, given: Path | None) -> tuple[CameraFile, Camera | None]:
+        path = self.folder / "camera.json"
+        if not self.is_clouds:
+            return load_camera(given or path)
+        if given is not None:
             raise InputError(
-                "is 'rays' and there is no rays.npy",
-                where=f"{path}: model",
-                remedy="add rays.npy, or give a lens model",
+                "means nothing for a recording of clouds", where="--camera", remedy="leave it out"
             )
-        return description, description.camera
+        if is_file(path):
+            return read_camera_file(path, clouds=True), None
+        return CameraFile(None, None), None
 
     def _read_timestamps(self) -> None:
         path = self.folder / "timestamps.txt"
@@ -263,26 +246,6 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
     return depth
 
 
-def read_rays(path: Path) -> RayTable:
-    """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
-    try:
-        # Mapped first, so that a header can't make us allocate more than the file holds.
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
-            raise ValueError("no array of floats")
-        if table.ndim != 3 or table.shape[2] != 2:
-            raise ValueError(f"shape {table.shape}, not (H, W, 2)")
-        return RayTable(np.array(table, np.float32))
-    except OSError as error:
-        raise input_error(error, path) from error
-    except InputError as error:
-        raise InputError(error.problem, where=path, remedy=error.remedy) from error
-    except Exception as error:  # NumPy parses the header as Python: anything may come out
-        raise InputError(
-            f"is no table of rays ({error})", where=path, remedy="save (H, W, 2) float32 by NumPy"
-        ) from error
-
-
 def sampled_color(
     frame: RangeFrame, image: NDArray[np.uint8], color: ColorCamera
 ) -> NDArray[np.uint8]:
@@ -300,9 +263,10 @@ def sampled_color(
     return out
 
 
-def _corrected(
+def corrected_depth(
     correction: DepthCorrection, camera: Camera, depth: Float32, kind: DepthKind
 ) -> Float32:
+    """Depth (H, W) of a kind, in m, after the correction of the radial range behind it."""
     if kind == "range":
         return correction.correct(depth)
     return z_from_range(camera, correction.correct(range_from_z(camera, depth)))

@@ -1,0 +1,248 @@
+"""PCD: point clouds of PCL, version 0.5 to 0.7; ascii, binary and binary_compressed."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_bytes
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+MAX_POINTS = 1 << 28
+_HEADER_LIMIT = 1 << 16
+_COPY_AGAIN = "copy or export the file again"
+_TYPES = {
+    ("F", 4): "<f4", ("F", 8): "<f8",
+    ("I", 1): "<i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
+    ("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Pcd:
+    """What a PCD file holds.
+
+    Attributes
+    ----------
+    fields
+        Columns by name, (N,), or (N, C) where a field has several values.
+    width, height
+        As declared; an organised cloud has height > 1 and N = width x height, row by row.
+    viewpoint
+        (7,) tx ty tz qw qx qy qz of the sensor, as declared. Points are not moved by it.
+    """
+
+    fields: dict[str, NDArray[Any]]
+    width: int
+    height: int
+    viewpoint: Float64
+
+    @property
+    def organised(self) -> bool:
+        """Whether the points form an image."""
+        return self.height > 1 and self.width > 1
+
+    @property
+    def points(self) -> Float32:
+        """(N, 3) float32, not finite where nothing was measured."""
+        return np.stack([self.fields[name] for name in "xyz"], -1).astype(np.float32)
+
+    @property
+    def normals(self) -> Float32 | None:
+        """(N, 3) float32, or None."""
+        names = ("normal_x", "normal_y", "normal_z")
+        if not all(name in self.fields for name in names):
+            return None
+        return np.stack([self.fields[name] for name in names], -1).astype(np.float32)
+
+    @property
+    def color(self) -> UInt8 | None:
+        """(N, 3) uint8 RGB of a packed rgb or rgba field, or None."""
+        for name in ("rgb", "rgba"):
+            packed = self.fields.get(name)
+            if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:
+                bits = np.ascontiguousarray(packed).view(np.uint32)
+                return np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], -1).astype(
+                    np.uint8
+                )
+        return None
+
+    @property
+    def amplitude(self) -> Float32 | None:
+        """(N,) float32 of a field called intensity, amplitude or i, or None."""
+        for name in ("intensity", "amplitude", "i"):
+            if name in self.fields and self.fields[name].ndim == 1:
+                return self.fields[name].astype(np.float32)
+        return None
+
+
+@dataclass(frozen=True)
+class _Header:
+    names: list[str]
+    dtypes: list[str]
+    counts: list[int]
+    width: int
+    height: int
+    points: int
+    viewpoint: tuple[float, ...]
+    kind: str
+    body: int
+
+    @property
+    def stride(self) -> int:
+        return sum(np.dtype(t).itemsize * c for t, c in zip(self.dtypes, self.counts, strict=True))
+
+
+def read_pcd(path: str | Path) -> Pcd:
+    """Read a PCD file.
+
+    Raises
+    ------
+    InputError
+        If it is no PCD, is cut off or damaged, promises more than it holds, or lacks x, y, z.
+    """
+    data = read_bytes(path)
+    header = _read_header(data, path)
+    if not all(name in header.names for name in "xyz"):
+        raise InputError(
+            f"has the fields {' '.join(header.names)}", where=path, remedy="store x y z"
+        )
+    body = memoryview(data)[header.body :]
+    columns = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.kind](
+        body, header, path
+    )
+    fields: dict[str, NDArray[Any]] = {}
+    for name, column in zip(header.names, columns, strict=True):
+        if name != "_" and name not in fields:
+            fields[name] = column
+    for name in "xyz":
+        if fields[name].ndim != 1:
+            raise InputError(f"has several values of {name!r} in a point", where=path)
+    viewpoint = np.array(header.viewpoint, float)
+    return Pcd(fields, header.width, header.height, viewpoint)
+
+
+def _read_header(data: bytes, path: str | Path) -> _Header:
+    values: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in values:
+        end = data.find(b"\n", at, _HEADER_LIMIT)
+        if end < 0:
+            what = "is empty" if not data else "is no PCD file (its header has no DATA line)"
+            raise InputError(what, where=path, remedy=_COPY_AGAIN)
+        words = data[at:end].decode("latin-1").split("#", 1)[0].split()
+        at = end + 1
+        if words:
+            values[words[0].upper()] = words[1:]
+    try:
+        names = values["FIELDS"] if "FIELDS" in values else values["COLUMNS"]
+        sizes = [int(v) for v in values["SIZE"]]
+        counts = [int(v) for v in values.get("COUNT", ["1"] * len(names))]
+        kinds = [v.upper() for v in values["TYPE"]]
+        if not len(names) == len(sizes) == len(counts) == len(kinds):
+            raise ValueError("FIELDS, SIZE, TYPE and COUNT have different lengths")
+        dtypes = [_TYPES[kind, size] for kind, size in zip(kinds, sizes, strict=True)]
+        width = int(values["WIDTH"][0])
+        height = int(values.get("HEIGHT", ["1"])[0])
+        points = int(values.get("POINTS", [str(width * height)])[0])
+        viewpoint = tuple(float(v) for v in values.get("VIEWPOINT", []))
+        kind = values["DATA"][0].lower()
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(
+            f"has a PCD header that can't be understood ({error})", where=path, remedy=_COPY_AGAIN
+        ) from error
+    if kind not in ("ascii", "binary", "binary_compressed"):
+        raise InputError(f"has PCD data of the kind {kind!r}", where=path, remedy=_COPY_AGAIN)
+    if points != width * height or width < 0 or height < 0 or any(c < 1 for c in counts):
+        raise InputError(
+            f"declares {points} points in {width} x {height}", where=path, remedy=_COPY_AGAIN
+        )
+    if points > MAX_POINTS or max(counts, default=1) > 65536:
+        raise InputError(f"claims to hold {points} points", where=path, remedy=_COPY_AGAIN)
+    if len(viewpoint) != 7 or not all(map(math.isfinite, viewpoint)):
+        viewpoint = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    return _Header(names, dtypes, counts, width, height, points, viewpoint, kind, at)
+
+
+def _cut_off(header: _Header, path: str | Path) -> InputError:
+    return InputError(
+        f"is cut off: its header promises {header.points} points, more than it holds",
+        where=path,
+        remedy=_COPY_AGAIN,
+    )
+
+
+def _binary(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
+    if header.points * header.stride > len(body):
+        raise _cut_off(header, path)
+    dtype = np.dtype(
+        [
+            (f"f{k}", t, (c,) if c > 1 else ())
+            for k, (t, c) in enumerate(zip(header.dtypes, header.counts, strict=True))
+        ]
+    )
+    rows = np.frombuffer(body, dtype, header.points)
+    return [rows[f"f{k}"] for k in range(len(header.names))]
+
+
+def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
+    from tofuse.kernels.lzf import lzf_decompress
+
+    if len(body) < 8:
+        raise _cut_off(header, path)
+    compressed, size = struct.unpack_from("<II", body)
+    expected = header.points * header.stride
+    # No stream of LZF grows more than 88-fold: 264 bytes from 3.
+    if compressed > len(body) - 8 or size != expected or size > 88 * compressed + 264:
+        raise InputError(
+            f"is cut off or damaged: {len(body) - 8} of {compressed} bytes for {expected}",
+            where=path,
+            remedy=_COPY_AGAIN,
+        )
+    out = np.empty(size, np.uint8)
+    source = np.frombuffer(body, np.uint8, compressed, 8)
+    if lzf_decompress(source, out) != size:
+        raise InputError("holds damaged compressed data", where=path, remedy=_COPY_AGAIN)
+    columns: list[NDArray[Any]] = []
+    at = 0
+    for dtype, count in zip(header.dtypes, header.counts, strict=True):
+        column = np.frombuffer(out, dtype, header.points * count, at)
+        columns.append(column.reshape(-1, count) if count > 1 else column)
+        at += column.nbytes
+    return columns
+
+
+def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[Any]]:
+    lines = [line for line in bytes(body).decode("latin-1").splitlines() if line.strip()]
+    if len(lines) < header.points:
+        raise _cut_off(header, path)
+    total = sum(header.counts)
+    try:
+        table = np.loadtxt(lines[: header.points], ndmin=2, comments=None)
+        if header.points and table.shape[1] != total:
+            raise ValueError(f"{table.shape[1]} numbers in a row, not {total}")
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"holds damaged points ({str(error).split('; use')[0]})",
+            where=path,
+            remedy=_COPY_AGAIN,
+        ) from error
+    table = table.reshape(header.points, total)
+    columns: list[NDArray[Any]] = []
+    at = 0
+    with np.errstate(invalid="ignore", over="ignore"):
+        for dtype, count in zip(header.dtypes, header.counts, strict=True):
+            column = table[:, at : at + count].astype(dtype)
+            columns.append(column if count > 1 else column[:, 0])
+            at += count
+    return columns

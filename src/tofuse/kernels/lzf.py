@@ -1,0 +1,53 @@
+"""LZF decompression (liblzf, Marc Lehmann), as PCD files use it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+UInt8 = NDArray[np.uint8]
+
+
+@kernel
+def lzf_decompress(source: UInt8, out: UInt8) -> int:
+    """Decompress `source` (N,) into `out` (M,).
+
+    Returns the number of bytes written, or -1 if the stream is damaged: it ends within a token,
+    points before the beginning, or holds more than M bytes.
+    """
+    size, room = source.size, out.size
+    i = 0
+    o = 0
+    while i < size:
+        control = np.int64(source[i])
+        i += 1
+        if control < 32:
+            length = control + 1
+            if i + length > size or o + length > room:
+                return -1
+            for _ in range(length):
+                out[o] = source[i]
+                i += 1
+                o += 1
+            continue
+        length = control >> 5
+        if length == 7:
+            if i >= size:
+                return -1
+            length += np.int64(source[i])
+            i += 1
+        if i >= size:
+            return -1
+        back = o - ((control & 31) << 8) - np.int64(source[i]) - 1
+        i += 1
+        length += 2
+        if back < 0 or o + length > room:
+            return -1
+        # Byte by byte: the copy may overlap what it writes.
+        for _ in range(length):
+            out[o] = out[back]
+            o += 1
+            back += 1
+    return o

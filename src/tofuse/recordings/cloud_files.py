@@ -1,0 +1,120 @@
+"""A source over files that each hold one cloud."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.tables import read_numbers
+from tofuse.geometry.quaternion import to_matrix
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.reader import SURE, Sniff
+from tofuse.recordings.sources import FileSource, check_timestamps, tum_poses
+
+Float64 = NDArray[np.float64]
+
+LoadFrame = Callable[[Path, int, float], Frame]
+
+
+class CloudFileSource(FileSource):
+    """One file, one view; timestamps.txt and poses beside them are read as for native folders.
+
+    Parameters
+    ----------
+    path
+        A file, or the folder of `files`.
+    files
+        In the order of frames.
+    load_frame
+        Reads a file, given its index and timestamp.
+    """
+
+    def __init__(self, path: Path, files: list[Path], load_frame: LoadFrame) -> None:
+        super().__init__(np.arange(len(files), dtype=float))
+        self.files, self.load_frame = files, load_frame
+        if is_folder(path):
+            self._read_timestamps(path / "timestamps.txt")
+            if is_file(path / "groundtruth.txt"):
+                self.reference = tum_poses(self, path / "groundtruth.txt")
+            elif is_file(path / "poses.txt"):
+                self.reference = self._numbered_poses(path / "poses.txt")
+            if is_file(path / "odometry.txt"):
+                self.odometry = tum_poses(self, path / "odometry.txt")
+
+    def load(self, index: int) -> Frame:
+        """See `FileSource.load`."""
+        return self.load_frame(self.files[index], index, float(self.timestamps[index]))
+
+    def _read_timestamps(self, path: Path) -> None:
+        if not is_file(path):
+            return
+        table = read_numbers(path)
+        if table.shape != (len(self.files), 1):
+            raise InputError(
+                f"has {len(table)} lines of {table.shape[-1]} numbers for {len(self.files)} clouds",
+                where=path,
+                remedy="give one time in seconds for each cloud",
+            )
+        self.timestamps = table[:, 0]
+        check_timestamps(self.timestamps, path, self.warnings)
+
+    def _numbered_poses(self, path: Path) -> Float64 | None:
+        """Read 'index x y z qw qx qy qz' lines, the index being the number in the file's name."""
+        table = read_numbers(path)
+        fits = table.ndim == 2 and table.shape[1] == 8 and np.isfinite(table).all()
+        if not fits or (table[:, 0] != np.rint(table[:, 0])).any():
+            self.warnings.append(
+                f"{path}: not 'index x y z qw qx qy qz', left aside; use groundtruth.txt (TUM)"
+            )
+            return None
+        norms = np.linalg.norm(table[:, 4:], axis=1)
+        if (np.abs(norms - 1) > 0.1).any():
+            raise InputError(
+                "holds no unit quaternions", where=path, remedy="write 'index x y z qw qx qy qz'"
+            )
+        by_number = {int(row[0]): row for row in table}
+        out = np.full((len(self.files), 4, 4), np.nan)
+        for k, file in enumerate(self.files):
+            digits = re.findall(r"[0-9]+", file.stem)
+            row = by_number.get(int(digits[-1])) if digits else None
+            if row is not None:
+                out[k] = np.eye(4)
+                out[k, :3, :3] = to_matrix(row[[5, 6, 7, 4]])
+                out[k, :3, 3] = row[1:4]
+        self.warnings.append(f"{path}: read as index x y z qw qx qy qz, kept as reference only")
+        return out
+
+
+def cloud_files(path: Path, *suffixes: str) -> list[Path]:
+    """Return the file itself, or the files in the folder, with one of the suffixes."""
+    if is_file(path):
+        return [path] if path.suffix.lower() in suffixes else []
+    return files_with(path, *suffixes) if is_folder(path) else []
+
+
+def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
+    """Look for files with one of the suffixes."""
+    try:
+        files = cloud_files(path, *suffixes)
+    except InputError:
+        return None
+    if not files:
+        return None
+    if is_folder(path) and is_file(path / "run.json"):
+        return Sniff(0.1, "a result of tofuse, not a recording", "give the recording itself")
+    kinds = sorted({f.suffix.lower() for f in files})
+    return Sniff(SURE, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
+
+
+def needed_files(path: Path, *suffixes: str) -> list[Path]:
+    """As `cloud_files`, or raise InputError if there are none."""
+    files = cloud_files(path, *suffixes)
+    if not files:
+        raise InputError(f"has no {suffixes[0]} files", where=path, remedy="check the path")
+    return files

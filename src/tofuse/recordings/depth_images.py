@@ -1,0 +1,106 @@
+"""A source over depth PNGs of one camera, as the RGB-D data sets store them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import read_color, read_header, read_image
+from tofuse.geometry.cameras import Camera
+from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.frames import DepthKind, RangeFrame
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.reader import ReaderOptions
+from tofuse.recordings.sources import FileSource
+
+Float64 = NDArray[np.float64]
+
+
+class DepthImageSource(FileSource):
+    """Depth images, with colour images registered to them where given.
+
+    Parameters
+    ----------
+    files
+        16-bit PNGs, one for each frame.
+    timestamps
+        (N,) seconds.
+    camera, depth_unit_m
+        Of all frames, unless `options` names another camera.json, which then gives both.
+    color
+        None, or one image for each frame.
+    options
+        Of the reader.
+
+    Raises
+    ------
+    InputError
+        If the camera disagrees with the size of the images.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        timestamps: Float64,
+        camera: Camera | None,
+        depth_unit_m: float,
+        *,
+        color: Sequence[Path] | None = None,
+        options: ReaderOptions | None = None,
+    ) -> None:
+        super().__init__(timestamps)
+        self.files, self.color = list(files), None if color is None else list(color)
+        kind: DepthKind = "z"
+        where = "the camera of this format"
+        if options is not None and options.camera is not None:
+            description, camera = load_camera(options.camera)
+            depth_unit_m, kind = description.depth_unit_m, description.depth_kind
+            where = str(options.camera)
+        if camera is None:
+            raise InputError(
+                "has no camera", where=self.files[0].parent, remedy="give one by --camera"
+            )
+        self.camera, self.depth_unit_m, self.depth_kind = camera, depth_unit_m, kind
+        self.metadata |= {"depth_unit_m": depth_unit_m, "depth_kind": kind}
+        self._check_size(where)
+
+    def _check_size(self, where: str) -> None:
+        for path in self.files[:5]:
+            try:
+                header = read_header(path)
+            except InputError:
+                continue  # that frame's own trouble, told when it is read
+            if (header.width, header.height) != (self.camera.width, self.camera.height):
+                raise InputError(
+                    f"is {header.width} x {header.height} pixels, {where} "
+                    f"{self.camera.width} x {self.camera.height}",
+                    where=path,
+                    remedy="give the camera of these images by --camera",
+                )
+            return
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        size = (self.camera.width, self.camera.height)
+        counts = read_image(self.files[index], size=size, dtype="uint16")
+        color = None
+        if self.color is not None:
+            color = read_color(self.color[index])
+            if color.shape[:2] != counts.shape:
+                raise InputError(
+                    f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
+                    where=self.color[index],
+                    remedy="register colour to depth, or leave it out",
+                )
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth_from_counts(counts, self.depth_unit_m),
+            self.depth_kind,
+            color_image=color,
+        )

@@ -1,0 +1,203 @@
+"""Opening a recording: which reader, and one recording from several paths."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.reading import input_error, is_folder, list_folder
+from tofuse.parts import discover, known, name_of
+from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
+from tofuse.recordings.recording import Recording, Source
+from tofuse.recordings.sources import JoinedSource, LimitedSource
+
+
+def readers() -> dict[str, Reader]:
+    """Return the readers by name."""
+    discover("tofuse.recordings.readers")
+    return {name: cls() for name, cls in known("reader").items()}
+
+
+def open_recording(
+    *paths: str | Path,
+    format: str | None = None,  # noqa: A002
+    camera: str | Path | None = None,
+    min_depth: float | None = None,
+    max_depth: float | None = None,
+) -> Recording:
+    """Open a recording, guessing its format from what lies there.
+
+    Parameters
+    ----------
+    paths
+        Files or folders; several are joined in the order given. A folder of native or SR4000
+        recordings is one recording, joined in name order.
+    format
+        Name of a reader, where guessing isn't wanted.
+    camera
+        A camera.json that replaces the recording's own camera.
+    min_depth, max_depth
+        Points nearer or farther are left out, in m: by z in images, by distance in clouds.
+
+    Raises
+    ------
+    InputError
+        If the format is unsure (with what was seen, and which option settles it), or nothing can
+        be read.
+    """
+    if not paths:
+        raise InputError("no recording was given", remedy="give a path")
+    _check_depths(min_depth, max_depth)
+    options = ReaderOptions(None if camera is None else Path(camera))
+    found = [item for path in paths for item in _resolve(Path(path), format)]
+    sources = [item.reader.open(item.path, options) for item in found]
+    source: Source = sources[0]
+    if len(sources) > 1:
+        source = JoinedSource(sources, _short_names([item.path for item in found]))
+    _check_usable(source, paths[0])
+    if min_depth is not None or max_depth is not None:
+        source = LimitedSource(
+            source, min_depth or 0.0, float("inf") if max_depth is None else max_depth
+        )
+    names = dict.fromkeys(name_of(item.reader) for item in found)
+    return Recording.of(source, " ".join(map(str, paths)), "+".join(names))
+
+
+@dataclass(frozen=True)
+class _Found:
+    path: Path
+    reader: Reader
+
+
+def _resolve(path: Path, format: str | None) -> list[_Found]:  # noqa: A002
+    """Return the recordings at a path, each with its reader."""
+    try:
+        path.stat()
+    except OSError as error:
+        raise input_error(error, path) from error
+    except ValueError as error:
+        raise InputError(f"is no path ({error})", where=repr(str(path))) from error
+    children = list_folder(path) if path.is_dir() else []
+    if path.is_dir() and not children:
+        raise InputError("is an empty folder", where=path, remedy="give a recording")
+    if format is not None:
+        return _resolve_as(path, format)
+    sniffs = _sniff(path)
+    sure = {name: sniff for name, sniff in sniffs.items() if sniff.confidence >= SURE}
+    if len(sure) == 1:
+        return [_Found(path, readers()[next(iter(sure))])]
+    if len(sure) > 1:
+        saw = "; ".join(f"{name}: {sniff.saw}" for name, sniff in sure.items())
+        raise InputError(
+            f"could be several formats ({saw})",
+            where=path,
+            remedy=f"give --format {' or '.join(sure)}",
+        )
+    if not sniffs and (parts := _parts(path)):
+        return parts
+    raise _unsure(path, sniffs, children)
+
+
+def _resolve_as(path: Path, format: str) -> list[_Found]:  # noqa: A002
+    choices = readers()
+    if format not in choices:
+        raise InputError(
+            f"there is no format {format!r}",
+            where="--format",
+            remedy=f"use one of {', '.join(choices)}",
+        )
+    reader = choices[format]
+    if reader.joinable and path.is_dir() and reader.sniff(path) is None:
+        parts = [p for p in list_folder(path) if is_folder(p) and reader.sniff(p) is not None]
+        if parts:
+            return [_Found(p, reader) for p in parts]
+    return [_Found(path, reader)]
+
+
+def _sniff(path: Path) -> dict[str, Sniff]:
+    found = {name: reader.sniff(path) for name, reader in readers().items()}
+    return {name: sniff for name, sniff in found.items() if sniff is not None}
+
+
+def _parts(path: Path) -> list[_Found]:
+    """Return the recordings in a folder, if they are one recording together; else refuse."""
+    if not is_folder(path):
+        return []
+    found: dict[Path, str] = {}
+    for folder in list_folder(path):
+        if not is_folder(folder):
+            continue
+        sure = [name for name, s in _sniff(folder).items() if s.confidence >= SURE]
+        if len(sure) == 1:
+            found[folder] = sure[0]
+    if not found:
+        return []
+    formats = sorted(set(found.values()))
+    listed = ", ".join(f"{p.name} ({name})" for p, name in list(found.items())[:6])
+    reader = readers()[formats[0]]
+    if len(formats) > 1 or not reader.joinable:
+        raise InputError(
+            f"holds several recordings: {listed}",
+            where=path,
+            remedy="give the one you mean, or several in their order",
+        )
+    return [_Found(p, reader) for p in found]
+
+
+def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
+    if sniffs:
+        name, sniff = max(sniffs.items(), key=lambda item: item[1].confidence)
+        return InputError(
+            f"may be a recording of the format {name}, but isn't surely one: there is {sniff.saw}",
+            where=path,
+            remedy=sniff.settle or f"give --format {name}",
+        )
+    if path.is_dir():
+        kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
+        saw = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
+        what = f"is no recording that is known: there are {saw}"
+    else:
+        what = f"is no recording that is known: a file with the suffix {path.suffix!r}"
+    return InputError(
+        what, where=path, remedy=f"check the path, or give --format ({', '.join(readers())})"
+    )
+
+
+def _check_depths(nearest: float | None, farthest: float | None) -> None:
+    for name, value in (("--min-depth", nearest), ("--max-depth", farthest)):
+        if value is not None and not value >= 0:
+            raise InputError(f"is {value}", where=name, remedy="give metres, 0 or more")
+    if nearest is not None and farthest is not None and nearest >= farthest:
+        raise InputError(
+            f"{nearest} and {farthest} leave nothing",
+            where="--min-depth, --max-depth",
+            remedy="give the smaller first",
+        )
+
+
+def _check_usable(source: Source, path: str | Path) -> None:
+    """Refuse a recording of which no frame can be read; stops at the first that can."""
+    first: UnreadableFrameError | None = None
+    for index in range(len(source.timestamps)):
+        try:
+            source.read(index)
+            return
+        except UnreadableFrameError as error:
+            first = first or error
+    if first is None:
+        raise InputError("has no frames", where=path, remedy="give a recording")
+    count = len(source.timestamps)
+    problem = first.problem if count == 1 else f"none of {count} frames can be read: {first}"
+    raise InputError(
+        problem,
+        where=first.where if count == 1 else path,
+        remedy=first.remedy if count == 1 else None,
+    )
+
+
+def _short_names(paths: list[Path]) -> list[str]:
+    """Return the last part of each path, or all of it where that isn't unique."""
+    names = [p.name for p in paths]
+    return names if len(set(names)) == len(names) else [str(p) for p in paths]

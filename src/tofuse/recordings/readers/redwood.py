@@ -1,0 +1,164 @@
+"""Reader of RGB-D folders as Open3D and Redwood lay them out (Choi et al. 2015)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder, read_text
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.depth_images import DepthImageSource
+from tofuse.recordings.reader import SURE, UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.sources import read_matrix_pose
+
+Float64 = NDArray[np.float64]
+
+# Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
+PRIMESENSE = Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+
+_COLOR_FOLDERS = ("color", "image", "rgb")
+_MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
+
+
+@part("reader", "redwood", label="validated")
+@dataclass(frozen=True)
+class Redwood:
+    """Folders with depth/, color/ (or image/, rgb/), maybe a camera .json and trajectory.log."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if not is_folder(path / "depth") or is_file(path / "depth.txt"):
+            return None
+        color = next((n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
+        if color is None:
+            return None
+        try:
+            camera = _camera_file(path)
+            if camera is not None:
+                return Sniff(SURE, f"depth/, {color}/ and {camera.name}")
+        except InputError:
+            return None
+        if is_file(path / "trajectory.log"):
+            return Sniff(SURE, f"depth/, {color}/ and trajectory.log")
+        if is_file(path / "camera.json"):
+            return None
+        return Sniff(
+            UNSURE,
+            f"depth/ and {color}/ but no camera",
+            "give --format redwood (a PrimeSense camera, millimetres), with --camera for another",
+        )
+
+    def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
+        """See `Reader.open`."""
+        files = files_with(path / "depth", ".png")
+        if not files:
+            raise InputError("has no .png files", where=path / "depth", remedy="check the path")
+        warnings: list[str] = []
+        camera: Pinhole | None = None
+        if options.camera is None:
+            file = _camera_file(path)
+            camera = PRIMESENSE if file is None else _read_intrinsics(file)
+            if file is None:
+                warnings.append(
+                    "no camera .json: the PrimeSense default is taken (525 px); --camera to change"
+                )
+        source = DepthImageSource(
+            files,
+            _timestamps(files),
+            camera,
+            0.001,
+            color=_color_files(path, files, warnings),
+            options=options,
+        )
+        source.warnings += warnings
+        if is_file(path / "trajectory.log"):
+            source.reference = _poses(path / "trajectory.log", len(files))
+        if is_file(path / "odometry.log"):
+            source.odometry = _poses(path / "odometry.log", len(files))
+        return source
+
+
+def _camera_file(path: Path) -> Path | None:
+    """Return the .json with an intrinsic_matrix, if there is one; refuse several that differ."""
+    found = [f for f in files_with(path, ".json") if "intrinsic_matrix" in read_text(f)]
+    if len({read_text(f) for f in found}) > 1:
+        raise InputError(
+            f"has several cameras: {', '.join(f.name for f in found)}",
+            where=path,
+            remedy="keep one of them",
+        )
+    return found[0] if found else None
+
+
+def _read_intrinsics(path: Path) -> Pinhole:
+    data = read_json(path)
+    try:
+        K = np.array(data["intrinsic_matrix"], float).reshape(3, 3).T
+        size = (int(data["width"]), int(data["height"]))
+    except (KeyError, ValueError, TypeError, OverflowError) as error:
+        raise InputError(
+            "lacks width, height or a 3x3 intrinsic_matrix",
+            where=path,
+            remedy="write it as Open3D does, column by column",
+        ) from error
+    try:
+        return Pinhole(*size, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    except InputError as error:
+        raise InputError(
+            error.problem, where=f"{path}: {error.where}", remedy=error.remedy
+        ) from error
+
+
+def _timestamps(files: list[Path]) -> Float64:
+    """Seconds from names like 000001-000000033369.png (microseconds), else the index."""
+    found = [_MICROSECONDS.fullmatch(f.stem) for f in files]
+    times = np.array([int(m.group(1)) / 1e6 for m in found if m])
+    if len(times) == len(files) and (np.diff(times) > 0).all():
+        return times
+    return np.arange(len(files), dtype=float)
+
+
+def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Path] | None:
+    folder = next((path / n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
+    if folder is None:
+        return None
+    color = files_with(folder, ".png", ".jpg", ".jpeg")
+    if len(color) == len(files):
+        return color
+    warnings.append(
+        f"{folder.name}/ has {len(color)} images, depth/ {len(files)}: colour is left out"
+    )
+    return None
+
+
+def _poses(path: Path, count: int) -> Float64:
+    """Read a .log: for each pose a line of three numbers (the first its frame) and a 4x4 matrix."""
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    out = np.full((count, 4, 4), np.nan)
+    if len(lines) % 5:
+        raise InputError(
+            f"has {len(lines)} lines, not 5 for each pose", where=path, remedy="check the file"
+        )
+    for k in range(0, len(lines), 5):
+        where = f"{path}, pose {k // 5}"
+        try:
+            frame = int(lines[k].split()[0])
+            table = np.array([[float(v) for v in line.split()] for line in lines[k + 1 : k + 5]])
+        except (ValueError, IndexError) as error:
+            raise InputError(f"can't be read ({error})", where=where) from error
+        if not 0 <= frame < count:
+            raise InputError(
+                f"is of frame {frame}, there are {count}", where=where, remedy="check the counts"
+            )
+        out[frame] = read_matrix_pose(table, where)
+    return out

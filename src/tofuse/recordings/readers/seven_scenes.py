@@ -1,0 +1,106 @@
+"""Reader of Microsoft's 7-Scenes (Shotton et al. 2013)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.reading import is_file, is_folder, list_folder
+from tofuse.files.tables import read_numbers
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.depth_images import DepthImageSource
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.sources import read_matrix_pose
+
+FRAME_RATE_HZ = 30.0
+DEFAULT_CAMERA = Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
+
+_DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
+
+
+@part("reader", "7scenes", label="validated")
+@dataclass(frozen=True)
+class SevenScenes:
+    """Folders of frame-NNNNNN.depth.png, .pose.txt and .color.png or .jpg."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = _depth_files(path)
+        return Sniff(1.0, f"{len(files)} frame-*.depth.png") if files else None
+
+    def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
+        """See `Reader.open`."""
+        numbered = _depth_files(path)
+        if not numbered:
+            raise InputError("has no frame-*.depth.png", where=path, remedy="check the path")
+        numbers = np.array([number for number, _ in numbered])
+        files = [file for _, file in numbered]
+        color = [found for file in files if (found := _color(file)) is not None]
+        complete = len(color) == len(files)
+        source = DepthImageSource(
+            files,
+            numbers / FRAME_RATE_HZ,
+            None if options.camera else _camera(path),
+            0.001,
+            color=color if complete else None,
+            options=options,
+        )
+        if color and not complete:
+            source.warnings.append(
+                f"only {len(color)} of {len(files)} frames have colour: colour is left out"
+            )
+        elif color:
+            source.warnings.append("colour is not registered to depth in 7-Scenes: taken as it is")
+        poses = np.full((len(files), 4, 4), np.nan)
+        for k, file in enumerate(files):
+            pose = file.with_name(file.name[: -len(".depth.png")] + ".pose.txt")
+            if is_file(pose):
+                poses[k] = read_matrix_pose(read_numbers(pose), str(pose))
+        if np.isfinite(poses).any():
+            source.reference = poses
+        source.metadata |= {
+            "sensor": "Kinect v1 (structured light)",
+            "frame_rate_hz": FRAME_RATE_HZ,
+        }
+        return source
+
+
+def _depth_files(path: Path) -> list[tuple[int, Path]]:
+    if not is_folder(path):
+        return []
+    try:
+        found = [(match, p) for p in list_folder(path) if (match := _DEPTH.fullmatch(p.name))]
+    except InputError:
+        return []
+    return sorted((int(match.group(1)), p) for match, p in found)
+
+
+def _color(file: Path) -> Path | None:
+    stem = file.name[: -len(".depth.png")]
+    for suffix in (".color.png", ".color.jpg"):
+        if is_file(file.with_name(stem + suffix)):
+            return file.with_name(stem + suffix)
+    return None
+
+
+def _camera(folder: Path) -> Pinhole:
+    path = folder / "camera-intrinsics.txt"
+    if not is_file(path):
+        return DEFAULT_CAMERA
+    K = read_numbers(path)
+    if K.shape != (3, 3):
+        raise InputError("holds no 3x3 matrix", where=path, remedy="write three rows of three")
+    try:
+        return Pinhole(640, 480, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    except InputError as error:
+        raise InputError(
+            error.problem, where=f"{path}: {error.where}", remedy=error.remedy
+        ) from error

@@ -1,0 +1,171 @@
+"""Reader of the ASCII export of MESA's SwissRanger SR4000."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder, read_head, read_text
+from tofuse.geometry.cameras import RayTable
+from tofuse.parts import part
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import FileSource
+
+Float64 = NDArray[np.float64]
+
+FRAME_RATE_HZ = 32.0
+# The export counts Z from about 1 cm before the optical centre; nothing so near can be measured,
+# and no ray can be told from it.
+NEAREST_M = 0.01
+
+_BLOCKS = {
+    "calibrated distance": "z",
+    "calibrated xvector": "x",
+    "calibrated yvector": "y",
+    "amplitude": "amplitude",
+    "confidence map": "confidence",
+}
+_TAIL = 16384
+_TIME = re.compile(rb"%[^\n]*time stamp \[ms\][^\n]*\n\s*([0-9.eE+-]+)", re.IGNORECASE)
+
+
+@part("reader", "sr4000", label="validated")
+@dataclass(frozen=True)
+class Sr4000:
+    """Folders of .dat files with blocks of Z, x and y vectors, amplitude and confidence."""
+
+    joinable: ClassVar[bool] = True
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            files = _files(path)
+            if any(b"calibrated distance" in read_head(f, 256).lower() for f in files[:3]):
+                return Sniff(1.0, f"{len(files)} .dat files of a SwissRanger")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> Sr4000Source:
+        """See `Reader.open`."""
+        refuse_camera(options, "sr4000")
+        files = _files(path)
+        if not files:
+            raise InputError("has no .dat files", where=path, remedy="give the export's folder")
+        return Sr4000Source(files)
+
+
+def _files(path: Path) -> list[Path]:
+    if is_file(path):
+        return [path] if path.suffix.lower() == ".dat" else []
+    return files_with(path, ".dat") if is_folder(path) else []
+
+
+class Sr4000Source(FileSource):
+    """Frames with the camera's own vectors, exactly, as each frame's ray table.
+
+    The vectors point left and up, and are turned. They do not meet in the origin but about 1 cm
+    behind it, so that x/z of a pixel depends a little on its z: each frame has its own table,
+    by which `frame.points` are the vectors of the file.
+    """
+
+    def __init__(self, files: list[Path]) -> None:
+        self.files = files
+        super().__init__(np.zeros(len(files)))
+        self._read_timestamps()
+        self.metadata |= {
+            "sensor": "MESA SR4000",
+            "confidence_max": 7.0,
+            "frame_rate_hz": FRAME_RATE_HZ,
+            "depth_kind": "z",
+        }
+
+    def _read_timestamps(self) -> None:
+        times = np.array([_time_stamp(path) for path in self.files])
+        known = np.isfinite(times)
+        index = np.arange(len(times))
+        if not known.any():
+            self.warnings.append(f"no time stamps: frames are taken to come at {FRAME_RATE_HZ} Hz")
+            self.timestamps = index / FRAME_RATE_HZ
+            return
+        if not known.all():
+            self.warnings.append(f"{int((~known).sum())} frames have no time stamp: interpolated")
+        times[~known] = np.interp(index[~known], index[known], times[known])
+        # Where the camera's counter starts again, the frames still follow each other.
+        step = np.diff(times, prepend=times[0])
+        if (step < 0).any():
+            self.warnings.append("time stamps go back; frames stay in the order of files")
+        self.timestamps = times
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        path = self.files[index]
+        blocks = _read_blocks(path)
+        z = blocks["z"]
+        valid = np.isfinite(z) & (z >= NEAREST_M)
+        valid &= np.isfinite(blocks["x"]) & np.isfinite(blocks["y"])
+        if valid.sum() < 16:
+            raise InputError("has no valid distances", where=path)
+        depth = np.where(valid, z, 0)
+        safe = np.where(valid, z, np.nan)
+        rays = np.stack([-blocks["x"] / safe, -blocks["y"] / safe], -1)
+        confidence = blocks.get("confidence")
+        amplitude = blocks.get("amplitude")
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            RayTable(rays.astype(np.float32)),
+            depth.astype(np.float32),
+            "z",
+            None if amplitude is None else np.nan_to_num(amplitude).astype(np.float32),
+            None
+            if confidence is None
+            else np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8),
+        )
+
+
+def _time_stamp(path: Path) -> float:
+    """Seconds, from the last lines of a file; NaN if there are none."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, 2)
+            file.seek(max(0, file.tell() - _TAIL))
+            found = _TIME.search(file.read())
+        return float(found.group(1)) / 1000 if found else float("nan")
+    except (OSError, ValueError):
+        return float("nan")
+
+
+def _read_blocks(path: Path) -> dict[str, Float64]:
+    """Return the (H, W) blocks of a file by short name."""
+    blocks: dict[str, Float64] = {}
+    for section in read_text(path).split("%")[1:]:
+        title, _, body = section.partition("\n")
+        name = _BLOCKS.get(title.strip().lower())
+        if name is None:
+            continue
+        try:
+            numbers = np.array([float(word) for word in body.split()])
+        except ValueError as error:
+            raise InputError(
+                f"is damaged in the block {title.strip()!r} ({error})", where=path
+            ) from error
+        width = len(body.partition("\n")[0].split())
+        if width < 2 or len(numbers) % width or len(numbers) < 2 * width:
+            raise InputError(f"is cut off in the block {title.strip()!r}", where=path)
+        blocks[name] = numbers.reshape(-1, width)
+    missing = [title for title, name in _BLOCKS.items() if name in "xyz" and name not in blocks]
+    if missing:
+        raise InputError(
+            f"has no block {missing[0]!r}", where=path, remedy="export the frame again"
+        )
+    if len({block.shape for block in blocks.values()}) > 1:
+        raise InputError("has blocks of different sizes (cut off)", where=path)
+    return blocks

@@ -1,0 +1,113 @@
+"""Reader of the TUM RGB-D benchmark (Sturm et al. 2012)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import is_file, is_folder, read_text
+from tofuse.files.trajectory import associate
+from tofuse.geometry.cameras import BrownConrady
+from tofuse.parts import part
+from tofuse.recordings.depth_images import DepthImageSource
+from tofuse.recordings.reader import SURE, ReaderOptions, Sniff
+from tofuse.recordings.sources import check_timestamps, tum_poses
+
+Float64 = NDArray[np.float64]
+
+DEPTH_UNIT_M = 1 / 5000
+
+# Of the colour cameras: depth is registered to colour (the infrared ones nearly double errors).
+CAMERAS = {
+    "freiburg1": BrownConrady(
+        640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
+        0.262383, -0.953104, -0.005358, 0.002628, 1.163314,
+    ),
+    "freiburg2": BrownConrady(
+        640, 480, 520.908620, 521.007327, 325.141442, 249.701764,
+        0.231222, -0.784899, -0.003257, -0.000105, 0.917205,
+    ),
+    "freiburg3": BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6),
+}  # fmt: skip
+
+
+@part("reader", "tum")
+@dataclass(frozen=True)
+class Tum:
+    """Folders with depth.txt (timestamp and file name), depth/, and maybe rgb.txt, rgb/."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if is_folder(path) and is_file(path / "depth.txt"):
+            return Sniff(SURE, "depth.txt")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
+        """See `Reader.open`."""
+        times, files = _read_list(path / "depth.txt")
+        camera = camera_of(path)
+        if camera is None and options.camera is None:
+            raise InputError(
+                "is a TUM folder whose name tells no camera (freiburg1, 2 or 3)",
+                where=path,
+                remedy="give the colour camera by --camera camera.json",
+            )
+        warnings: list[str] = []
+        check_timestamps(times, path / "depth.txt", warnings)
+        color: list[Path] | None = None
+        if is_file(path / "rgb.txt"):
+            color_times, color_files = _read_list(path / "rgb.txt")
+            pairs = associate(times, color_times)
+            if (pairs >= 0).all():
+                color = [color_files[k] for k in pairs]
+            else:
+                warnings.append(
+                    f"{int((pairs < 0).sum())} of {len(pairs)} depth images have no colour image "
+                    "within 0.02 s: colour is left out"
+                )
+        source = DepthImageSource(files, times, camera, DEPTH_UNIT_M, color=color, options=options)
+        source.warnings += warnings
+        if is_file(path / "groundtruth.txt"):
+            source.reference = tum_poses(source, path / "groundtruth.txt")
+        source.metadata["sensor"] = "Kinect v1 or Xtion (structured light)"
+        return source
+
+
+def camera_of(path: Path) -> BrownConrady | None:
+    """Return the colour camera that the folder's name, or its parent's, tells."""
+    for name in (path.absolute().name, path.absolute().parent.name):
+        found = re.search(r"(?:freiburg|fr)([123])(?![0-9])", name.lower())
+        if found:
+            return CAMERAS[f"freiburg{found.group(1)}"]
+    return None
+
+
+def _read_list(path: Path) -> tuple[Float64, list[Path]]:
+    times, files = [], []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        try:
+            times.append(float(words[0]))
+            name = Path(words[1])
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                "isn't a timestamp and a file name", where=f"{path}, line {number}"
+            ) from error
+        if name.is_absolute() or ".." in name.parts or "\0" in words[1]:
+            raise InputError(
+                f"names {words[1]!r}, outside the folder", where=f"{path}, line {number}"
+            )
+        files.append(path.parent / name)
+    if not files:
+        raise InputError("names no images", where=path, remedy="check the recording")
+    return np.array(times), files
