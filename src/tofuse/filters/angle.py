@@ -28,7 +28,9 @@ class NeighbourhoodAngle(Filter):
     camera and that neighbour approaches 180 degrees. On a surface seen at grazing angle g (0 when
     seen edge on) it is at most about 180 degrees - g: the threshold is the tilt that is still
     believed. The background beside an edge sees its neighbour in front (an angle near 0) and is
-    kept.
+    kept. Noise looks the same where it exceeds what the threshold lets pass between neighbours, at
+    170 degrees 5.7 times their spacing: on a camera as coarse and noisy as the SR4000 half of the
+    points go with it, so it belongs after a filter by confidence.
 
     Attributes
     ----------

@@ -1,0 +1,97 @@
+"""Temporal noise of a real SR4000 before and after each filter.
+
+    python benchmarks/filters_sr4000.py [folder of sr4000_corridor]
+
+The camera stands still at each position, so what varies at a pixel is noise: the standard
+deviation of z over the frames there. It is taken over the pixels that a filter keeps in every
+frame of the position. The temporal filter is given the same frames that it is judged by.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.filters.amplitude import Amplitude
+from tofuse.filters.angle import NeighbourhoodAngle
+from tofuse.filters.base import Filter, apply_filters
+from tofuse.filters.confidence import Confidence
+from tofuse.filters.distance import Distance
+from tofuse.filters.median import Median
+from tofuse.filters.neighbours import NeighbourDistance, NeighbourShare
+from tofuse.filters.temporal import TemporalDeviation, z_deviation
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.open import open_recording
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
+
+CASES: dict[str, list[Filter]] = {
+    "no filter": [],
+    **{f"confidence {level}": [Confidence(level)] for level in range(1, 8)},
+    "amplitude over 500": [Amplitude(500.0)],
+    "distance 0.5 to 4 m": [Distance(0.5, 4.0)],
+    "neighbourhood angle 170 deg": [NeighbourhoodAngle()],
+    "median 5 x 5, 0.1 m": [Median()],
+    "neighbour distance 0.05 m": [NeighbourDistance()],
+    "neighbour share 0.5": [NeighbourShare()],
+    "temporal 25 mm": [TemporalDeviation()],
+    "chapter 4: confidence 7, share 0.5": [Confidence(), NeighbourShare()],
+    "figure 3.2 d: temporal, share 0.5": [TemporalDeviation(), NeighbourShare()],
+}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the pixels kept in all frames: median and rms deviation in m, and their share."""
+
+    median_m: float
+    rms_m: float
+    kept: float
+
+
+def temporal_noise(positions: Sequence[Sequence[RangeFrame]], filters: Sequence[Filter]) -> Noise:
+    """Pool the temporal standard deviation of z over still frames of several positions."""
+    deviations, seen = [], 0
+    for frames in positions:
+        kept = np.all([f.valid for f in frames], axis=0)
+        seen += int(kept.sum())
+        for k, frame in enumerate(frames):
+            # All the others stand in for history, as the first frames have none.
+            others = [*frames[k + 1 :], *frames[:k]]
+            kept &= apply_filters(filters, frame, others)[0].valid
+        deviations.append(z_deviation([f.z for f in frames])[kept])
+    pooled = np.concatenate(deviations)
+    if len(pooled) == 0:
+        return Noise(np.nan, np.nan, 0.0)
+    return Noise(
+        float(np.median(pooled)), float(np.sqrt((pooled**2).mean())), len(pooled) / max(seen, 1)
+    )
+
+
+def still_frames(folder: Path) -> list[list[RangeFrame]]:
+    """Frames of each position of the corridor."""
+    return [
+        [frame for frame in open_recording(folder / name) if isinstance(frame, RangeFrame)]
+        for name in ("Y1", "Y2")
+    ]
+
+
+def main() -> None:
+    positions = still_frames(Path(sys.argv[1]) if len(sys.argv) > 1 else DATA)
+    before = temporal_noise(positions, [])
+    print(f"{'':36}{'median':>9}{'rms':>9}{'kept':>8}{'median lowered':>16}")
+    for name, filters in CASES.items():
+        noise = temporal_noise(positions, filters)
+        lowered = before.median_m / noise.median_m
+        print(
+            f"{name:36}{noise.median_m * 1e3:6.1f} mm{noise.rms_m * 1e3:6.0f} mm"
+            f"{noise.kept:8.1%}{lowered:14.2f} x"
+        )
+
+
+if __name__ == "__main__":
+    main()
