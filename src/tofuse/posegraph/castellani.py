@@ -212,10 +212,13 @@ class _Step:
         """Return q, t and the objective after one step down; None if there is no way down."""
         H, g = self._assemble(*self.problem.jacobian(q, t), self.problem.residuals(q, t))
         diagonal = H.diagonal()
-        # A vertex at the end of an edge without an arm still has a curvature in every direction.
+        # No direction goes undamped, not even one in which the objective is flat.
         scale = np.maximum(diagonal, 1e-12 * diagonal.max())
         while self.damping < 1e12:
             x = _solve(H + sparse.diags(self.damping * scale, format="csc"), g)
+            if x is None:
+                self.damping *= 10
+                continue
             q_new, t_new = q.copy(), t.copy()
             d = x.reshape(-1, 6)
             half = np.concatenate([d[:, 3:] / 2, np.ones((len(d), 1))], axis=1)
@@ -268,9 +271,15 @@ def normal_equations(
     return assemble
 
 
-def _solve(H: Any, g: Float64) -> Float64:
-    """Solve for a symmetric positive definite sparse matrix, without pivoting."""
-    factor = splu(
-        H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+def _solve(H: Any, g: Float64) -> Float64 | None:
+    """Solve for a symmetric positive definite sparse matrix; None if it is singular."""
+    try:
+        factor = splu(
+            H,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError:
+        return None
     return factor.solve(g)
