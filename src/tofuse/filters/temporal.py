@@ -15,7 +15,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
 
-@part("filter", "temporal")
+@part("filter", "temporal", label="validated")
 @dataclass(frozen=True)
 class TemporalDeviation(Filter):
     """Remove pixels whose z varied too much over the last frames (section 2.8).
