@@ -230,7 +230,7 @@ CAMERAS: dict[str, CameraModel] = {
             name="ifm-o3r",
             camera=BrownConrady(224, 172, 186.0, 186.0, 111.5, 85.5, k1=-0.25, k2=0.07),
             modulation_hz=80e6,
-            unwrap_hz=5e6,
+            unwrap_hz=10e6,
             frame_rate_hz=20.0,
             integration_s=0.015,
             depth_unit_m=1.52587890625e-4,

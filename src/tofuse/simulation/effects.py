@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import IntFlag
 from typing import Any, Literal, Self
 
@@ -80,23 +80,32 @@ class Effects:
     @classmethod
     def none(cls, **on: Any) -> Self:
         """Return an ideal camera, but for the effects given by name."""
-        off: dict[str, Any] = {
-            "shot_noise": False,
-            "ambient": 0.0,
-            "saturation": False,
-            "under_exposure": False,
-            "mixed_pixels": False,
-            "wrap": False,
-            "scatter": 0.0,
-            "multipath": False,
-            "gloss": False,
-            "smear": False,
-            "wiggling": 0.0,
-            "pixel_offsets": 0.0,
-            "amplitude_nonlinearity": 0.0,
-            "thermal_drift": 0.0,
-        }
-        return cls(**(off | on))
+        return cls(**({name: _off(name) for name in SWITCHES} | on))
+
+    def without(self, *names: str) -> Self:
+        """Return these effects with the ones named switched off; "all" stands for every one.
+
+        Raises
+        ------
+        InputError
+            If there is no such effect.
+        """
+        for name in names:
+            if name not in (*SWITCHES, "all"):
+                raise InputError(
+                    f"there is no effect called {name!r}",
+                    where="effects",
+                    remedy=f"use all, or some of {list(SWITCHES)}",
+                )
+        chosen = SWITCHES if "all" in names else names
+        return replace(self, **{name: _off(name) for name in chosen})
+
+
+SWITCHES = tuple(field.name for field in fields(Effects) if field.name != "noise")
+
+
+def _off(name: str) -> Any:
+    return False if isinstance(getattr(Effects, name), bool) else 0.0
 
 
 class Flag(IntFlag):

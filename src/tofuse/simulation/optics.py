@@ -111,6 +111,7 @@ class Returns:
 
 def trace(
     scene: Scene,
+    model: CameraModel,
     directions: Float64,
     T_room_camera: Float64,
     T_room_object: Float64 | None,
@@ -121,19 +122,19 @@ def trace(
 
     The lamp is at the camera's centre. A surface that mirrors the share g sends back a highlight
     head-on, and shows what is mirrored in it: lit through the mirror (g^2, the mirror image) and
-    lit directly (g, on a shorter path).
+    lit directly (g, on a shorter path). g depends on the angle, see `_mirrored`.
     """
     origin = T_room_camera[:3, 3]
     rays = directions @ T_room_camera[:3, :3].T
-    seen = np.isfinite(rays).all(1)
+    seen: NDArray[np.bool_] = np.isfinite(rays.sum(1))
     rays = np.where(seen[:, None], rays, [0.0, 0.0, 1.0])
     hits = scene.cast(origin, rays, T_room_object)
-    distance = np.where(seen, hits.distance.astype(float), np.inf)
+    distance: Float64 = np.where(seen, hits.distance.astype(float), np.inf)
     hit = np.isfinite(distance)
     safe = np.where(hit, np.maximum(distance, 1e-3), 1.0)
     normals = hits.normal.astype(float)
     cosine = np.clip(-(normals * rays).sum(1), 0, 1)
-    mirror = np.where(hit, hits.gloss, 0.0) if gloss else np.zeros(len(rays))
+    mirror = np.where(hit, _mirrored(hits.gloss.astype(float), cosine), 0.0) * gloss
     diffuse = np.where(hit, hits.albedo * (1 - mirror), 0.0)
     direct = diffuse * cosine / safe**2
     points = np.where(hit[:, None], origin + safe[:, None] * rays, np.inf)
@@ -159,9 +160,19 @@ def trace(
     strength[shiny, 1] = g * g * albedo * arriving / (r + s) ** 2
     path[shiny, 1] = 2 * (r + s)
     lit, length = lit_by(scene, origin, y, n2, T_room_object)
+    # Lit where the lamp shines there, not along the ray.
+    lit *= _beam(model, (y - origin) @ T_room_camera[:3, :3]) / _beam(model, directions[shiny])
     strength[shiny, 2] = g * albedo * lit
     path[shiny, 2] = r + s + length
     return Returns(strength, path, diffuse, distance, points, normals)
+
+
+def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
+    """Share of the light that a surface mirrors (Schlick 1994): gloss^2 head-on, more askance.
+
+    So a full mirror mirrors everything, and varnish (gloss 0.2) 4 % head-on and 20 % at most.
+    """
+    return gloss * (gloss + (1 - gloss) * (1 - cosine) ** 5)
 
 
 def lit_by(

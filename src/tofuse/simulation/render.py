@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import INVALID_DEPTH, depth_from_counts
 from tofuse.sensor.models import CameraModel
 from tofuse.simulation import optics, sensor
 from tofuse.simulation.effects import Effects, Flag
@@ -80,7 +81,9 @@ def render(
     still = not effects.smear or all(_same(pose, poses[-1]) for pose in poses)
 
     def light(pose: tuple[Float64, Float64 | None], rays: optics.RayGrid) -> _Light:
-        returns = optics.trace(scene, rays.directions.reshape(-1, 3), *pose, gloss=effects.gloss)
+        returns = optics.trace(
+            scene, model, rays.directions.reshape(-1, 3), *pose, gloss=effects.gloss
+        )
         direct = [optics.pixel_phasors(rays, returns, f) for f in model.frequencies]
         weights = [
             optics.bounce_weights(rays, returns, f)
@@ -94,7 +97,7 @@ def render(
     if middle is None:
         pick = optics.ray_grid(model, False)
         middle = optics.trace(
-            scene, pick.directions.reshape(-1, 3), *poses[-1], gloss=effects.gloss
+            scene, model, pick.directions.reshape(-1, 3), *poses[-1], gloss=effects.gloss
         )
     shape = pick.directions.shape
     distance = middle.distance.reshape(shape[:2])[pick.centre]
@@ -266,13 +269,13 @@ def _frame(
     depth = np.where(measured.saturated, 0, _recorded(model, measured.range_m))
     if effects.under_exposure:
         depth = np.where(measured.amplitude < model.minimum_amplitude, 0, depth)
-    steps = np.round(depth / model.depth_unit_m)
-    depth = np.where(steps < 65535, steps * model.depth_unit_m, 0)
+    counts = np.round(depth / model.depth_unit_m)
+    counts = np.where(counts < INVALID_DEPTH, counts, 0).astype(np.uint16)
     return RangeFrame(
         index,
         time_s,
         model.camera,
-        depth.astype(np.float32),
+        depth_from_counts(counts, model.depth_unit_m),
         model.depth_kind,
         sensor.reported_amplitude(model, measured),
         sensor.reported_confidence(model, measured),

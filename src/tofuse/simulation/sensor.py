@@ -100,9 +100,10 @@ def expose(
     else:
         buckets = _noisy(model, effects, signal + ambient, difference, rng)
     a, b = buckets
-    saturated = np.zeros(a.shape[2:], bool)
+    saturated: Bool = np.zeros(a.shape[2:], bool)
     if effects.saturation:
-        saturated = (np.maximum(a, b) >= model.full_well_electrons).any((0, 1))
+        full = np.maximum(a, b) >= model.full_well_electrons
+        saturated = np.asarray(full.any((0, 1)))
         a, b = np.minimum(a, model.full_well_electrons), np.minimum(b, model.full_well_electrons)
     share = (a + b) / (2 * model.full_well_electrons)
     read = (a - b) * (1 - effects.amplitude_nonlinearity * model.compression * share)
@@ -136,10 +137,13 @@ def _noisy(
         a = rng.poisson(mean_a) + rng.normal(0, read, mean_a.shape)
         b = rng.poisson(mean_b) + rng.normal(0, read, mean_b.shape)
         return a, b
-    gain = _noise_gain(mean_a.shape[2:])
+    # A factor that all phase images of a pixel share makes the tails of the range heavy
+    # (Student's t with 5 degrees).
+    shape = mean_a.shape[2:]
+    tails = np.sqrt(3 / rng.chisquare(5, shape))
+    gain = _noise_gain(shape) * tails
     a, b = (
-        mean + gain * np.sqrt(mean + read**2) * _unruly(rng, mean.shape)
-        for mean in (mean_a, mean_b)
+        mean + gain * np.sqrt(mean + read**2) * _alike(rng, mean.shape) for mean in (mean_a, mean_b)
     )
     return a, b
 
@@ -151,14 +155,11 @@ def _noise_gain(shape: tuple[int, ...]) -> Float64:
     return np.exp(np.random.default_rng([90210]).normal(0, spread, shape) - spread**2)
 
 
-def _unruly(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
-    """Noise of unit variance with heavy tails (Student's t, 4 degrees) and alike neighbours."""
-    tails = rng.standard_t(4, shape) / np.sqrt(2)
-    alike = rng.normal(size=shape)
-    alike = (
-        alike + np.roll(alike, 1, -1) + np.roll(alike, 1, -2) + np.roll(alike, (1, 1), (-2, -1))
-    ) / 2
-    return (tails + alike) / np.sqrt(2)
+def _alike(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
+    """Normal noise of unit variance, half of which a pixel shares with its neighbours."""
+    own, other = rng.normal(size=shape), rng.normal(size=shape)
+    shifts = [np.roll(other, shift, (-2, -1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))]
+    return (own + sum(shifts) / 2) / np.sqrt(2)
 
 
 @cache
