@@ -23,32 +23,29 @@ LATTICE = 256
 
 
 @kernel
-def value_noise(table: Float64, x: float, y: float, z: float) -> float:
+def value_noise(order: Int32, values: Float64, x: float, y: float, z: float) -> float:
     """Smooth noise of unit variance at the lattice points, cell size 1, period 256 cells.
 
-    `table` holds (2, 256) values: a permutation of 0 to 255, and the noise.
+    `order` (256,) is a permutation of 0 to 255, `values` (256,) the noise on the lattice.
     """
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     ux, uy, uz = x - fx, y - fy, z - fz
     wx = ux * ux * (3.0 - 2.0 * ux)
     wy = uy * uy * (3.0 - 2.0 * uy)
     wz = uz * uz * (3.0 - 2.0 * uz)
-    x0, y0, z0 = int(fx) & 255, int(fy) & 255, int(fz) & 255
-    total = 0.0
-    for a in range(2):
-        pa = int(table[0, (x0 + a) & 255])
-        sa = wx if a else 1.0 - wx
-        for b in range(2):
-            pb = int(table[0, (pa + y0 + b) & 255])
-            sb = sa * (wy if b else 1.0 - wy)
-            p0 = int(table[0, (pb + z0) & 255])
-            p1 = int(table[0, (pb + z0 + 1) & 255])
-            total += sb * (table[1, p0] * (1.0 - wz) + table[1, p1] * wz)
-    return total
+    x0, y0, z0 = int(fx), int(fy), int(fz)
+    a0, a1 = order[x0 & 255], order[(x0 + 1) & 255]
+    b00, b01 = order[(a0 + y0) & 255] + z0, order[(a0 + y0 + 1) & 255] + z0
+    b10, b11 = order[(a1 + y0) & 255] + z0, order[(a1 + y0 + 1) & 255] + z0
+    c00 = values[order[b00 & 255]] * (1.0 - wz) + values[order[(b00 + 1) & 255]] * wz
+    c01 = values[order[b01 & 255]] * (1.0 - wz) + values[order[(b01 + 1) & 255]] * wz
+    c10 = values[order[b10 & 255]] * (1.0 - wz) + values[order[(b10 + 1) & 255]] * wz
+    c11 = values[order[b11 & 255]] * (1.0 - wz) + values[order[(b11 + 1) & 255]] * wz
+    return (c00 * (1.0 - wy) + c01 * wy) * (1.0 - wx) + (c10 * (1.0 - wy) + c11 * wy) * wx
 
 
 @kernel
-def fractal_noise(table: Float64, x: float, y: float, z: float) -> float:
+def fractal_noise(order: Int32, values: Float64, x: float, y: float, z: float) -> float:
     """Three octaves of `value_noise`, near unit variance on the average over a surface.
 
     Each octave is turned its own way: surfaces along the axes would show the lattice.
@@ -56,16 +53,16 @@ def fractal_noise(table: Float64, x: float, y: float, z: float) -> float:
     a = (2.0 * x + 2.0 * y - z) / 3.0
     b = (2.0 * z - x + 2.0 * y) / 3.0
     c = (2.0 * x - y + 2.0 * z) / 3.0
-    total = value_noise(table, a, b, c)
+    total = value_noise(order, values, a, b, c)
     a, b, c = 0.6 * a - 0.8 * b, 0.8 * a + 0.6 * b, c
-    total += 0.7 * value_noise(table, 2.13 * a + 31.7, 2.13 * b + 11.3, 2.13 * c + 47.1)
+    total += 0.7 * value_noise(order, values, 2.13 * a + 31.7, 2.13 * b + 11.3, 2.13 * c + 47.1)
     b, c = 0.6 * b - 0.8 * c, 0.8 * b + 0.6 * c
-    total += 0.5 * value_noise(table, 4.31 * a + 7.9, 4.31 * b + 53.9, 4.31 * c + 19.3)
+    total += 0.5 * value_noise(order, values, 4.31 * a + 7.9, 4.31 * b + 53.9, 4.31 * c + 19.3)
     return 1.3 * total
 
 
 @kernel
-def pattern_at(table: Float64, row: Float64, x: float, y: float, z: float) -> float:
+def pattern_at(order: Int32, values: Float64, row: Float64, x: float, y: float, z: float) -> float:
     """Pattern of one surface at a point of its body: mean near 0, standard deviation near 1."""
     kind = int(row[KIND])
     if kind == PLAIN:
@@ -74,10 +71,9 @@ def pattern_at(table: Float64, row: Float64, x: float, y: float, z: float) -> fl
     v = (y + row[SHIFT + 1]) / row[SCALE + 1]
     w = (z + row[SHIFT + 2]) / row[SCALE + 2]
     if kind == WOOD:
-        warp = value_noise(table, 0.4 * u, 0.4 * v, 0.4 * w)
-        return 0.9 * np.sin(6.2831853 * (u + v + w) * 0.35 + 4.0 * warp) + 0.7 * value_noise(
-            table, u, v, w
-        )
+        warp = value_noise(order, values, 0.4 * u, 0.4 * v, 0.4 * w)
+        rings = np.sin(6.2831853 * 0.35 * (u + v + w) + 4.0 * warp)
+        return 0.9 * rings + 0.7 * value_noise(order, values, u, v, w)
     if kind == TILES:
         # Joints between square tiles, with soft edges, and a tone for each tile.
         joint = 0.0
@@ -86,14 +82,14 @@ def pattern_at(table: Float64, row: Float64, x: float, y: float, z: float) -> fl
             away = abs(q - np.floor(q) - 0.5)
             s = min(max((away - 0.44) / 0.04, 0.0), 1.0)
             joint = max(joint, s * s * (3.0 - 2.0 * s))
-        tone = table[1, (int(np.floor(u)) * 7 + int(np.floor(v)) * 57 + int(np.floor(w))) & 255]
+        tone = values[(int(np.floor(u)) * 7 + int(np.floor(v)) * 57 + int(np.floor(w))) & 255]
         return (0.6 * tone + 0.3) * (1.0 - joint) - 2.0 * joint
     if kind == PRINT:
-        return 1.1 * np.tanh(2.2 * fractal_noise(table, u, v, w))
+        return 1.1 * np.tanh(2.2 * fractal_noise(order, values, u, v, w))
     if kind == SPECKLE:
-        fine = value_noise(table, u, v, w)
-        return 1.6 * fine + 0.8 * value_noise(table, 0.23 * u, 0.23 * v, 0.23 * w)
-    return fractal_noise(table, u, v, w)
+        fine = value_noise(order, values, u, v, w)
+        return 1.6 * fine + 0.8 * value_noise(order, values, 0.23 * u, 0.23 * v, 0.23 * w)
+    return fractal_noise(order, values, u, v, w)
 
 
 @kernel
@@ -102,7 +98,8 @@ def shade_hits(
     face_normals: Float64,
     face_surface: Int32,
     rows: Float64,
-    table: Float64,
+    order: Int32,
+    values: Float64,
     origins: Float64,
     directions: Float64,
     rotation: Float64,
@@ -121,7 +118,7 @@ def shade_hits(
     corner_normals (F, 9), face_normals (F, 3), face_surface (F,)
         Of the body's triangles, in the order of the leaves.
     rows (S, 10)
-        Texture parameters of every surface; `table` (2, 256) as in `value_noise`.
+        Texture parameters of every surface; `order` and `values` as in `value_noise`.
     origins (1 or N, 3), directions (N, 3)
         Rays in the body's frame.
     rotation (3, 3)
@@ -170,6 +167,6 @@ def shade_hits(
             x = origins[j, 0] + distance[i] * directions[i, 0]
             y = origins[j, 1] + distance[i] * directions[i, 1]
             z = origins[j, 2] + distance[i] * directions[i, 2]
-            p = min(max(pattern_at(table, rows[s], x, y, z), -2.5), 2.5)
+            p = min(max(pattern_at(order, values, rows[s], x, y, z), -2.5), 2.5)
             value = min(max(value * (1.0 + rows[s, CONTRAST] * p), 0.02), 0.98)
         albedo[i] = value

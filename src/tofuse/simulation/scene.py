@@ -87,7 +87,7 @@ class Body:
     def shade(
         self,
         rows: Float64,
-        table: Float64,
+        noise: tuple[Int32, Float64],
         origins: Float64,
         directions: Float64,
         R_room_body: Float64,
@@ -97,9 +97,12 @@ class Body:
         out: tuple[Float32, Float32, Float32, Int32],
     ) -> None:
         """Fill in normal, albedo, gloss and surface of the rays that hit this body."""
+        order, values = noise
+        normal, albedo, gloss, surface = out
         shade_hits(
-            self._corner_normals, self._face_normals, self._surface, rows, table,
-            origins, directions, R_room_body, distance, face, weights, *out,
+            self._corner_normals, self._face_normals, self._surface, rows, order, values,
+            origins, directions, R_room_body, distance, face, weights,
+            normal, albedo, gloss, surface,
         )  # fmt: skip
 
 
@@ -136,7 +139,7 @@ class Scene:
         self._room = Body(room)
         self._object = None if moving is None else Body(moving)
         self._rows = texture.parameter_rows(self.materials, seed)
-        self._table = texture.noise_table(seed)
+        self._noise = texture.noise_tables(seed)
 
     @property
     def triangles(self) -> int:
@@ -187,14 +190,14 @@ class Scene:
             nearest = np.full(b - a, np.inf)
             out = (normal[a:b], albedo[a:b], gloss[a:b], surface[a:b])
             face, weights = self._room.cast(starts, rays, nearest)
-            rows, table = self._rows, self._table
-            self._room.shade(rows, table, starts, rays, np.eye(3), nearest, face, weights, out)
+            rows, noise = self._rows, self._noise
+            self._room.shade(rows, noise, starts, rays, np.eye(3), nearest, face, weights, out)
             if self._object is not None:
                 starts = np.ascontiguousarray(se3.transform(T_object_room, starts))
                 rays = np.ascontiguousarray(rays @ T_object_room[:3, :3].T)
                 face, weights = self._object.cast(starts, rays, nearest)
                 R = np.ascontiguousarray(T[:3, :3])
-                self._object.shade(rows, table, starts, rays, R, nearest, face, weights, out)
+                self._object.shade(rows, noise, starts, rays, R, nearest, face, weights, out)
             distance[a:b] = nearest
 
         run_chunks(chunk, size, chunks=max(1, size // _RAYS_PER_CHUNK))

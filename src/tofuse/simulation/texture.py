@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tofuse.kernels import texture as kernels
 
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 
 Pattern = Literal["plain", "noise", "wood", "tiles", "print", "speckle"]
 _KINDS: dict[Pattern, int] = {
@@ -59,11 +60,11 @@ class Material:
         return replace(self, albedo=UNIFORM_ALBEDO, contrast=0.0, pattern="plain", gloss=0.0)
 
 
-def noise_table(seed: int) -> Float64:
-    """(2, 256) table of the noise kernels: a permutation, and values of unit variance."""
+def noise_tables(seed: int) -> tuple[Int32, Float64]:
+    """Return (256,) tables of the noise kernels: a permutation, and values of unit variance."""
     rng = np.random.default_rng([seed, 1])
     values = np.linspace(-np.sqrt(3), np.sqrt(3), kernels.LATTICE)
-    return np.stack([rng.permutation(kernels.LATTICE).astype(float), rng.permutation(values)])
+    return rng.permutation(kernels.LATTICE).astype(np.int32), rng.permutation(values)
 
 
 def parameter_rows(materials: Sequence[Material], seed: int) -> Float64:
