@@ -93,7 +93,7 @@ class Confirmation:
     registrations: tuple[Registrar, ...] = field(
         default_factory=lambda: (algorithm_1(0.2), algorithm_1(0.05))
     )
-    min_share: float = 0.25
+    min_share: float = 0.3
     max_error: float = 0.65
 
     def __post_init__(self) -> None:
