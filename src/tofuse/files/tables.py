@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -36,11 +35,14 @@ def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
     text = text.replace(",", " ").replace(";", " ")
     if "\0" in text:
         raise InputError("is not text", where=path, remedy="check the file")
-    lines = [line for line in text.splitlines()[skip:] if line.split("#", 1)[0].strip()]
+    lines = text.splitlines()[skip:]
+    if "#" in text:
+        lines = [line.split("#", 1)[0] for line in lines]
+    lines = [line for line in lines if line.strip()]
     if not lines:
         return np.zeros((0, 0))
     try:
-        return np.loadtxt(io.StringIO("\n".join(lines)), ndmin=2)
+        return np.loadtxt(lines, ndmin=2)
     except (ValueError, OverflowError) as error:
         reason = str(error).split("; use", 1)[0].removesuffix(".")
         raise InputError(

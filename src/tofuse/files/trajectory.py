@@ -87,12 +87,16 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
 
 
 def associate(
-    timestamps: ArrayLike, others: ArrayLike, *, limit: float = ASSOCIATION_LIMIT_S
+    timestamps: ArrayLike,
+    others: ArrayLike,
+    *,
+    limit: float = ASSOCIATION_LIMIT_S,
+    exclusive: bool = True,
 ) -> NDArray[np.intp]:
     """For each of (N,) timestamps, the index of the nearest of (M,) others, or -1.
 
-    An entry is given to the one timestamp nearest to it, and only within `limit` seconds
-    (inclusive, give or take a nanosecond). Neither needs to be sorted.
+    Only within `limit` seconds (inclusive, give or take a nanosecond); if `exclusive`, an entry
+    that is nearest to several goes to the nearest of them alone. Neither needs to be sorted.
     """
     times, others = np.asarray(timestamps, float), np.asarray(others, float)
     out = np.full(len(times), -1, np.intp)
@@ -109,7 +113,7 @@ def associate(
     taken = np.zeros(len(ordered), bool)
     for k in np.argsort(gap, kind="stable"):
         if gap[k] <= limit + 1e-9 and not taken[best[k]]:
-            taken[best[k]] = True
+            taken[best[k]] = exclusive
             out[k] = order[best[k]]
     return out
 

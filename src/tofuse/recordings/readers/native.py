@@ -41,9 +41,7 @@ class Native:
                 "depth/ but no camera.json",
                 "give --format native --camera camera.json",
             )
-        if images == "cloud":
-            return Sniff(UNSURE, "cloud/ but no camera.json", "give --format native")
-        return None
+        return Sniff(SURE, "cloud/") if images == "cloud" else None
 
     def open(self, path: Path, options: ReaderOptions) -> NativeSource:
         """See `Reader.open`."""

@@ -22,6 +22,7 @@ from tofuse.recordings.sources import check_timestamps, tum_poses
 Float64 = NDArray[np.float64]
 
 DEPTH_UNIT_M = 1 / 5000
+COLOR_LIMIT_S = 0.1
 
 # Of the colour cameras: depth is registered to colour (the infrared ones nearly double errors).
 CAMERAS = {
@@ -65,13 +66,14 @@ class Tum:
         color: list[Path] | None = None
         if is_file(path / "rgb.txt"):
             color_times, color_files = _read_list(path / "rgb.txt")
-            pairs = associate(times, color_times)
+            # A depth image without its own takes a neighbour's: colour is for looks.
+            pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
             if (pairs >= 0).all():
                 color = [color_files[k] for k in pairs]
             else:
                 warnings.append(
                     f"{int((pairs < 0).sum())} of {len(pairs)} depth images have no colour image "
-                    "within 0.02 s: colour is left out"
+                    f"within {COLOR_LIMIT_S} s: colour is left out"
                 )
         source = DepthImageSource(files, times, camera, DEPTH_UNIT_M, color=color, options=options)
         source.warnings += warnings
@@ -84,7 +86,7 @@ class Tum:
 def camera_of(path: Path) -> BrownConrady | None:
     """Return the colour camera that the folder's name, or its parent's, tells."""
     for name in (path.absolute().name, path.absolute().parent.name):
-        found = re.search(r"(?:freiburg|fr)([123])(?![0-9])", name.lower())
+        found = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name.lower())
         if found:
             return CAMERAS[f"freiburg{found.group(1)}"]
     return None

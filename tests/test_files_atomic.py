@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from tofuse.errors import OutputError
+from tofuse.files.atomic import make_folder, replacing, write_text
+
+
+def test_file_appears_whole_and_nothing_else_stays(tmp_path: Path) -> None:
+    with replacing(tmp_path / "a.png") as beside:
+        assert beside.parent == tmp_path
+        assert beside.suffix == ".png"
+        beside.write_text("new")
+        assert not (tmp_path / "a.png").exists()
+    assert (tmp_path / "a.png").read_text() == "new"
+    assert os.listdir(tmp_path) == ["a.png"]
+
+
+def test_failure_leaves_the_earlier_file(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+
+    def interrupted() -> None:
+        with replacing(tmp_path / "a.txt") as beside:
+            beside.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.ENOSPC, "free some space"), (errno.EACCES, "may write to"), (errno.EROFS, "may write")],
+)
+def test_trouble_becomes_one_line_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, words: str
+) -> None:
+    def fail(*_args: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OutputError, match=words) as caught:
+        write_text(tmp_path / "a.txt", "x")
+    assert str(tmp_path / "a.txt") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        make_folder(tmp_path / "file" / "inside")
+    with pytest.raises(OutputError, match="create its folder first"):
+        write_text(tmp_path / "missing" / "a.txt", "x")
+
+
+def test_line_feeds_on_every_system(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "a\nb\n")
+    assert (tmp_path / "a.txt").read_bytes() == b"a\nb\n"

@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, list_folder, read_text
+from tofuse.files.tables import read_columns, read_numbers, write_columns
+
+
+def test_numbers_with_any_separator(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(b"# x y\n1, 2;3\n\n4\t5 6 # end\r\n")
+    np.testing.assert_array_equal(read_numbers(tmp_path / "a.txt"), [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("text", ["1 2\n3\n", "1 b\n", "1 2\n3 4 5\n", "\0\0\0\0"])
+def test_bad_numbers(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(InputError, match=r"a\.txt"):
+        read_numbers(tmp_path / "a.txt")
+
+
+def test_empty_file_has_no_rows(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("# nothing\n")
+    assert read_numbers(tmp_path / "a.txt").size == 0
+
+
+def test_columns_round_trip(tmp_path: Path) -> None:
+    columns = {"integration_us": np.array([100.0, 200.0]), "temperature_c": np.array([41.25, 0.1])}
+    write_columns(tmp_path / "a.csv", columns)
+    back = read_columns(tmp_path / "a.csv")
+    assert list(back) == list(columns)
+    for name, column in columns.items():
+        np.testing.assert_array_equal(back[name], column)
+
+
+@pytest.mark.parametrize("text", ["", "a,a\n1,2\n", "a,b\n1\n", "a,b\n1,x\n"])
+def test_bad_columns(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=r"a\.csv"):
+        read_columns(tmp_path / "a.csv")
+
+
+def test_name_order_counts(tmp_path: Path) -> None:
+    for name in ("f10.png", "f9.png", "f1.PNG", ".hidden.png", "a.txt"):
+        (tmp_path / name).touch()
+    assert [p.name for p in files_with(tmp_path, ".png")] == ["f1.PNG", "f9.png", "f10.png"]
+    assert len(list_folder(tmp_path)) == 4
+
+
+def test_what_is_no_text(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(b"abc\xff\xfe\xff")
+    with pytest.raises(InputError, match="byte 3"):
+        read_text(tmp_path / "a.txt")
+    with pytest.raises(InputError, match="MiB"):
+        read_text(tmp_path / "a.txt", limit=3)
