@@ -192,10 +192,10 @@ class Framing:
         if len(points) == 0:
             return cls(T, 1.0, size)
         view = points @ R.T
-        low, high = np.percentile(view, [1, 99], axis=0)
+        low, high = np.percentile(view, [0.2, 99.8], axis=0)
         T[:3, 3] = -(low + high) / 2
         extent = np.maximum(high - low, 1e-6)
-        return cls(T, float(0.92 * min(size[0] / extent[0], size[1] / extent[1])), size)
+        return cls(T, float(0.9 * min(size[0] / extent[0], size[1] / extent[1])), size)
 
 
 def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
@@ -207,7 +207,7 @@ def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> 
         depth = np.linalg.norm(points - frame.origin, axis=1)
     low, high = limits
     colors = viridis((depth - low) / (high - low))
-    radius = 1 if len(points) > 20_000 else 2
+    radius = 1 if len(points) > 60_000 else 2
     return splat(
         points, colors, framing.T_view_world, framing.size, scale=framing.scale, radius=radius
     )

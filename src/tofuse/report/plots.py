@@ -180,18 +180,21 @@ def project(points: Float64, view: str) -> Float64:
     return np.stack([sa * points[:, a], sb * points[:, b]], axis=1)
 
 
-def limits(*groups: Float64, outer: float = 0.0, least: float = 0.02) -> Float64:
-    """Return (2, 2) low and high corners around groups of (N, 2) points, with some room.
+def limits(
+    *groups: Float64, outer: float = 0.0, room: float = 0.06, least: float = 0.02
+) -> Float64:
+    """Return (2, 2) low and high corners around groups of (N, 2) points.
 
-    `outer` percent of the points are left out at each end; `least` is the smallest size in m.
+    `outer` percent of the points are left out at each end. The border is `room` of the size,
+    and at least `least` m.
     """
     boxes = [np.percentile(g, [outer, 100 - outer], axis=0) for g in groups if len(g)]
     if not boxes:
         return np.array([[-0.5, -0.5], [0.5, 0.5]])
     low = np.min([b[0] for b in boxes], axis=0)
     high = np.max([b[1] for b in boxes], axis=0)
-    room = np.maximum(0.06 * (high - low).max(), least)
-    return np.stack([low - room, high + room])
+    border = np.maximum(room * (high - low).max(), least)
+    return np.stack([low - border, high + border])
 
 
 def _plan(box: Float64, view: str, width: int) -> Any:
@@ -199,7 +202,7 @@ def _plan(box: Float64, view: str, width: int) -> Any:
     left, bottom, right, top = 46, 36, 12, 8
     extent = box[1] - box[0]
     inner = width - left - right
-    height = float(np.clip(inner * extent[1] / extent[0], 90, 1.1 * inner))
+    height = float(np.clip(inner * extent[1] / extent[0], 130, 1.1 * inner))
     figure, axes = _new(width, height + bottom + top, (left, bottom, right, top))
     # Grow the box to the shape of the axes, about its middle.
     scale = max(extent[0] / inner, extent[1] / height)
@@ -208,7 +211,7 @@ def _plan(box: Float64, view: str, width: int) -> Any:
     axes.set_ylim(middle[1] - scale * height / 2, middle[1] + scale * height / 2)
     (a, sa), (b, sb) = VIEWS[view]
     for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
-        axis.set_major_locator(_locator())
+        axis.set_major_locator(_locator(inner / 60 if axis is axes.xaxis else height / 40))
         if sign < 0:
             axis.set_major_formatter(lambda value, _: f"{-value + 0.0:.6g}".replace("-", "−"))
     axes.set_xlabel(f"{_NAMES[a]}, m", color=MUTED, fontsize=10.5, labelpad=2)
@@ -216,10 +219,10 @@ def _plan(box: Float64, view: str, width: int) -> Any:
     return figure, axes
 
 
-def _locator() -> Any:
+def _locator(most: float) -> Any:
     from matplotlib.ticker import MaxNLocator
 
-    return MaxNLocator(nbins=6, steps=[1, 2, 5, 10])
+    return MaxNLocator(nbins=int(np.clip(most, 2, 6)), steps=[1, 2, 5, 10])
 
 
 def model(
@@ -247,7 +250,7 @@ def model(
     box = limits(box, path, *([] if true is None else [true]))
     figure, axes = _plan(box, view, width)
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    columns = 2 * (width - 58)
+    columns = int(0.8 * (width - 58))
     rows = max(2, int(columns * (y1 - y0) / (x1 - x0)))
     density, _, _ = np.histogram2d(
         flat[:, 1], flat[:, 0], bins=(rows, columns), range=((y0, y1), (x0, x1))
@@ -256,7 +259,7 @@ def model(
     image = np.zeros((rows, columns, 4), np.uint8)
     image[..., :3] = _MODEL
     alpha = (np.log1p(density) / np.log1p(top)).clip(0, 1)
-    image[..., 3] = np.round(255 * np.where(density > 0, 0.25 + 0.75 * alpha, 0))
+    image[..., 3] = np.round(255 * np.where(density > 0, 0.3 + 0.7 * alpha, 0))
     axes.imshow(
         image,
         extent=(x0, x1, y0, y1),
@@ -328,7 +331,7 @@ def cameras(
     from matplotlib.collections import LineCollection
 
     figure, axes = _plan(box, view, width)
-    size = 0.045 * float((box[1] - box[0]).max())
+    size = 0.05 * float((box[1] - box[0]).max())
     centers = project(poses[:, :3, 3], view)
     if reference is not None and len(reference):
         path = project(reference[:, :3, 3], view)
@@ -337,7 +340,7 @@ def cameras(
         ends = np.stack([project(loops[:, 0], view), project(loops[:, 1], view)], axis=1)
         axes.add_collection(LineCollection(list(ends), colors=LOOP, linewidths=1, alpha=0.8))
     axes.plot(centers[:, 0], centers[:, 1], color=color, linewidth=1)
-    step = -(-len(poses) // 150)
+    step = -(-len(poses) // 72)
     shape = np.array([[-0.5, 0, 1], [0, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]])
     if view == "side":
         shape = shape[:, [1, 0, 2]]

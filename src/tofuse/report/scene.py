@@ -20,7 +20,7 @@ UInt8 = NDArray[np.uint8]
 Integers = NDArray[np.intp]
 
 MAX_POINTS = 150_000
-MAX_CAMERAS = 300
+MAX_CAMERAS = 72
 YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
 
 
@@ -116,7 +116,7 @@ def packed(scene: Scene) -> dict[str, Any]:
     steps = np.round((scene.points - low) / extent * 65535).astype("<u2")
     normals = scene.normals
     step = -(-max(len(scene.after), len(scene.before), 1) // MAX_CAMERAS)
-    edge = 0.02 * scene.size
+    edge = 0.018 * scene.size
     return {
         "count": len(scene.points),
         "low": low.tolist(),
@@ -184,7 +184,7 @@ def still(scene: Scene, size: tuple[int, int] = (960, 600)) -> UInt8:
     out[:] = images.BACKGROUND
     seen = drawn[..., 3] > 0
     out[seen] = drawn[seen, :3]
-    edge, step = 0.02 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
+    edge, step = 0.018 * scene.size, -(-max(len(scene.after), 1) // MAX_CAMERAS)
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
         dots = _sampled(camera_lines(poses, edge, step))
         ink = images.splat(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse._version import __version__
+from tofuse.fusion.cloud import Cloud
 from tofuse.geometry import se3
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report import images, plots, words
@@ -61,7 +62,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     rows = {int(k): row for row, k in enumerate(index)}
     reference = extras.reference
     if reference is not None and (
-        reference.shape != result.trajectory.shape or len(finite(reference)) == 0
+        reference.shape != result.trajectory.shape or len(finite(reference[result.has_pose])) == 0
     ):
         reference = None
     scene = make_scene(result, rows, reference)
@@ -122,7 +123,7 @@ def _verdict(s: Subject) -> Values:
     statuses: list[str] = [f.status for f in result.diagnostics.frames]
     facts = [(f"frames {name}", f"{statuses.count(name):,}") for name in words.STATUSES]
     facts.append(("model", words.count(s.scene.total, "point")))
-    size = _measured(s.scene.points)
+    size = _measured(result.cloud)
     if size is not None:
         width, height, depth = size[1] - size[0]
         facts.append(("size x × y × z", f"{width:.2f} × {height:.2f} × {depth:.2f} m"))
@@ -160,7 +161,7 @@ def _model(s: Subject) -> Values:
         return {"scene": None, "still": "", "toggles": [], "thinned": ""}
     toggles = [("points", "Points", "", True)]
     if scene.normals is not None:
-        toggles.append(("peel", "See through walls from behind", "", True))
+        toggles.append(("peel", "Hide walls seen from behind", "", True))
     if len(scene.points):
         toggles.append(("height", "Colour by height", "", s.result.cloud.color is None))
     if len(scene.before):
@@ -181,11 +182,12 @@ def _model(s: Subject) -> Values:
     }
 
 
-def _measured(points: Float64, outer: float = _OUTER) -> Float64 | None:
-    """Return the (2, 3) low and high corners of all but the outermost points."""
+def _measured(cloud: Cloud, outer: float = _OUTER) -> Float64 | None:
+    """Return the (2, 3) low and high corners of all but the outermost points, world frame."""
+    points = cloud.points[np.isfinite(cloud.points).all(1)]
     if len(points) == 0:
         return None
-    return np.percentile(points, [outer, 100 - outer], axis=0)
+    return np.percentile(points, [outer, 100 - outer], axis=0).astype(float) + cloud.offset
 
 
 def _views(s: Subject) -> Values:
@@ -194,8 +196,8 @@ def _views(s: Subject) -> Values:
     if truth is not None:
         true = truth[np.isfinite(truth).all(1)].astype(float)
         true = true if len(true) else None
-    measured = _measured(points)
-    if measured is None:
+    measured = _measured(s.result.cloud)
+    if measured is None or len(points) == 0:
         return {"views": [], "sizes": [], "true_sizes": False, "views_legend": []}
     path = s.scene.after[:, :3, 3]
     figures = [
@@ -208,7 +210,7 @@ def _views(s: Subject) -> Values:
     if true is not None:
         legend.insert(0, ("bad", "6 3", "true outline"))
     sizes = []
-    whole = _measured(points, 0.0)
+    whole = _measured(s.result.cloud, 0.0)
     assert whole is not None
     for axis, name in enumerate(("x (width)", "y (height)", "z (depth)")):
         got = float(np.ptp(measured[:, axis]))
@@ -234,7 +236,7 @@ def _cameras(s: Subject) -> Values:
     groups = [before, after] + ([s.scene.reference] if s.reference is not None else [])
     for view, name in (("above", "from above"), ("side", "from the side")):
         flat = [plots.project(g[:, :3, 3], view) for g in groups]
-        box = plots.limits(*flat, least=0.01)
+        box = plots.limits(*flat, room=0.11, least=0.01)
         for poses, color, when in ((before, plots.BEFORE, "before"), (after, plots.AFTER, "after")):
             title = f"{when}, {name}"
             if len(poses):
@@ -310,7 +312,7 @@ def _error(s: Subject) -> Values:
     )
     legend = [("before", "6 3", "before optimisation"), ("after", "", "after optimisation")]
     if len(bad):
-        legend.append(("bad", "2 2", f"× {words.count(len(bad), 'frame')} without a pose"))
+        legend.append(("bad", "x", f"{words.count(len(bad), 'frame')} without a pose"))
     return {
         "error": figures,
         "error_title": title,
@@ -432,6 +434,7 @@ def _frames(s: Subject) -> Values:
         "health": [],
         "problems": [],
         "problems_more": "",
+        "health_legend": [],
     }
     if not records:
         return out | {"strip_label": "", "strip_hint": ""}
@@ -451,6 +454,8 @@ def _frames(s: Subject) -> Values:
     )
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]
+    if len(bad):
+        out["health_legend"] = [("bad", "x", "lost or skipped")]
     share = np.array([np.nan if r.inlier_share is None else r.inlier_share for r in records], float)
     rms = np.array([np.nan if r.rms_m is None else r.rms_m for r in records], float)
     for values, scale, ylabel, label in (
@@ -464,7 +469,7 @@ def _frames(s: Subject) -> Values:
     runs = words.runs((r.index, r.status, r.reason) for r in records)
     runs = [run for run in runs if run[3] != "tracked"]
     out["problems"] = [
-        (words.frame_range(a, b), f"{n:,}", status, words.sentence(why) or "–")
+        (words.frame_range(a, b), f"{n:,}", status, why or "–")
         for a, b, n, status, why in runs[:_ROWS]
     ]
     if len(runs) > _ROWS:
@@ -492,7 +497,7 @@ def _loops(s: Subject) -> Values:
         (
             f"{p.i} and {p.j}",
             "✓ accepted" if p.accepted else "✗ rejected",
-            words.sentence(p.reason) or "–",
+            p.reason or "–",
             words.share(p.overlap),
             words.length(p.rms_m),
             words.share(p.free_space_violation),

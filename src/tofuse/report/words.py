@@ -114,7 +114,9 @@ def findings(reasons: Sequence[Reason]) -> list[Finding]:
 def sentence(text: str) -> str:
     """End a text with a full stop and begin it with a capital."""
     text = text.strip()
-    text = text[:1].upper() + text[1:]
+    first = text.split(maxsplit=1)[:1]
+    if first and first[0].isalpha():  # a path or a number stays as it is
+        text = text[0].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) or not text else text + "."
 
 
