@@ -384,7 +384,7 @@ def _objective(s: Subject) -> Values:
 
 def _filters(s: Subject) -> Values:
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
-    here: dict[str, str] = {}
+    here: dict[str, tuple[int, int]] = {}  # points removed and seen; a name may come twice
     shown = []
     if steps:
         raw = steps[0][1]
@@ -396,7 +396,8 @@ def _filters(s: Subject) -> Values:
                 gone = len(last) - len(frame)
                 part = words.share(gone / len(last) if len(last) else None)
                 text = f"removed {part} ({gone:,} points), {len(frame):,} are left"
-                here[name] = part
+                before = here.get(name, (0, 0))
+                here[name] = (before[0] + gone, before[1] + len(last))
             else:
                 text = words.count(len(frame), "point")
             pictures = []
@@ -422,7 +423,11 @@ def _filters(s: Subject) -> Values:
                 "below, the points seen from above and to the side."
             )
     names = [*removed, *(n for n in here if n not in removed)]
-    rows = [(n, words.share(removed.get(n)), here.get(n, "–")) for n in names]
+    rows = []
+    for name in names:
+        gone, seen = here.get(name, (0, 0))
+        part = words.share(gone / seen) if seen else "–"
+        rows.append((name, words.share(removed.get(name)), part))
     return {"filter_rows": rows, "filter_steps": shown, "filter_note": note}
 
 

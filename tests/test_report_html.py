@@ -1,0 +1,598 @@
+"""The report: that it is one valid file, and that what it says is what came out."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.fusion.cloud import Cloud, CloudBuilder, CloudFusion, empty_cloud
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.posegraph.graph import LoopRecord, PoseGraph
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.report.extras import ReportExtras
+from tofuse.report.html import write_report
+from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
+
+# A room of 6.0 x 2.5 x 3.2 m around the first camera, and two blocks in it.
+ROOM = np.array([[-3.4, -1.4, -1.5], [2.6, 1.1, 1.7]])
+BLOCKS = np.array([[[1.2, 0.3, 0.6], [1.9, 1.1, 1.2]], [[-2.6, -0.2, -1.0], [-2.0, 1.1, -0.4]]])
+
+
+def cast(origin, rays):
+    """Range along rays to the room's walls or a block in front of them, by the slab method."""
+    with np.errstate(divide="ignore"):
+        inverse = 1 / rays
+    near, far = ((bound - origin) * inverse for bound in ROOM)
+    best = np.maximum(near, far).min(-1)
+    for block in BLOCKS:
+        a, b = ((bound - origin) * inverse for bound in block)
+        enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+        best = np.where((enter < leave) & (enter > 0), np.minimum(best, enter), best)
+    return best
+
+
+def circle(frames):
+    """T_world_camera of a camera that turns once about an axis 0.15 m behind it."""
+    angle = np.linspace(0, 2 * np.pi, frames, endpoint=False)
+    poses = se3.exp(np.stack([0 * angle] * 4 + [angle, 0 * angle], axis=-1))
+    arm = np.eye(4)
+    arm[2, 3] = 0.15
+    poses = poses @ arm
+    return se3.inverse(poses[0]) @ poses
+
+
+def view(k, T, camera, rng):
+    flat = camera.rays().reshape(-1, 2).astype(float)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    world = rays @ T[:3, :3].T
+    z = cast(T[:3, 3], world)
+    hit = T[:3, 3] + world * z[:, None]
+    shape = (camera.height, camera.width)
+    texture = 0.6 + 0.3 * np.sign(np.sin(5 * hit).prod(1))
+    amplitude = (4000 * texture / (z**2 + 0.3)).astype(np.float32).reshape(shape)
+    depth = (z + rng.normal(0, 0.012, len(z))).astype(np.float32).reshape(shape)
+    depth[rng.random(shape) < 0.01] *= 0.8
+    return RangeFrame(k, k / 10, camera, depth, "z", amplitude)
+
+
+def make_room(frames=24, width=64, height=48):
+    rng = np.random.default_rng(5)
+    camera = Pinhole(width, height, width * 1.4, width * 1.4, width / 2, height / 2)
+    truth = circle(frames)
+    share = np.linspace(0, 1, frames)
+    drift = np.stack(
+        [0.21 * share**2, 0.06 * share, -0.12 * share, 0 * share, 0.09 * share, 0 * share], -1
+    )
+    sequential = truth @ se3.exp(drift)
+    estimate = truth @ se3.exp(0.06 * drift)
+    views = [view(k, T, camera, rng) for k, T in enumerate(truth)]
+    builder = CloudBuilder(CloudFusion(), 0.03)
+    for frame, T in zip(views, estimate, strict=True):
+        builder.add(frame, T)
+    records = [
+        FrameRecord(k, k / 10, "tracked", "", 0.97, 0.7 + 0.1 * np.sin(k / 3), 0.011)
+        for k in range(frames)
+    ]
+    records[5] = FrameRecord(
+        5, 0.5, "predicted", "a flat wall holds only 3 of 6 directions", 0.9, 0.4, 0.03
+    )
+    for k in (9, 10):
+        records[k] = FrameRecord(
+            k, k / 10, "lost", "too few correspondences: 31 of 1000", 0.8, 0.031, 0.09
+        )
+        estimate[k] = sequential[k] = np.nan
+    records[15] = FrameRecord(15, 1.5, "skipped", "depth/000015.png: is truncated")
+    estimate[15] = sequential[15] = np.nan
+    loops = (
+        LoopRecord(0, frames - 1, True, "", 0.62, 0.014, 0.01),
+        LoopRecord(2, frames - 2, False, "overlap is below 25 %", 0.18, 0.05, None),
+    )
+    objective = tuple(3.1 * np.exp(-0.4 * np.arange(14)) + 0.01)
+    diagnostics = Diagnostics(
+        "degraded",
+        (
+            Reason("lost_frames", (9, 10), "2 readable frames have no pose"),
+            Reason("unreadable_frames", (15, 15), "1 frame could not be read and was skipped"),
+        ),
+        tuple(records),
+        loops,
+        sequential,
+        objective,
+        {"confidence": 0.081, "neighbours": 0.5},
+        {
+            "read": 0.31,
+            "filter": 0.92,
+            "odometry": 2.4,
+            "loops": 0.6,
+            "optimise": 0.05,
+            "fuse": 0.4,
+        },
+    )
+    result = Reconstruction(
+        estimate,
+        np.arange(frames) / 10,
+        PoseGraph.empty(),
+        builder.finish(),
+        diagnostics,
+        {"method": "thesis", "filters": [{"part": "confidence", "minimum": 4}]},
+        {"path": "room", "format": "native", "frames": frames, "warnings": ["no timestamps.txt"]},
+        7,
+        2,
+    )
+    raw = views[0]
+    step1 = raw.keep(np.asarray(raw.amplitude_image > 700))
+    step2 = step1.keep(rng.random(step1.valid.shape) < 0.5)
+    surface = rng.uniform(*ROOM, (4000, 3))
+    axis = rng.integers(0, 3, 4000)
+    surface[np.arange(4000), axis] = ROOM[rng.integers(0, 2, 4000), axis]
+    extras = ReportExtras(
+        "room <simulated>",
+        (("raw", raw), ("confidence", step1), ("neighbours", step2)),
+        truth,
+        surface.astype(np.float32),
+        tuple(views[::4]),
+    )
+    return result, extras
+
+
+@cache
+def room():
+    return make_room()
+
+
+def lonely(**changes):
+    """A result with one frame of a bare cloud, and nothing else."""
+    cloud = Cloud(
+        np.array([[0, 0, 1], [0.1, 0, 1], [0, 0.2, 1.1]], np.float32),
+        None,
+        None,
+        np.ones(3, np.int32),
+        np.zeros(3),
+    )
+    diagnostics = Diagnostics(
+        "good",
+        (Reason("single_frame", (0, 0), ""),),
+        (FrameRecord(0, 0.0, "tracked"),),
+        (),
+        np.eye(4)[None],
+        (),
+        {},
+        {},
+    )
+    whole = Reconstruction(
+        np.eye(4)[None], np.zeros(1), PoseGraph.empty(), cloud, diagnostics, {}, {}, 0, 1
+    )
+    inner = {k: v for k, v in changes.items() if k in Diagnostics.__dataclass_fields__}
+    outer = {k: v for k, v in changes.items() if k not in inner}
+    return replace(whole, **outer, diagnostics=replace(diagnostics, **inner))
+
+
+class Page(HTMLParser):
+    """Text of each section and of all tables, addresses, identifiers; tags must balance."""
+
+    VOID = frozenset({"meta", "link", "img", "br", "input", "hr"})
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.sections, self.links, self.ids, self.scripts = [], {}, [], [], []
+        self.rows, self.images, self.titles = [], [], []
+        self.section = None
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "section":
+            self.section = attrs["id"]
+            self.sections[self.section] = ""
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag == "img":
+            assert attrs["alt"]
+            self.images.append(attrs["src"])
+        self.ids += [attrs["id"]] if "id" in attrs else []
+        self.links += [v for k, v in attrs.items() if k in ("href", "src", "xlink:href", "action")]
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+        if tag == "section":
+            self.section = None
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "script":
+            self.scripts.append(data)
+            return
+        if self.open and self.open[-1] == "title" and "svg" in self.open:
+            self.titles.append(data)
+        if self.section:
+            self.sections[self.section] += data
+        if "td" in self.open or "th" in self.open:
+            self.rows[-1][-1] += data
+
+    def row(self, *start):
+        """The one table row that begins with these cells."""
+        (found,) = [r for r in self.rows if tuple(r[: len(start)]) == start]
+        return found
+
+
+def page(folder, result, extras):
+    path = Path(folder) / "report.html"
+    write_report(result, path, extras)
+    assert [p.name for p in Path(folder).iterdir()] == ["report.html"]
+    return Page(path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    return page(tmp_path_factory.mktemp("room"), *room())
+
+
+ORDER = [
+    "verdict",
+    "model",
+    "views",
+    "cameras",
+    "error",
+    "objective",
+    "filters",
+    "frames",
+    "loops",
+    "recording",
+    "timings",
+    "settings",
+    "reading",
+]
+
+
+def test_sections_come_in_order_and_the_verdict_first(shown):
+    assert list(shown.sections) == ORDER
+    text = " ".join(shown.sections["verdict"].split())
+    assert "Degraded: use this model with care. 2 readable frames have no pose." in text
+    assert "Look first at frames 9–10." in text
+    for name, number in (("tracked", 20), ("predicted", 1), ("lost", 2), ("skipped", 1)):
+        assert f"frames {name}{number}" in text
+    assert f"{len(room()[0].cloud):,} points" in text
+
+
+def test_nothing_is_fetched_from_elsewhere(shown, tmp_path):
+    assert shown.links
+    assert all(link.startswith(("#", "data:")) for link in shown.links)
+    write_report(room()[0], tmp_path / "r.html", room()[1])
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "://" not in text
+    assert "@import" not in text
+    assert "default-src 'none'" in text
+    assert not re.search(r"url\((?!#)", text)
+    assert len(text) < 20e6
+
+
+def test_identifiers_are_unique_and_contents_lead_somewhere(shown):
+    assert len(shown.ids) == len(set(shown.ids))
+    anchors = {link[1:] for link in shown.links if link.startswith("#")}
+    assert anchors <= set(shown.ids)
+    assert set(ORDER) <= anchors
+
+
+def test_same_result_gives_the_same_file(tmp_path):
+    result, extras = room()
+    for name in "ab":
+        write_report(result, tmp_path / name, extras)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_errors_shown_are_those_against_the_reference(shown):
+    result, extras = room()
+    assert "Estimated minus reference" in shown.sections["error"]
+    for name, poses in (("Before", result.diagnostics.sequential), ("After", result.trajectory)):
+        error = poses[:, :3, 3] - extras.reference[:, :3, 3]
+        error = error[np.isfinite(error[:, 0])]
+        row = shown.row(f"{name}, rms")
+        expected = [*np.sqrt((error**2).mean(0)), np.sqrt((error**2).sum(1).mean())]
+        for cell, value in zip(row[1:5], expected, strict=True):
+            number, unit = cell.split()
+            assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(value, rel=0.06)
+    last = se3.angle(se3.inverse(extras.reference[-1]) @ result.diagnostics.sequential[-1])
+    assert shown.row("Before, at the last frame")[5] == f"{np.degrees(last):.2f}°"
+    worst = np.nanargmax(
+        np.linalg.norm(
+            result.trajectory[:, :3, 3] - result.diagnostics.sequential[:, :3, 3], axis=1
+        )
+    )
+    assert f"most at frame {worst}." in shown.sections["cameras"]
+
+
+def test_without_a_reference_the_displacement_is_shown(tmp_path):
+    result, extras = room()
+    got = page(tmp_path, result, replace(extras, reference=None))
+    assert "Displacement from the first camera" in got.sections["error"]
+    moved = np.abs(result.trajectory[-1, 0, 3] - result.trajectory[0, 0, 3])
+    number, unit = got.row("After, at the last frame")[1].split()
+    assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(moved, rel=0.06)
+
+
+def test_true_and_measured_sizes(shown, tmp_path):
+    result, extras = room()
+    row = shown.row("x (width)")
+    low, high = np.percentile(result.cloud.points[:, 0], [0.25, 99.75])
+    assert row[1:3] == ["6.00 m", f"{high - low:.2f} m"]
+    bare = page(tmp_path, result, replace(extras, truth_points=None))
+    assert bare.row("x (width)")[1] == f"{high - low:.2f} m"
+    assert "true outline" not in bare.sections["views"]
+
+
+def test_filters_show_the_share_of_the_recording_and_of_the_frame(shown):
+    result, extras = room()
+    (_, raw), (_, first), (_, second) = extras.filter_steps
+    here = [1 - len(first) / len(raw), 1 - len(second) / len(first)]
+    for name, part in zip(("confidence", "neighbours"), here, strict=True):
+        whole = result.diagnostics.removed[name]
+        assert shown.row(name) == [name, f"{100 * whole:.1f} %", f"{100 * part:.1f} %"]
+
+
+def test_each_frame_says_why_it_is_lost(shown):
+    assert len([t for t in shown.titles if t.startswith("Frame ")]) == 24
+    assert any(
+        t.startswith("Frame 9: lost – too few correspondences: 31 of 1000") for t in shown.titles
+    )
+    assert shown.row("frames 9–10")[1:] == ["2", "lost", "too few correspondences: 31 of 1000"]
+    assert shown.row("frame 15")[2:] == ["skipped", "depth/000015.png: is truncated"]
+
+
+def test_loops_timings_and_objective(shown):
+    assert shown.row("0 and 23")[1:] == ["✓ accepted", "–", "62.0 %", "14 mm", "1.0 %"]
+    assert shown.row("2 and 22")[1:3] == ["✗ rejected", "overlap is below 25 %"]
+    assert shown.row("odometry")[1] == "2.4 s"
+    assert shown.row("total")[1] == "4.7 s"
+    objective = room()[0].diagnostics.objective
+    assert f"From {objective[0]:.4g} to {objective[-1]:.4g} in 13" in shown.sections["objective"]
+    assert '"minimum": 4' in shown.sections["settings"]
+    assert "no timestamps.txt" in shown.sections["settings"]
+
+
+def decode(text, kind):
+    return np.frombuffer(base64.b64decode(text), kind).reshape(-1, 3)
+
+
+def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
+    result, _ = room()
+    scene = json.loads(shown.scripts[0])
+    points = np.array(scene["low"]) + decode(scene["points"], "<u2") / 65535 * scene["extent"]
+    np.testing.assert_allclose(points, result.cloud.points, atol=1e-4)
+    np.testing.assert_array_equal(decode(scene["colors"], np.uint8), result.cloud.color)
+    normals = decode(scene["normals"], np.int8) / 127
+    np.testing.assert_allclose(normals, result.cloud.normals, atol=0.01)
+    loops = decode(scene["lines"]["loops"], "<f4")
+    np.testing.assert_allclose(loops, result.trajectory[[0, 23], :3, 3], atol=1e-6)
+    for name, poses in (("before", result.diagnostics.sequential), ("after", result.trajectory)):
+        ends = decode(scene["lines"][name], "<f4")
+        for center in poses[np.isfinite(poses[:, 0, 0]), :3, 3]:
+            assert np.abs(ends - center).max(1).min() < 1e-6
+
+
+def test_viewer_thins_a_large_model(tmp_path):
+    points = np.random.default_rng(1).uniform(-2, 2, (200_000, 3)).astype(np.float32)
+    cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([10.0, 0, 0]))
+    got = page(tmp_path, lonely(cloud=cloud), ReportExtras("large"))
+    scene = json.loads(got.scripts[0])
+    assert scene["count"] == len(decode(scene["points"], "<u2")) == 150_000
+    assert scene["normals"] is None
+    assert scene["center"][0] == pytest.approx(10, abs=0.1)  # the offset counts
+    assert "150,000 of 200,000 points are shown" in got.sections["model"]
+
+
+def test_what_comes_from_outside_is_escaped(tmp_path):
+    bad = "</script><script>alert('1')</script><b>&"
+    result, extras = room()
+    d = result.diagnostics
+    result = replace(
+        result,
+        config={"method": bad, bad: bad},
+        recording={"path": bad, "format": bad, "frames": 1, "warnings": [bad]},
+        diagnostics=replace(
+            d,
+            reasons=(Reason("lost_frames", (1, 2), bad),),
+            frames=(*d.frames[:-1], replace(d.frames[-1], status="lost", reason=bad)),
+            loops=(replace(d.loops[0], reason=bad),),
+            removed={bad: 0.5},
+            seconds={bad: 1.0},
+        ),
+    )
+    steps = ((bad, extras.filter_steps[0][1]), (bad, extras.filter_steps[1][1]))
+    write_report(result, tmp_path / "r.html", replace(extras, title=bad, filter_steps=steps))
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "alert('1')" not in text
+    assert "<b>" not in text
+    got = Page(text)
+    assert len(got.scripts) == 2
+    for name in ("verdict", "filters", "frames", "loops", "timings", "settings"):
+        assert "alert(" in got.sections[name]
+
+
+def many(number):
+    """A long recording whose every third frame is lost, for another reason each time."""
+    frames = [
+        FrameRecord(
+            k, k / 10, "lost" if k % 3 == 1 else "tracked", f"reason {k}" if k % 3 == 1 else ""
+        )
+        for k in range(number)
+    ]
+    poses = np.tile(np.eye(4), (number, 1, 1))
+    poses[:, 0, 3] = np.arange(number) * 0.01
+    poses[1::3] = np.nan
+    loops = tuple(LoopRecord(k, k + 50, False, "too far") for k in range(300))
+    return lonely(
+        trajectory=poses,
+        timestamps=np.arange(number) / 10,
+        sequential=poses,
+        frames=tuple(frames),
+        loops=loops,
+    )
+
+
+def test_a_long_recording_stays_readable(tmp_path):
+    got = page(tmp_path, many(2000), ReportExtras("long"))
+    titles = [t for t in got.titles if t.startswith("Frame ")]
+    assert len(titles) == 500
+    assert all("lost" in t for t in titles)  # a cell shows the worst of its frames
+    assert "517 more are not shown" in got.sections["frames"]
+    assert "150 more are not shown" in got.sections["loops"]
+
+
+def cloud_frame():
+    return CloudFrame.of(np.random.default_rng(0).normal(0, 1, (500, 3)), index=4)
+
+
+def unlit():
+    return RangeFrame(0, 0.0, Pinhole(8, 6, 8, 8, 4, 3), np.zeros((6, 8), np.float32))
+
+
+POOR = {
+    "one cloud": (
+        lonely(),
+        ReportExtras("x", (("raw", cloud_frame()),), None, None, (cloud_frame(),)),
+    ),
+    "nothing read": (
+        lonely(
+            trajectory=np.zeros((0, 4, 4)),
+            timestamps=np.zeros(0),
+            cloud=empty_cloud(),
+            frames=(),
+            sequential=np.zeros((0, 4, 4)),
+            reasons=(),
+            verdict="failed",
+        ),
+        ReportExtras("x"),
+    ),
+    "all lost": (
+        lonely(
+            trajectory=np.full((2, 4, 4), np.nan),
+            timestamps=np.zeros(2),
+            cloud=empty_cloud(),
+            frames=(FrameRecord(0, 0.0, "lost", "why"), FrameRecord(1, 1.0, "lost", "why")),
+            sequential=np.full((2, 4, 4), np.nan),
+            reasons=(Reason("few_poses", (0, 1), "no frame has a pose"),),
+            verdict="failed",
+        ),
+        ReportExtras("x", reference=np.tile(np.eye(4), (2, 1, 1))),
+    ),
+    "cameras without a model": (lonely(cloud=empty_cloud()), ReportExtras("x")),
+    "one point": (
+        lonely(
+            cloud=Cloud(np.ones((1, 3), np.float32), None, None, np.ones(1, np.int32), np.zeros(3))
+        ),
+        ReportExtras("x", truth_points=np.ones((1, 3), np.float32)),
+    ),
+    "objective of zero": (lonely(objective=(0.5, 0.0, 0.0)), ReportExtras("x")),
+    "objective of one value": (lonely(objective=(0.5,)), ReportExtras("x")),
+    "no valid pixel": (
+        lonely(),
+        ReportExtras("x", (("raw", unlit()), ("median", unlit())), None, None, (unlit(),)),
+    ),
+    "camera that stands still": (
+        lonely(
+            trajectory=np.tile(np.eye(4), (3, 1, 1)),
+            timestamps=np.arange(3.0),
+            sequential=np.tile(np.eye(4), (3, 1, 1)),
+            frames=tuple(FrameRecord(k, k, "tracked", "", 0.0, 0.0, 0.0) for k in range(3)),
+        ),
+        ReportExtras("x", reference=np.full((3, 4, 4), np.nan)),
+    ),
+    "skipped frames without a row": (
+        lonely(
+            trajectory=np.tile(np.eye(4), (2, 1, 1)),
+            timestamps=np.arange(2.0),
+            sequential=np.tile(np.eye(4), (2, 1, 1)),
+            frames=tuple(
+                FrameRecord(k, k, status)
+                for k, status in enumerate(("tracked", "skipped", "tracked"))
+            ),
+            loops=(LoopRecord(0, 2, True, ""), LoopRecord(0, 7, True, "")),
+        ),
+        ReportExtras("x"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", POOR)
+def test_poor_results_give_a_sensible_report(name, tmp_path):
+    result, extras = POOR[name]
+    got = page(tmp_path, result, extras)
+    assert [s for s in ORDER if s != "recording" or extras.thumbnails] == list(got.sections)
+    for section, text in got.sections.items():
+        assert len(text.split()) > 4, section
+        assert not re.search(r"\b(nan|None|inf)\b", text), section
+    verdict = result.diagnostics.verdict.capitalize()
+    assert f"{verdict}:" in got.sections["verdict"]
+
+
+def test_poor_results_say_what_is_missing(tmp_path):
+    got = page(tmp_path, *POOR["one cloud"])
+    assert "Nothing was optimised" in got.sections["objective"]
+    assert "No loop was found" in got.sections["loops"]
+    assert "Every frame was tracked." in got.sections["frames"]
+    assert "Good: the only frame has a pose" in got.sections["verdict"]
+    (tmp_path / "report.html").unlink()
+    got = page(tmp_path, *POOR["all lost"])
+    assert "Failed: do not rely on this model; 0 of 2 readable frames have a pose." in " ".join(
+        got.sections["verdict"].split()
+    )
+    assert "There is nothing to show" in got.sections["model"]
+
+
+def test_an_unwritable_place_leaves_nothing(tmp_path):
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(OSError, match="report"):
+        write_report(lonely(), tmp_path / "report.html", ReportExtras("x"))
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+BROWSER = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine to open the report with")
+def test_a_browser_opens_it_without_complaint(tmp_path):
+    result, extras = room()
+    write_report(result, tmp_path / "report.html", extras)
+    options = (
+        "--headless --no-sandbox --no-first-run --disable-background-networking --disable-sync "
+        "--disable-component-update --use-gl=angle --use-angle=swiftshader "
+        "--enable-unsafe-swiftshader --enable-logging=stderr --virtual-time-budget=2000 --dump-dom"
+    )
+    done = subprocess.run(
+        [
+            BROWSER,
+            *options.split(),
+            f"--user-data-dir={tmp_path / 'profile'}",
+            (tmp_path / "report.html").as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert "CONSOLE" not in done.stderr, done.stderr
+    # "live" with WebGL, "without" where the machine has none; neither would mean a broken script.
+    assert re.search(r'<div id="viewer" class="(live|without)">', done.stdout)
