@@ -165,7 +165,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         emit(data)
         return 0
     table = Table.grid(padding=(0, 2))
-    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of the reference)")
+    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of those known)")
     table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
     table.add_row("ATE largest", f"{error.ate_max_m:.4f} m")
     for r in error.relative:
@@ -177,7 +177,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     if recording is not None:
         m = data["map_consistency"]
         value = "no two images overlap enough"
-        if m["pairs"]:
+        if m["rms_m"] is not None:
             value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
     Console(highlight=False, soft_wrap=True).print(table)

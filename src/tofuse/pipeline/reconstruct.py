@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.ply import read_ply
 from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
@@ -129,12 +130,22 @@ def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 
     return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
 
 
-def truth_points(recording: Recording, count: int = 200_000) -> NDArray[np.float32] | None:
+def truth_points(recording: Recording, count: int = 100_000) -> NDArray[np.float32] | None:
     """Return points (K, 3) on the true surfaces of a simulated recording, in its world frame."""
     path = Path(recording.path) / "truth" / "surface.ply"
     if not path.is_file():
         return None
-    from tofuse.files.ply import read_ply
-
-    points: NDArray[np.float32] = read_ply(path).points
-    return points[:: max(1, len(points) // count)]
+    truth = read_ply(path)
+    if truth.faces is None or len(truth.faces) == 0:
+        return truth.points
+    corners = truth.points[truth.faces].astype(float)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    rng = np.random.default_rng(0)
+    chosen = corners[rng.choice(len(corners), count, p=area / area.sum())]
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    points = chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
+    return points.astype(np.float32)

@@ -21,7 +21,7 @@ from tofuse.posegraph.g2o import write_g2o
 from tofuse.results.types import Reconstruction
 
 STAGING = ".tofuse-unfinished"
-EXTRA = ("recording",)  # what `tofuse demo` puts beside its result
+RECORDING = "recording"  # what `tofuse demo` puts beside its result
 
 
 class OutputFolder:
@@ -57,7 +57,7 @@ class OutputFolder:
         entries -= {STAGING}
         if not entries:
             return
-        if not is_result(self.path) and entries - set(EXTRA):
+        if not is_result(self.path) and entries - {RECORDING}:
             raise OutputError(
                 "is not empty and holds no earlier result of tofuse",
                 where=self.path,
