@@ -18,7 +18,9 @@ from tofuse.simulation.effects import Effects, Flag
 from tofuse.simulation.render import Rendered, render
 from tofuse.simulation.scene import Hits, Sequence, build
 
-MODEL = replace(camera_model("sr4000"), camera=Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5))
+SMALL = Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5)
+# Sharp, so that sums over sub-rays can be told exactly.
+MODEL = replace(camera_model("sr4000"), camera=SMALL, blur_px=0.0)
 CENTRE = (18, 22)
 
 
@@ -215,6 +217,20 @@ def test_mixed_pixel_can_lie_outside_of_both_surfaces() -> None:
     seen = ranges(scene, Effects.none(mixed_pixels=True))[18, 25]
     assert not near < seen < far * 1.02
     assert ranges(scene, Effects.none())[18, 25] == pytest.approx(far, rel=0.02)
+
+
+def test_blurred_edge_is_wider_and_keeps_to_its_place() -> None:
+    scene = edge(1.2, 2.2, 24.5)
+    sharp, soft = (
+        shoot(scene, Effects.none(mixed_pixels=True), model=replace(MODEL, blur_px=blur))
+        for blur in (0.0, 0.75)
+    )
+    between = [int(((r.frame.z[18] > 1.25) & (r.frame.z[18] < 2.15)).sum()) for r in (sharp, soft)]
+    assert between[0] <= 1
+    assert 2 <= between[1] <= 4
+    np.testing.assert_allclose(soft.frame.depth[:, :20], sharp.frame.depth[:, :20], atol=2e-4)
+    assert (soft.flags[:, 24:26] & Flag.MIXED).all()
+    assert not (soft.flags[:, :20] & Flag.MIXED).any()
 
 
 def test_range_beyond_the_period_comes_back_short() -> None:

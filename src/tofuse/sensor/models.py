@@ -56,6 +56,8 @@ class CameraModel:
     falloff
         Light in a pixel falls as the cosine of its angle to the axis to this power (lens and
         illumination, half each).
+    blur_px
+        Standard deviation of the lens's sharp image of a point, in pixels.
     amplitude_kind
         "raw", "ir", or "range_compensated": multiplied by the square of the measured range and
         divided by the falloff, as the SR4000 does.
@@ -91,6 +93,7 @@ class CameraModel:
     ambient_electrons: float = 1500.0
     counts_per_electron: float = 0.064
     falloff: float = 4.0
+    blur_px: float = 0.3
     amplitude_kind: Literal["raw", "range_compensated", "ir"] = "raw"
     minimum_amplitude: float = 0.0
     confidence_thresholds: tuple[float, ...] = ()
@@ -151,6 +154,7 @@ CAMERAS: dict[str, CameraModel] = {
             signal_electrons=68_000.0,
             read_noise_electrons=45.0,
             full_well_electrons=180_000.0,
+            blur_px=0.9,
             amplitude_kind="range_compensated",
             confidence_thresholds=(10.5, 16.4, 24.0, 33.0, 47.8, 73.1, 136.0),
         ),

@@ -29,7 +29,8 @@ class Effects:
     under_exposure
         Cameras that drop weak pixels drop them (the SR4000 never does: it gives noise).
     mixed_pixels
-        Light of several sub-rays adds up in a pixel as phasors: "flying" pixels.
+        Light of several sub-rays, and of neighbours through the blur of the lens, adds up in a
+        pixel as phasors: "flying" pixels.
     wrap
         Ranges beyond one period come back as short ones.
     scatter
@@ -122,7 +123,7 @@ class Flag(IntFlag):
     """A bucket overflowed in at least one phase image."""
     MIXED = 8
     """Sub-rays of the pixel lie more than 2 cm and 1 % of the range off the surface at its
-    centre."""
+    centre, or the blur of the lens moves the range by more than 2 cm."""
     WRAPPED = 16
     """Measured in another period than the true one (beyond the ambiguity, or unwrapped wrongly)."""
     MULTIPATH = 32

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import phasor
@@ -346,6 +347,17 @@ def combine(weights: Float64, light: Float64) -> Float64:
         b = light[..., c] + 1j * light[..., c + 1]
         out[..., c], out[..., c + 1] = (a * b).real, (a * b).imag
     return out
+
+
+def blurred(images: Float64, sigma_px: float) -> Float64:
+    """Images (..., H, W) as a lens shows them that spreads a point by sigma_px."""
+    if sigma_px == 0:
+        return images
+    radius = int(np.ceil(3 * sigma_px))
+    weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma_px) ** 2)
+    weights /= weights.sum()
+    rows = ndimage.correlate1d(images, weights, -2, mode="nearest")
+    return np.asarray(ndimage.correlate1d(rows, weights, -1, mode="nearest"))
 
 
 class LensScatter:

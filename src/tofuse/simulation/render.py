@@ -139,8 +139,22 @@ def _same(a: tuple[Float64, Float64 | None], b: tuple[Float64, Float64 | None]) 
 
 @dataclass(frozen=True, eq=False)
 class _PhaseImages:
-    """Correlations (F, 4, H, W) before scattering, with and without bounces; and totals."""
+    """Light of the phase images before scattering in the lens.
 
+    Attributes
+    ----------
+    sharp, direct, lit
+        (F, 4, H, W) correlations of direct light, before and after the lens's blur, and with what
+        came by a bounce.
+    total
+        (F, 4, H, W) all modulated light.
+    albedo
+        (H, W) what the surface scatters.
+    unsmeared
+        (H, W) phasor of direct light, had nothing moved; None where nothing did.
+    """
+
+    sharp: Float64
     direct: Float64
     lit: Float64
     total: Float64
@@ -168,6 +182,9 @@ class _PhaseImages:
         out = np.zeros(self.direct.shape[2:], np.uint16)
         lit = sensor.phasor_of(self.lit[0])
         direct = sensor.phasor_of(self.direct[0])
+        if effects.mixed_pixels:
+            sharp = sensor.phasor_of(self.sharp[0])
+            out |= _bit(_apart(model, direct, sharp, _MIXED_M), Flag.MIXED)
         if effects.multipath:
             out |= _bit(_apart(model, lit, direct), Flag.MULTIPATH)
         if self.unsmeared is not None:
@@ -182,10 +199,12 @@ def _bit(mask: NDArray[np.bool_], flag: Flag) -> UInt16:
     return np.where(mask, np.uint16(flag), np.uint16(0))
 
 
-def _apart(model: CameraModel, a: sensor.Complex, b: sensor.Complex) -> NDArray[np.bool_]:
-    """Where two phasors differ notably in range; nowhere if one has no light."""
+def _apart(
+    model: CameraModel, a: sensor.Complex, b: sensor.Complex, limit_m: float = _NOTABLE_M
+) -> NDArray[np.bool_]:
+    """Where two phasors differ in range by more than a limit; nowhere if one has no light."""
     turn = np.abs(np.angle(a * np.conj(b))) / (2 * np.pi) * model.period_m
-    return (turn > _NOTABLE_M) & (np.abs(a) > 0) & (np.abs(b) > 0)
+    return (turn > limit_m) & (np.abs(a) > 0) & (np.abs(b) > 0)
 
 
 def _phase_images(
@@ -204,14 +223,18 @@ def _phase_images(
                 extra = optics.combine(light.weights[f], bounced[f])
                 lit[f, k] += sensor.correlate(extra, k, harmonics)
                 total[f, k] += extra[..., 0]
+    sharp = direct
+    if effects.mixed_pixels:
+        direct, lit, total = (optics.blurred(x, model.blur_px) for x in (direct, lit, total))
     unsmeared = None
     if len(taps) > 1:
         light = np.mean([tap.direct[0] for tap in taps], axis=0)
-        unsmeared = sensor.phasor_of(
-            np.stack([sensor.correlate(light, k, harmonics) for k in range(sensor.TAPS)])
-        )
+        static = np.stack([sensor.correlate(light, k, harmonics) for k in range(sensor.TAPS)])
+        if effects.mixed_pixels:
+            static = optics.blurred(static, model.blur_px)
+        unsmeared = sensor.phasor_of(static)
     albedo = taps[len(taps) // 2].weights[0, ..., 0]
-    return _PhaseImages(direct, lit, total, albedo, unsmeared)
+    return _PhaseImages(sharp, direct, lit, total, albedo, unsmeared)
 
 
 def _offset(model: CameraModel, effects: Effects, ranges: Float64, time_s: float) -> Float64:
