@@ -18,6 +18,7 @@ from tofuse.geometry.se3 import check_pose
 from tofuse.recordings.frames import DepthKind
 
 SCHEMA = 1
+MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
 AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
@@ -134,6 +135,8 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     if not (clouds and "model" not in data):
         camera, size = _lens(get)
         unit = get.positive("depth_unit_m", needed=True) or 0.001
+        if not 1e-9 <= unit <= 1:
+            raise get.error("depth_unit_m", f"is {unit}", "give the metres of one count, at most 1")
         kind = get.choice("depth_kind", ("z", "range"), needed=True)  # type: ignore[assignment]
         color = _color(get)
     return CameraFile(
@@ -189,7 +192,10 @@ def read_rays(path: Path) -> RayTable:
             raise ValueError("no array of floats")
         if table.ndim != 3 or table.shape[2] != 2:
             raise ValueError(f"shape {table.shape}, not (H, W, 2)")
-        return RayTable(np.array(table, np.float32))
+        rays = np.array(table, float)
+        if (np.abs(rays[np.isfinite(rays)]) > MAX_SLOPE).any():
+            raise ValueError("rays at right angles to the axis and beyond")
+        return RayTable(np.where(np.isfinite(rays), rays, np.nan).astype(np.float32))
     except OSError as error:
         raise input_error(error, path) from error
     except InputError as error:
@@ -300,11 +306,30 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
     cls = MODELS[model]
     known = {f.name for f in fields(cls)}
     values = {name: v for name, v in values.items() if name in known}
+    return checked_lens(cls, size, values, get.where), size
+
+
+def checked_lens(
+    cls: type[Pinhole], size: tuple[int, int], values: dict[str, float], where: str | Path
+) -> Pinhole:
+    """Make a camera of numbers from a file.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the number, if it isn't finite or can't be true.
+    """
+    for name, value in values.items():
+        low = 0.01 if name in ("fx", "fy") else -1e6
+        if not low <= value <= 1e6:
+            raise InputError(
+                f"is {value}", where=f"{where}: {name}", remedy=f"give {low:g} to 1000000"
+            )
     try:
-        return cls(size[0], size[1], **values), size
+        return cls(size[0], size[1], **values)
     except InputError as error:
         raise InputError(
-            error.problem, where=f"{get.where}: {error.where}", remedy=error.remedy
+            error.problem, where=f"{where}: {error.where}", remedy=error.remedy
         ) from error
 
 

@@ -148,11 +148,12 @@ def _parts(path: Path) -> list[_Found]:
 
 def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
     if sniffs:
-        name, sniff = max(sniffs.items(), key=lambda item: item[1].confidence)
+        saw = "; ".join(dict.fromkeys(sniff.saw for sniff in sniffs.values()))
+        settle = [sniff.settle or f"give --format {name}" for name, sniff in sniffs.items()]
         return InputError(
-            f"may be a recording of the format {name}, but isn't surely one: there is {sniff.saw}",
+            f"isn't surely a recording: there is {saw}",
             where=path,
-            remedy=sniff.settle or f"give --format {name}",
+            remedy=", or ".join(dict.fromkeys(settle)),
         )
     if path.is_dir():
         kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)

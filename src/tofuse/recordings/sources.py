@@ -21,6 +21,9 @@ from tofuse.recordings.recording import Source
 Float64 = NDArray[np.float64]
 
 
+FARTHEST_M = 1e9  # beyond it, a coordinate is damage
+
+
 class FileSource(ABC):
     """A source whose frames are files; any trouble with one of them is that frame's alone."""
 
@@ -111,7 +114,7 @@ def cloud_frame(
     color: NDArray[np.uint8] | None = None,
     origin: Float64 | None = None,
 ) -> CloudFrame:
-    """Make a view of (N, 3) points and what is known of each, dropping those not finite."""
+    """Make a view of (N, 3) points and what is known of each, dropping what is no measurement."""
     frame = CloudFrame(
         index,
         timestamp,
@@ -121,8 +124,9 @@ def cloud_frame(
         color=color,
         origin=np.zeros(3) if origin is None else origin,
     )
-    finite = np.asarray(np.isfinite(points).all(1))
-    return frame if finite.all() else frame.keep(finite)
+    # Not-a-number compares false; what is left has squares that float32 can hold.
+    measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
+    return frame if measured.all() else frame.keep(measured)
 
 
 class JoinedSource:

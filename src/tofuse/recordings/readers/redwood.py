@@ -14,7 +14,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.camera_file import checked_lens, read_json
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import SURE, UNSURE, ReaderOptions, Sniff
 from tofuse.recordings.sources import read_matrix_pose
@@ -111,12 +111,8 @@ def _read_intrinsics(path: Path) -> Pinhole:
             where=path,
             remedy="write it as Open3D does, column by column",
         ) from error
-    try:
-        return Pinhole(*size, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-    except InputError as error:
-        raise InputError(
-            error.problem, where=f"{path}: {error.where}", remedy=error.remedy
-        ) from error
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
 
 
 def _timestamps(files: list[Path]) -> Float64:

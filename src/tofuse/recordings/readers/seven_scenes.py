@@ -14,6 +14,7 @@ from tofuse.files.reading import is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
+from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import read_matrix_pose
@@ -98,9 +99,5 @@ def _camera(folder: Path) -> Pinhole:
     K = read_numbers(path)
     if K.shape != (3, 3):
         raise InputError("holds no 3x3 matrix", where=path, remedy="write three rows of three")
-    try:
-        return Pinhole(640, 480, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-    except InputError as error:
-        raise InputError(
-            error.problem, where=f"{path}: {error.where}", remedy=error.remedy
-        ) from error
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return checked_lens(Pinhole, (640, 480), {k: float(v) for k, v in values.items()}, path)

@@ -64,7 +64,7 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers in a line", where=path)
     with np.errstate(over="ignore"):
-        points = (table[:, :3] @ FLIP * CENTIMETRE).astype(np.float32)
+        points = (table[:, :3] * np.diag(FLIP) * CENTIMETRE).astype(np.float32)
     # The scanner writes the origin where nothing came back.
     points[(points == 0).all(1)] = np.nan
     amplitude = table[:, 3].astype(np.float32) if table.shape[1] == 4 else None

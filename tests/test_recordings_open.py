@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.images import write_png
+from tofuse.files.ply import write_ply
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.recordings.native import RecordingWriter
+from tofuse.recordings.open import open_recording, readers
+from tofuse.recordings.recording import ArraySource, Recording
+
+CAMERA = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
+
+
+def write(folder: Path, depths: list[float], *, poses: bool = False) -> Path:
+    writer = RecordingWriter(folder, CAMERA, frame_rate_hz=10.0)
+    for k, depth in enumerate(depths):
+        writer.add(RangeFrame(k, k / 10, CAMERA, np.full((30, 40), depth, np.float32)))
+    return writer.finish(groundtruth=np.tile(np.eye(4), (len(depths), 1, 1)) if poses else None)
+
+
+def depths(recording: Recording) -> list[float]:
+    return [round(float(f.points[0, 2]), 3) for f in recording]
+
+
+def test_every_format_has_a_reader() -> None:
+    names = {"7scenes", "native", "pcd", "ply", "redwood", "slam6d", "sr4000", "tum", "xyz"}
+    assert names <= set(readers())
+
+
+def test_several_paths_are_joined_in_the_order_given(tmp_path: Path) -> None:
+    write(tmp_path / "a", [1, 2])
+    write(tmp_path / "b", [3, 4, 5], poses=True)
+    recording = open_recording(tmp_path / "b", tmp_path / "a")
+    assert depths(recording) == [3, 4, 5, 1, 2]
+    assert [f.index for f in recording] == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2, 0.3, 0.4])
+    assert [f.timestamp for f in recording] == recording.timestamps.tolist()
+    assert recording.reference is not None
+    assert np.isfinite(recording.reference[:, 0, 0]).tolist() == [True] * 3 + [False] * 2
+    assert recording.metadata["parts"] == [{"name": "b", "frames": 3}, {"name": "a", "frames": 2}]
+
+
+def test_a_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
+    for name, depth in (("part10", 3), ("part2", 2), ("part1", 1)):
+        write(tmp_path / name, [depth])
+    (tmp_path / "notes.txt").write_text("")
+    assert depths(open_recording(tmp_path)) == [1, 2, 3]
+    assert depths(open_recording(tmp_path, format="native")) == [1, 2, 3]
+    assert depths(open_recording(tmp_path).select(1)) == [2, 3]
+
+
+def test_recordings_of_different_formats_are_not_joined_unasked(tmp_path: Path) -> None:
+    write(tmp_path / "a", [1])
+    (tmp_path / "b").mkdir()
+    write_ply(tmp_path / "b" / "0.ply", np.ones((3, 3)))
+    with pytest.raises(InputError, match=r"several recordings: a \(native\), b \(ply\)"):
+        open_recording(tmp_path)
+    assert open_recording(tmp_path / "a", tmp_path / "b").format == "native+ply"
+
+
+def test_a_path_that_could_be_several_formats(tmp_path: Path) -> None:
+    write_ply(tmp_path / "0.ply", np.ones((3, 3)))
+    (tmp_path / "0.xyz").write_text("1 2 3\n")
+    with pytest.raises(InputError, match="--format ply or xyz"):
+        open_recording(tmp_path)
+    assert open_recording(tmp_path, format="xyz").format == "xyz"
+
+
+def test_images_without_a_camera(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1])
+    (folder / "camera.json").rename(tmp_path / "camera.json")
+    with pytest.raises(InputError, match=r"depth/ but no camera\.json.*--camera"):
+        open_recording(folder)
+    camera = tmp_path / "camera.json"
+    assert depths(open_recording(folder, format="native", camera=camera)) == [1]
+
+
+def test_limits_of_depth(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2, 3])
+    recording = open_recording(folder, min_depth=1.5, max_depth=2.5)
+    assert [len(f) for f in recording] == [0, 1200, 0]
+    for limits in ({"min_depth": -1.0}, {"max_depth": float("nan")}):
+        with pytest.raises(InputError, match="depth"):
+            open_recording(folder, **limits)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="smaller first"):
+        open_recording(folder, min_depth=2.0, max_depth=1.0)
+
+
+def test_a_result_is_no_recording(tmp_path: Path) -> None:
+    write_ply(tmp_path / "cloud.ply", np.ones((3, 3)))
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(InputError, match="a result of tofuse"):
+        open_recording(tmp_path)
+
+
+def test_what_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "inside" / "again").symlink_to(tmp_path / "inside")
+    (tmp_path / "file.mkv").write_bytes(bytes(10))
+    (tmp_path / "file").mkdir()
+    (tmp_path / "file" / "a.docx").touch()
+    for name, words in (
+        ("missing", "doesn't exist"),
+        ("empty", "empty folder"),
+        ("loop", "leads back to itself"),
+        ("inside", "no recording that is known"),
+        ("file.mkv", "suffix '.mkv'"),
+        ("file", r"1 \.docx"),
+        ("file.mkv/x", "no folder"),
+        ("a\0b", "no path"),
+        ("n" * 300, "too long"),
+    ):
+        with pytest.raises(InputError, match=words):
+            open_recording(tmp_path / name)
+    with pytest.raises(InputError, match="no recording was given"):
+        open_recording()
+    with pytest.raises(InputError, match="no format 'mp3'"):
+        open_recording(tmp_path / "file", format="mp3")
+
+
+@pytest.mark.parametrize("name", sorted(readers()))
+def test_a_format_asked_for_that_isn_t_there(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.docx").touch()
+    for path in (tmp_path, tmp_path / "a.docx"):
+        with pytest.raises(InputError):
+            open_recording(path, format=name)
+
+
+def test_all_images_cut_off(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2, 3])
+    for path in (folder / "depth").iterdir():
+        path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(InputError, match="none of 3 frames can be read") as caught:
+        open_recording(folder)
+    assert not isinstance(caught.value, UnreadableFrameError)
+    assert "000000.png" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_first_frame_bad_others_good(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2, 3])
+    (folder / "depth" / "000000.png").write_bytes(b"")
+    recording = open_recording(folder)
+    assert [isinstance(f, UnreadableFrameError) for f in recording.read_all()] == [
+        True,
+        False,
+        False,
+    ]
+
+
+@pytest.mark.skipif(
+    os.name == "nt" or (hasattr(os, "geteuid") and os.geteuid() == 0),
+    reason="permissions don't hold back this user",
+)
+def test_permissions(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1])
+    for path in (folder / "camera.json", folder / "depth", folder):
+        mode = path.stat().st_mode
+        path.chmod(0)
+        try:
+            with pytest.raises(InputError, match="permission"):
+                open_recording(folder)
+        finally:
+            path.chmod(mode)
+
+
+def test_permission_denied_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above, for users whom permissions don't hold back."""
+    folder = write(tmp_path / "a", [1, 2])
+
+    def deny(self: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", deny)
+    with pytest.raises(InputError, match=r"camera\.json: may not be read \(permission denied\)"):
+        open_recording(folder)
+
+
+class Counting(ArraySource):
+    """Counts reads; the frames in `bad` can't be read."""
+
+    bad: tuple[int, ...] = ()
+    reads = 0
+
+    def read(self, index: int) -> Frame:
+        self.reads += 1
+        if index in self.bad:
+            raise UnreadableFrameError("is bad", where=f"frame {index}")
+        return super().read(index)
+
+
+def counting(count: int, *bad: int) -> tuple[Counting, Recording]:
+    source = Counting([CloudFrame.of(np.ones((3, 3)), index=k) for k in range(count)])
+    source.bad = bad
+    return source, Recording.of(source, "memory", "array")
+
+
+def reader_threads() -> list[threading.Thread]:
+    return [t for t in threading.enumerate() if t.name == "tofuse-reader"]
+
+
+def test_frames_come_in_order_with_errors_in_place() -> None:
+    _, recording = counting(50, 3, 49)
+    items = list(recording.select(1, None, 2).read_all(ahead=3))
+    assert [f.index if isinstance(f, CloudFrame) else str(f) for f in items] == [
+        1,
+        "frame 3: is bad",
+        *range(5, 49, 2),
+        "frame 49: is bad",
+    ]
+    assert reader_threads() == []
+
+
+def test_iteration_raises_when_it_is_the_bad_frame_s_turn() -> None:
+    _, recording = counting(5, 3)
+    iterator = iter(recording)
+    assert [next(iterator).index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(UnreadableFrameError, match="frame 3"):
+        next(iterator)
+
+
+def test_reads_ahead_but_not_without_bound_and_stops_early() -> None:
+    source, recording = counting(1000)
+    iterator = recording.read_all(ahead=4)
+    next(iterator)
+    iterator.close()
+    assert source.reads <= 7
+    assert reader_threads() == []
+
+
+def test_other_errors_come_through_the_thread() -> None:
+    class Broken(Counting):
+        def read(self, index: int) -> Frame:
+            raise InputError("breaks down")
+
+    source = Broken([CloudFrame.of(np.ones((3, 3)))])
+    with pytest.raises(InputError, match="breaks down"):
+        list(Recording.of(source, "memory", "array").read_all())
+    assert reader_threads() == []
+
+
+def test_a_wrong_dtype_everywhere(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1])
+    write_png(folder / "depth" / "000000.png", np.ones((30, 40), np.uint8))
+    with pytest.raises(InputError, match="store one channel of uint16"):
+        open_recording(folder)
+
+
+def test_opening_leaves_the_recording_untouched(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2])
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    list(open_recording(folder))
+    files = sorted(p.relative_to(folder) for p in folder.rglob("*"))
+    assert files == sorted(p.relative_to(copy) for p in copy.rglob("*"))

@@ -1,0 +1,450 @@
+"""Each reader on small recordings made here, whose truth is known."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.images import write_png
+from tofuse.files.ply import write_ply
+from tofuse.files.trajectory import write_tum
+from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.geometry.se3 import exp
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.open import open_recording
+
+RNG = np.random.default_rng(20)
+COUNTS = [RNG.integers(500, 4000, (480, 640), np.uint16) for _ in range(3)]
+for _counts in COUNTS:
+    _counts[0, 0], _counts[0, 1] = 0, 65535
+POSES = exp(RNG.normal(size=(3, 6)))
+
+
+def sr4000_text(z: np.ndarray, rays: np.ndarray, behind: float, time_ms: float) -> str:
+    """Write an export whose vectors meet `behind` metres behind the origin, x left and y up."""
+    x, y = (-rays[..., k] * (z + behind) for k in (0, 1))
+    confidence = np.full(z.shape, 5)
+    amplitude = np.arange(z.size).reshape(z.shape)
+    blocks = {
+        "Calibrated Distance": (z, "%.4f"),
+        "Calibrated xVector": (x, "%.4f"),
+        "Calibrated yVector": (y, "%.4f"),
+        "Amplitude": (amplitude, "%d"),
+        "Confidence map": (confidence, "%d"),
+    }
+    text = ""
+    for title, (block, style) in blocks.items():
+        rows = ["\t".join(style % v for v in row) for row in block]
+        text += f"% {title}\n" + "\n".join(rows) + "\n"
+    tail = [f"{time_ms:g}", *["nan"] * (z.shape[1] - 1)]
+    return text + "% additional data / time stamp [ms]\n" + "\t".join(tail) + "\n"
+
+
+def make_sr4000(folder: Path, count: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    folder.mkdir(parents=True)
+    v, u = np.mgrid[:12, :16]
+    rays = np.stack([(u - 7.5) / 20, (v - 5.5) / 20], -1)
+    z = np.random.default_rng(21).uniform(0.3, 4.9, (count, 12, 16)).round(4)
+    z[:, 3, 3] = 0.004
+    for k in range(count):
+        (folder / f"frm_{k + 1:04d}.dat").write_text(sr4000_text(z[k], rays, 0.01, 31.25 * k))
+    return z, rays
+
+
+def test_sr4000_gives_the_vectors_themselves(tmp_path: Path) -> None:
+    z, rays = make_sr4000(tmp_path / "Y1")
+    recording = open_recording(tmp_path / "Y1")
+    assert recording.format == "sr4000"
+    np.testing.assert_allclose(recording.timestamps, [0, 0.03125, 0.0625])
+    for k in range(3):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        assert isinstance(frame.camera, RayTable)
+        truth = np.concatenate([rays * (z[k] + 0.01)[..., None], z[k][..., None]], -1)
+        assert not frame.valid[3, 3]
+        assert frame.valid.sum() == 12 * 16 - 1
+        np.testing.assert_allclose(frame.points, truth[frame.valid], atol=6e-5)
+        assert frame.amplitude_image is not None
+        np.testing.assert_array_equal(frame.amplitude_image.ravel(), np.arange(192))
+        assert frame.confidence_image is not None
+        assert (frame.confidence_image == 5).all()
+
+
+def test_sr4000_stations_are_joined_in_name_order(tmp_path: Path) -> None:
+    z2, _ = make_sr4000(tmp_path / "Y2", 2)
+    make_sr4000(tmp_path / "Y1", 3)
+    recording = open_recording(tmp_path)
+    assert len(recording) == 5
+    assert (np.diff(recording.timestamps) > 0).all()
+    assert "Y2: starts anew in time" in recording.warnings[0]
+    frame = recording[3]
+    assert isinstance(frame, RangeFrame)
+    assert frame.index == 3
+    assert frame.timestamp == recording.timestamps[3]
+    np.testing.assert_allclose(frame.z[frame.valid], z2[0][frame.valid], atol=1e-6)
+
+
+def test_sr4000_frame_that_is_cut_off(tmp_path: Path) -> None:
+    make_sr4000(tmp_path / "Y1")
+    path = tmp_path / "Y1" / "frm_0002.dat"
+    path.write_text(path.read_text()[:2000])
+    recording = open_recording(tmp_path / "Y1")
+    assert recording.timestamps.tolist() == [0, 0.03125, 0.0625]
+    assert "interpolated" in recording.warnings[0]
+    with pytest.raises(UnreadableFrameError, match="frm_0002"):
+        recording[1]
+    assert len(recording[2])
+
+
+def make_tum(folder: Path) -> None:
+    for name in ("depth", "rgb"):
+        (folder / name).mkdir(parents=True)
+    depth_lines, color_lines = ["# timestamp filename"], ["# timestamp filename"]
+    for k, counts in enumerate(COUNTS):
+        time = 1305031102.16 + k / 30
+        write_png(folder / "depth" / f"{time:.6f}.png", counts)
+        write_png(folder / "rgb" / f"{time:.6f}.png", np.full((480, 640, 3), k, np.uint8))
+        depth_lines.append(f"{time:.6f} depth/{time:.6f}.png")
+        color_lines.insert(1, f"{time + 0.012:.6f} rgb/{time:.6f}.png")
+    (folder / "depth.txt").write_text("\n".join(depth_lines) + "\n")
+    (folder / "rgb.txt").write_text("\n".join(color_lines) + "\n")
+    write_tum(folder / "groundtruth.txt", 1305031102.15 + np.arange(3) / 30, POSES)
+
+
+def test_tum(tmp_path: Path) -> None:
+    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
+    make_tum(folder)
+    recording = open_recording(folder)
+    assert recording.format == "tum"
+    frame = recording[1]
+    assert isinstance(frame, RangeFrame)
+    # The colour camera's lens, not the infrared one's: depth is registered to colour.
+    assert isinstance(frame.camera, BrownConrady)
+    assert (frame.camera.fx, frame.camera.k1) == (517.306408, 0.262383)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 5000, rtol=1e-6)
+    assert frame.depth[0, :2].tolist() == [0, 0]
+    assert frame.color_image is not None
+    assert (frame.color_image == 1).all()
+    assert recording.reference is not None
+    np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    assert recording.odometry is None
+    third = open_recording(folder.rename(tmp_path / "fr3_office"))[0]
+    assert isinstance(third, RangeFrame)
+    assert third.camera == BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+def test_tum_asks_for_the_camera_of_an_unknown_name(tmp_path: Path) -> None:
+    make_tum(tmp_path / "living_room")
+    with pytest.raises(InputError, match="--camera"):
+        open_recording(tmp_path / "living_room")
+    camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}
+    camera |= {"fx": 481.2, "fy": 480.0, "cx": 319.5, "cy": 239.5}
+    camera |= {"depth_unit_m": 0.0002, "depth_kind": "range"}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    frame = open_recording(tmp_path / "living_room", camera=tmp_path / "camera.json")[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.camera == Pinhole(640, 480, 481.2, 480.0, 319.5, 239.5)
+    assert frame.depth_kind == "range"
+
+
+@pytest.mark.parametrize(
+    "line", ["1.0 ../../secret.png", "1.0 /etc/passwd", "1.0", "x depth/a.png"]
+)
+def test_tum_list_with_a_bad_line(tmp_path: Path, line: str) -> None:
+    make_tum(tmp_path / "freiburg1")
+    (tmp_path / "freiburg1" / "depth.txt").write_text(line + "\n")
+    with pytest.raises(InputError, match=r"depth\.txt, line 1"):
+        open_recording(tmp_path / "freiburg1")
+
+
+def make_7scenes(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for k, counts in enumerate(COUNTS):
+        stem = folder / f"frame-{2 * k:06d}"
+        write_png(stem.with_name(stem.name + ".depth.png"), counts)
+        np.savetxt(stem.with_name(stem.name + ".pose.txt"), POSES[k])
+        write_png(stem.with_name(stem.name + ".color.png"), np.full((480, 640, 3), k, np.uint8))
+
+
+def test_7scenes(tmp_path: Path) -> None:
+    make_7scenes(tmp_path / "seq-01")
+    recording = open_recording(tmp_path / "seq-01")
+    assert recording.format == "7scenes"
+    frame = recording[2]
+    assert isinstance(frame, RangeFrame)
+    assert frame.camera == Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[2][1:] / 1000, rtol=1e-6)
+    assert frame.color_image is not None
+    np.testing.assert_allclose(recording.timestamps, [0, 2 / 30, 4 / 30])
+    assert recording.reference is not None
+    np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    (tmp_path / "seq-01" / "camera-intrinsics.txt").write_text("500 0 320\n0 510 240\n0 0 1\n")
+    (tmp_path / "seq-01" / "frame-000002.pose.txt").write_text(
+        "-1.#IND nan\n".replace("-1.#IND", "nan")
+    )
+    with pytest.raises(InputError, match=r"frame-000002\.pose\.txt"):
+        open_recording(tmp_path / "seq-01")
+    np.savetxt(tmp_path / "seq-01" / "frame-000002.pose.txt", np.full((4, 4), np.inf))
+    (tmp_path / "seq-01" / "frame-000004.color.png").unlink()
+    recording = open_recording(tmp_path / "seq-01")
+    assert recording.reference is not None
+    assert np.isnan(recording.reference[1]).all()
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)
+    assert frame.color_image is None
+    assert "only 2 of 3 frames have colour" in recording.warnings[0]
+
+
+def make_redwood(folder: Path, color: str = "color") -> None:
+    for name in ("depth", color):
+        (folder / name).mkdir(parents=True)
+    lines = []
+    for k, counts in enumerate(COUNTS):
+        write_png(folder / "depth" / f"{k + 1:06d}-{k * 33369:012d}.png", counts)
+        write_png(folder / color / f"{k + 1:06d}.png", np.full((480, 640, 3), k, np.uint8))
+        lines += [f"{k} {k} {k + 1}", *(" ".join(map(repr, row)) for row in POSES[k].tolist())]
+    (folder / "trajectory.log").write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("color", ["color", "image", "rgb"])
+def test_redwood(tmp_path: Path, color: str) -> None:
+    make_redwood(tmp_path, color)
+    recording = open_recording(tmp_path)
+    assert recording.format == "redwood"
+    assert any("PrimeSense default" in w for w in recording.warnings)
+    frame = recording[1]
+    assert isinstance(frame, RangeFrame)
+    assert frame.camera == Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 1000, rtol=1e-6)
+    np.testing.assert_allclose(recording.timestamps, [0, 0.033369, 0.066738])
+    assert recording.reference is not None
+    np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    # Open3D stores the matrix column by column.
+    matrix = [500.0, 0, 0, 0, 510.0, 0, 321.0, 241.0, 1]
+    about = {"width": 640, "height": 480, "intrinsic_matrix": matrix}
+    (tmp_path / "camera_primesense.json").write_text(json.dumps(about))
+    recording = open_recording(tmp_path)
+    assert recording.warnings == []
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 321.0, 241.0)
+
+
+def test_redwood_without_a_camera_is_unsure(tmp_path: Path) -> None:
+    make_redwood(tmp_path)
+    (tmp_path / "trajectory.log").unlink()
+    with pytest.raises(InputError, match="--format redwood"):
+        open_recording(tmp_path)
+    assert len(open_recording(tmp_path, format="redwood")) == 3
+
+
+def test_redwood_with_a_damaged_log_or_camera(tmp_path: Path) -> None:
+    make_redwood(tmp_path)
+    log = (tmp_path / "trajectory.log").read_text()
+    for text, words in (
+        (log + "3 3 4\n", "lines"),
+        (log.replace("2 2 3", "9 9 9"), "frame 9"),
+        (log.replace("2 2 3", "two"), "pose 2"),
+        (log.replace("0.0 0.0 0.0 1.0", "0 0 1 1", 1), "last row"),
+    ):
+        (tmp_path / "trajectory.log").write_text(text)
+        with pytest.raises(InputError, match=words):
+            open_recording(tmp_path)
+    (tmp_path / "trajectory.log").write_text(log)
+    (tmp_path / "camera.json").write_text('{"intrinsic_matrix": [1, 2, 3], "width": 640}')
+    with pytest.raises(InputError, match="3x3 intrinsic_matrix"):
+        open_recording(tmp_path)
+
+
+def pcd_bytes(points: np.ndarray, **columns: np.ndarray) -> bytes:
+    """Write an organised binary PCD of (H, W, 3) points."""
+    height, width = points.shape[:2]
+    names, sizes = ["x", "y", "z", *columns], " ".join(["4"] * (3 + len(columns)))
+    parts = [points.astype("<f4")]
+    parts += [np.asarray(c, "<f4").reshape(height, width, 1) for c in columns.values()]
+    header = (
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {sizes}\n"
+        f"TYPE {' '.join(['F'] * len(names))}\nCOUNT {' '.join(['1'] * len(names))}\n"
+        f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {width * height}\n"
+        "DATA binary\n"
+    )
+    return header.encode() + np.concatenate(parts, -1).astype("<f4").tobytes()
+
+
+CAMERA = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
+
+
+def pcd_points(camera: Pinhole, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.5, 4, (camera.height, camera.width, 1))
+    points = np.concatenate([camera.rays() * z, z], -1)
+    points[rng.uniform(size=points.shape[:2]) < 0.3] = np.nan
+    return points
+
+
+def test_organised_pcd_becomes_an_image(tmp_path: Path) -> None:
+    truth = [pcd_points(CAMERA, k) for k in range(3)]
+    for k, points in enumerate(truth):
+        intensity = np.arange(1200.0)
+        (tmp_path / f"cloud_{k}.pcd").write_bytes(pcd_bytes(points, intensity=intensity))
+    half = np.sqrt(0.5)
+    (tmp_path / "poses.txt").write_text(f"2 1 2 3 {half} {half} 0 0\n0 0 0 0 1 0 0 0\n")
+    recording = open_recording(tmp_path)
+    assert recording.format == "pcd"
+    for k in range(3):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        assert isinstance(frame.camera, Pinhole)
+        assert frame.camera.fx == pytest.approx(35, abs=1e-3)
+        measured = np.isfinite(truth[k]).all(-1)
+        np.testing.assert_array_equal(frame.valid, measured)
+        np.testing.assert_allclose(frame.points, truth[k][measured], atol=1e-4)
+        assert frame.amplitude is not None
+        np.testing.assert_array_equal(frame.amplitude, np.flatnonzero(measured))
+    assert recording.reference is not None
+    np.testing.assert_array_equal(recording.reference[0], np.eye(4))
+    assert np.isnan(recording.reference[1]).all()
+    np.testing.assert_allclose(recording.reference[2][:3, 1], [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(recording.reference[2][:3, 3], [1, 2, 3])
+
+
+def test_organised_pcd_of_a_bent_lens_keeps_a_table(tmp_path: Path) -> None:
+    lens = BrownConrady(40, 30, 35.0, 36.0, 19.5, 14.5, -0.1, 0.02)
+    truth = pcd_points(lens, 1)
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(truth))
+    # A second file sees pixels that the first doesn't.
+    (tmp_path / "b.pcd").write_bytes(pcd_bytes(pcd_points(lens, 2)))
+    frame = open_recording(tmp_path)[0]
+    assert isinstance(frame, RangeFrame)
+    assert isinstance(frame.camera, RayTable)
+    measured = np.isfinite(truth).all(-1)
+    np.testing.assert_allclose(frame.points, truth[measured], atol=1e-5)
+    assert np.isfinite(frame.camera.rays()).all(-1).mean() > 0.85
+
+
+def test_pcd_that_is_no_image_stays_a_cloud(tmp_path: Path) -> None:
+    points = np.random.default_rng(3).normal(size=(30, 40, 3))
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(points))
+    frame = open_recording(tmp_path / "a.pcd")[0]
+    assert isinstance(frame, CloudFrame)
+    np.testing.assert_allclose(frame.points, points.reshape(-1, 3), rtol=1e-6)
+    row = pcd_bytes(points.reshape(1, -1, 3)).replace(b"VIEWPOINT 0 0 0", b"VIEWPOINT 1 2 3")
+    (tmp_path / "a.pcd").write_bytes(row)
+    frame = open_recording(tmp_path / "a.pcd")[0]
+    assert isinstance(frame, CloudFrame)
+    assert frame.origin.tolist() == [1, 2, 3]
+
+
+def test_pcd_of_another_camera_among_them(tmp_path: Path) -> None:
+    for k in range(12):
+        (tmp_path / f"{k}.pcd").write_bytes(pcd_bytes(pcd_points(CAMERA, k)))
+    # Not among the files that are looked at first.
+    other = Pinhole(40, 30, 60.0, 60.0, 19.5, 14.5)
+    (tmp_path / "11.pcd").write_bytes(pcd_bytes(pcd_points(other, 11)))
+    recording = open_recording(tmp_path)
+    assert isinstance(recording[10], RangeFrame)
+    with pytest.raises(UnreadableFrameError, match="off the rays"):
+        recording[11]
+
+
+def test_a_file_that_only_claims_to_be_pcd(tmp_path: Path) -> None:
+    (tmp_path / "a.pcd").write_text("This is no point cloud.\n" * 100)
+    with pytest.raises(InputError, match="is no PCD file"):
+        open_recording(tmp_path / "a.pcd")
+    with pytest.raises(InputError, match="is no PCD file"):
+        open_recording(tmp_path)
+
+
+def test_ply_folder(tmp_path: Path) -> None:
+    points = [np.random.default_rng(k).normal(size=(20, 3)).astype(np.float32) for k in range(3)]
+    for k in (10, 9, 1):
+        write_ply(
+            tmp_path / f"scan{k}.ply",
+            points[(10, 9, 1).index(k)],
+            scalars={"intensity": np.full(20, k, np.float32)},
+        )
+    (tmp_path / "timestamps.txt").write_text("0.5\n1.5\n2.5\n")
+    recording = open_recording(tmp_path)
+    assert recording.format == "ply"
+    assert recording.timestamps.tolist() == [0.5, 1.5, 2.5]
+    for k, seed in enumerate((2, 1, 0)):
+        np.testing.assert_array_equal(recording[k].points, points[seed])
+    assert recording[2].amplitude is not None
+    assert recording[2].amplitude[0] == 10  # type: ignore[index]
+    (tmp_path / "timestamps.txt").write_text("0.5\n")
+    with pytest.raises(InputError, match=r"timestamps\.txt"):
+        open_recording(tmp_path)
+
+
+def test_xyz(tmp_path: Path) -> None:
+    points = np.random.default_rng(4).normal(size=(20, 3))
+    unit = points / np.linalg.norm(points, axis=1, keepdims=True)
+    files = {
+        "a.xyz": points,
+        "b.xyz": np.c_[points, np.arange(20)],
+        "c.xyz": np.c_[points, unit],
+        "d.xyz": np.c_[points, np.tile([10, 20, 30], (20, 1))],
+        "e.xyzrgb": np.c_[points, np.full((20, 3), 0.2)],
+    }
+    for name, table in files.items():
+        np.savetxt(tmp_path / name, table)
+    recording = open_recording(tmp_path)
+    assert recording.format == "xyz"
+    frames = list(recording)
+    for frame in frames:
+        np.testing.assert_allclose(frame.points, points, rtol=1e-6)
+    assert frames[0].amplitude is None
+    np.testing.assert_array_equal(frames[1].amplitude, np.arange(20))
+    np.testing.assert_allclose(frames[2].normals, unit, rtol=1e-6)
+    assert frames[3].color is not None
+    assert frames[3].color[0].tolist() == [10, 20, 30]
+    assert frames[4].color is not None
+    assert frames[4].color[0].tolist() == [51, 51, 51]
+
+
+def test_slam6d_axes_units_and_poses(tmp_path: Path) -> None:
+    """A left-handed world in cm: x right, y up, z forward."""
+    (tmp_path / "scan000.3d").write_text("3\n100 200 300\n0 0 0\n-50 0 10\n")
+    (tmp_path / "scan000.pose").write_text("0 0 0\n0 0 0\n")
+    (tmp_path / "scan001.3d").write_text("100 200 300 7\n-50 0 10 8\n")
+    (tmp_path / "scan001.pose").write_text("100 50 -200\n0 90 0\n")
+    recording = open_recording(tmp_path)
+    assert recording.format == "slam6d"
+    np.testing.assert_allclose(recording[0].points, [[1, -2, 3], [-0.5, 0, 0.1]], rtol=1e-6)
+    np.testing.assert_array_equal(recording[1].amplitude, [7, 8])
+    assert recording.odometry is not None
+    np.testing.assert_array_equal(recording.odometry[0], np.eye(4))
+    T = recording.odometry[1]
+    np.testing.assert_allclose(T[:3, 3], [1, -0.5, -2])
+    # 3DTK turns z forward into x right at +90 degrees about y.
+    np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-15)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    assert "no truth" in recording.warnings[0]
+
+
+def test_slam6d_pose_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "scan000.3d").write_text("1 2 3\n")
+    (tmp_path / "scan000.pose").write_text("1 2 3\n")
+    with pytest.raises(InputError, match=r"scan000\.pose"):
+        open_recording(tmp_path)
+
+
+def test_camera_means_nothing_for_clouds(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", np.ones((3, 3)))
+    with pytest.raises(InputError, match="--camera"):
+        open_recording(tmp_path / "a.ply", camera=tmp_path / "camera.json")
+
+
+def test_rgb_packed_in_a_float_field(tmp_path: Path) -> None:
+    packed = struct.unpack("<f", struct.pack("<I", 0x00112233))[0]
+    points = pcd_points(CAMERA, 5)
+    (tmp_path / "a.pcd").write_bytes(pcd_bytes(points, rgb=np.full(1200, packed)))
+    frame = open_recording(tmp_path / "a.pcd")[0]
+    assert frame.color is not None
+    assert (frame.color == [0x11, 0x22, 0x33]).all()
