@@ -228,7 +228,8 @@ def test_blurred_edge_is_wider_and_keeps_to_its_place() -> None:
     between = [int(((r.frame.z[18] > 1.25) & (r.frame.z[18] < 2.15)).sum()) for r in (sharp, soft)]
     assert between[0] <= 1
     assert 2 <= between[1] <= 4
-    np.testing.assert_allclose(soft.frame.depth[:, :20], sharp.frame.depth[:, :20], atol=2e-4)
+    inside = np.s_[3:-3, 3:20]
+    np.testing.assert_allclose(soft.frame.depth[inside], sharp.frame.depth[inside], atol=3e-4)
     assert (soft.flags[:, 24:26] & Flag.MIXED).all()
     assert not (soft.flags[:, :20] & Flag.MIXED).any()
 
