@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -356,6 +357,18 @@ def test_a_header_of_rays_that_promises_more_than_the_file_holds(tmp_path: Path)
         np.lib.format.write_array_header_1_0(file, claim)
         file.write(bytes(1000))
     with pytest.raises(InputError, match=r"rays\.npy"):
+        NativeSource(folder)
+
+
+def test_a_correction_that_promises_more_than_there_is_memory(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a")
+    with zipfile.ZipFile(folder / "correction.npz", "w") as archive:
+        for name in ("range_m", "bias_m"):
+            with archive.open(f"{name}.npy", "w") as file:
+                claim = {"descr": "<f8", "fortran_order": False, "shape": (10**14,)}
+                np.lib.format.write_array_header_1_0(file, claim)
+                file.write(bytes(1000))
+    with pytest.raises(InputError, match=r"correction\.npz"):
         NativeSource(folder)
 
 

@@ -75,6 +75,13 @@ def test_a_path_that_could_be_several_formats(tmp_path: Path) -> None:
     assert open_recording(tmp_path, format="xyz").format == "xyz"
 
 
+def test_a_cloud_beside_a_native_recording_is_passed_over(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1])
+    write_ply(folder / "model.ply", np.ones((3, 3)))
+    assert open_recording(folder).format == "native"
+    assert open_recording(tmp_path).format == "native"
+
+
 def test_images_without_a_camera(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1])
     (folder / "camera.json").rename(tmp_path / "camera.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 INVALID_DEPTH = 65535
+MAX_CORRECTION_BYTES = 1 << 30
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -157,7 +159,7 @@ class NativeSource(FileSource):
         path = self.folder / "correction.npz"
         if self.camera is None or not is_file(path):
             return None
-        correction = DepthCorrection.load(path)
+        correction = read_correction(path)
         try:
             correction.correct(np.ones((self.camera.height, self.camera.width), np.float32))
         except InputError as error:
@@ -244,6 +246,23 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
     depth = counts.astype(np.float32) * np.float32(unit_m)
     depth[counts == INVALID_DEPTH] = 0
     return depth
+
+
+def read_correction(path: Path) -> DepthCorrection:
+    """Read a correction.npz, refusing one that unpacks to more than any camera needs."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+    except (OSError, ValueError, zipfile.BadZipFile):
+        size = 0  # the loader says what is wrong
+    try:
+        if size <= MAX_CORRECTION_BYTES:
+            return DepthCorrection.load(path)
+    except MemoryError:
+        pass
+    raise InputError(
+        "unpacks to more than a correction can be", where=path, remedy="write it again"
+    )
 
 
 def sampled_color(

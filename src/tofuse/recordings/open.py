@@ -85,7 +85,9 @@ def _resolve(path: Path, format: str | None) -> list[_Found]:  # noqa: A002
     if format is not None:
         return _resolve_as(path, format)
     sniffs = _sniff(path)
-    sure = {name: sniff for name, sniff in sniffs.items() if sniff.confidence >= SURE}
+    # A camera.json or a format's own names outweigh a cloud that lies beside them.
+    best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
+    sure = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, SURE)}
     if len(sure) == 1:
         return [_Found(path, readers()[next(iter(sure))])]
     if len(sure) > 1:
@@ -129,9 +131,10 @@ def _parts(path: Path) -> list[_Found]:
     for folder in list_folder(path):
         if not is_folder(folder):
             continue
-        sure = [name for name, s in _sniff(folder).items() if s.confidence >= SURE]
-        if len(sure) == 1:
-            found[folder] = sure[0]
+        sniffs = _sniff(folder)
+        sure = [name for name, s in sniffs.items() if s.confidence >= SURE]
+        if sure:
+            found[folder] = max(sure, key=lambda name: sniffs[name].confidence)
     if not found:
         return []
     formats = sorted(set(found.values()))

@@ -20,7 +20,8 @@ class Sniff:
     Attributes
     ----------
     confidence
-        0 to 1; a path is opened unasked only from `SURE` on.
+        0 to 1; a path is opened unasked only from `SURE` on. 1 is for names and contents that
+        no other format has.
     saw
         What speaks for it, for messages.
     settle

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
+from tofuse.files.reading import is_file
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
@@ -62,6 +63,23 @@ def tum_poses(source: FileSource, path: Path) -> Float64:
             f"{path}: {found} of {len(out)} frames have a pose within 0.02 s of their timestamp"
         )
     return out
+
+
+def poses_beside(
+    source: FileSource, files: Sequence[Path], read: Callable[[Path], Float64]
+) -> Float64:
+    """Poses (N, 4, 4) from one file for each frame; NaN, and a warning, where one can't be read."""
+    poses = np.full((len(files), 4, 4), np.nan)
+    errors = []
+    for k, path in enumerate(files):
+        if is_file(path):
+            try:
+                poses[k] = read(path)
+            except InputError as error:
+                errors.append(error)
+    if errors:
+        source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
+    return poses
 
 
 def read_matrix_pose(table: Float64, where: str) -> Float64:

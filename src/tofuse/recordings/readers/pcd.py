@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import cloud_frame
+from tofuse.recordings.sources import FARTHEST_M, cloud_frame
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -87,7 +87,7 @@ def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame
         )
     points = _image(pcd)
     z = points[..., 2]
-    measured = np.asarray(np.isfinite(points).all(-1) & (z > 0))
+    measured = _measured(points)
     rays = camera.rays()
     known = np.asarray(np.isfinite(rays).all(-1))
     if not _fits(points, measured & known, rays):
@@ -149,15 +149,13 @@ def _common_rays(images: list[Float32]) -> Float32 | None:
     below = np.zeros(images[0].shape[:2])
     masks = []
     for image in images:
-        finite = np.isfinite(image).all(-1)
-        z = np.where(finite, image[..., 2], 0).astype(float)
-        if (z < 0).any():
+        if (image[..., 2] < 0).any():
             return None
-        # Some programs write the origin, not NaN, where nothing came back.
-        measured = finite & (z > 0)
+        measured = _measured(image)
+        z = np.where(measured, image[..., 2], 0).astype(float)
         masks.append(measured)
         above += np.where(measured[..., None], image[..., :2], 0) * z[..., None]
-        below += np.where(measured, z, 0) ** 2
+        below += z**2
     with np.errstate(invalid="ignore", divide="ignore"):
         rays = (above / np.where(below > 0, below, np.nan)[..., None]).astype(np.float32)
     fits = all(_fits(image, mask, rays) for image, mask in zip(images, masks, strict=True))
@@ -168,6 +166,11 @@ def _fits(points: Float32, mask: NDArray[np.bool_], rays: Float32) -> bool:
     z = points[mask][:, 2:]
     off = np.abs(points[mask][:, :2] - rays[mask] * z)
     return bool((off <= TOLERANCE_M + TOLERANCE_SHARE * z).all())
+
+
+def _measured(points: Float32) -> NDArray[np.bool_]:
+    """Mask of points; some programs write the origin, not NaN, where nothing came back."""
+    return np.asarray((np.abs(points) < FARTHEST_M).all(-1) & (points[..., 2] > 0))
 
 
 def _image(pcd: Pcd) -> Float32:

@@ -16,7 +16,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, read_json
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import SURE, UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
 from tofuse.recordings.sources import read_matrix_pose
 
 Float64 = NDArray[np.float64]
@@ -45,11 +45,11 @@ class Redwood:
         try:
             camera = _camera_file(path)
             if camera is not None:
-                return Sniff(SURE, f"depth/, {color}/ and {camera.name}")
+                return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
         except InputError:
             return None
         if is_file(path / "trajectory.log"):
-            return Sniff(SURE, f"depth/, {color}/ and trajectory.log")
+            return Sniff(1.0, f"depth/, {color}/ and trajectory.log")
         if is_file(path / "camera.json"):
             return None
         return Sniff(

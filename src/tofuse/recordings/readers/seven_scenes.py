@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.reading import is_file, is_folder, list_folder
@@ -17,7 +18,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.sources import read_matrix_pose
+from tofuse.recordings.sources import poses_beside, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
 DEFAULT_CAMERA = Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -60,11 +61,8 @@ class SevenScenes:
             )
         elif color:
             source.warnings.append("colour is not registered to depth in 7-Scenes: taken as it is")
-        poses = np.full((len(files), 4, 4), np.nan)
-        for k, file in enumerate(files):
-            pose = file.with_name(file.name[: -len(".depth.png")] + ".pose.txt")
-            if is_file(pose):
-                poses[k] = read_matrix_pose(read_numbers(pose), str(pose))
+        stems = [file.name[: -len(".depth.png")] for file in files]
+        poses = poses_beside(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
         if np.isfinite(poses).any():
             source.reference = poses
         source.metadata |= {
@@ -72,6 +70,11 @@ class SevenScenes:
             "frame_rate_hz": FRAME_RATE_HZ,
         }
         return source
+
+
+def read_pose(path: Path) -> NDArray[np.float64]:
+    """T_world_camera (4, 4) of a .pose.txt; NaN where the tracker was lost."""
+    return read_matrix_pose(read_numbers(path), str(path))
 
 
 def _depth_files(path: Path) -> list[tuple[int, Path]]:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import is_file, read_text
+from tofuse.files.reading import read_text
 from tofuse.files.tables import parse_numbers, read_numbers
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import cloud_frame
+from tofuse.recordings.sources import cloud_frame, poses_beside
 
 Float64 = NDArray[np.float64]
 
@@ -41,11 +41,7 @@ class Slam6d:
         refuse_camera(options, "slam6d")
         files = needed_files(path, ".3d")
         source = CloudFileSource(path, files, scan_frame)
-        poses = np.full((len(files), 4, 4), np.nan)
-        for k, file in enumerate(files):
-            pose = file.with_suffix(".pose")
-            if is_file(pose):
-                poses[k] = read_pose(pose)
+        poses = poses_beside(source, [file.with_suffix(".pose") for file in files], read_pose)
         if np.isfinite(poses).any():
             source.odometry = poses
             if source.reference is None:

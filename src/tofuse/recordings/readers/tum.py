@@ -16,7 +16,7 @@ from tofuse.files.trajectory import associate
 from tofuse.geometry.cameras import BrownConrady
 from tofuse.parts import part
 from tofuse.recordings.depth_images import DepthImageSource
-from tofuse.recordings.reader import SURE, ReaderOptions, Sniff
+from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import check_timestamps, tum_poses
 
 Float64 = NDArray[np.float64]
@@ -48,7 +48,7 @@ class Tum:
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         if is_folder(path) and is_file(path / "depth.txt"):
-            return Sniff(SURE, "depth.txt")
+            return Sniff(1.0, "depth.txt")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
