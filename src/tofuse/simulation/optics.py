@@ -127,18 +127,19 @@ def trace(
     """
     origin = T_room_camera[:3, 3]
     rays = directions @ T_room_camera[:3, :3].T
-    seen: NDArray[np.bool_] = np.isfinite(rays.sum(1))
-    rays = np.where(seen[:, None], rays, [0.0, 0.0, 1.0])
+    seen: NDArray[np.bool_] = np.isfinite(rays @ np.ones(3))
+    rays[~seen] = (0.0, 0.0, 1.0)
     hits = scene.cast(origin, rays, T_room_object)
     distance: Float64 = np.where(seen, hits.distance.astype(float), np.inf)
     hit = np.isfinite(distance)
     safe = np.where(hit, np.maximum(distance, 1e-3), 1.0)
     normals = hits.normal.astype(float)
-    cosine = np.clip(-(normals * rays).sum(1), 0, 1)
+    cosine = np.clip(-np.einsum("nc,nc->n", normals, rays), 0, 1)
     mirror = np.where(hit, _mirrored(hits.gloss.astype(float), cosine), 0.0) * gloss
     diffuse = np.where(hit, hits.albedo * (1 - mirror), 0.0)
     direct = diffuse * cosine / safe**2
-    points = np.where(hit[:, None], origin + safe[:, None] * rays, np.inf)
+    points = origin + safe[:, None] * rays
+    points[~hit] = np.inf
     shiny = np.flatnonzero(mirror > 0.01)
     if len(shiny) == 0:
         return Returns(direct[:, None], 2 * safe[:, None], diffuse, distance, points, normals)
