@@ -268,8 +268,9 @@ ORDER = [
 def test_sections_come_in_order_and_the_verdict_first(shown):
     assert list(shown.sections) == ORDER
     text = " ".join(shown.sections["verdict"].split())
-    assert "Degraded: use this model with care. 2 readable frames have no pose." in text
-    assert "Look first at frames 9–10." in text
+    assert (
+        "Degraded: use this model with care. 2 readable frames have no pose. (frames 9–10)" in text
+    )
     for name, number in (("tracked", 20), ("predicted", 1), ("lost", 2), ("skipped", 1)):
         assert f"frames {name}{number}" in text
     assert f"{len(room()[0].cloud):,} points" in text
@@ -333,12 +334,44 @@ def test_without_a_reference_the_displacement_is_shown(tmp_path):
 
 def test_true_and_measured_sizes(shown, tmp_path):
     result, extras = room()
-    row = shown.row("x (width)")
+    row = shown.row("width")
     low, high = np.percentile(result.cloud.points[:, 0], [0.25, 99.75])
     assert row[1:3] == ["6.00 m", f"{high - low:.2f} m"]
+    assert shown.row("height")[1] == "2.50 m"
+    assert shown.row("depth")[1] == "3.20 m"
     bare = page(tmp_path, result, replace(extras, truth_points=None))
-    assert bare.row("x (width)")[1] == f"{high - low:.2f} m"
+    number, unit = bare.row("width")[1].split()
+    assert unit == "m"
+    assert float(number) == pytest.approx(high - low, abs=0.05)
     assert "true outline" not in bare.sections["views"]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_turned_model_is_measured_along_its_own_sides(exact, tmp_path):
+    rng = np.random.default_rng(2)
+    surface = rng.uniform(-0.5, 0.5, (20_000, 3))
+    axis = rng.integers(0, 3, len(surface))
+    surface[np.arange(len(surface)), axis] = rng.choice([-0.5, 0.5], len(surface))
+    box = surface * [0.3, 0.4, 0.6]
+    # Tilted as well where the truth tells what is upright; a cloud alone can only be turned.
+    T = se3.exp([0.2, 0, 1, 0.3 if exact else 0, 0.4, -0.1 if exact else 0])
+    points = se3.transform(T, box).astype(np.float32)
+    cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.zeros(3))
+    got = page(
+        tmp_path, lonely(cloud=cloud), ReportExtras("x", truth_points=points if exact else None)
+    )
+    for name, size in (("width", 0.3), ("height", 0.4), ("depth", 0.6)):
+        for cell in got.row(name)[1:3]:
+            assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
+
+
+def test_reasons_of_one_kind_are_said_together(tmp_path):
+    reasons = tuple(Reason("loop_gap", (k, 90), f"Loop {k} to 90 gaped.") for k in range(7))
+    text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
+    said = " ".join(text.sections["verdict"].split())
+    assert said.count("the path bends to fit") == 2  # in the verdict and above the seven
+    assert "4 more like these" in said
+    assert all(r.text in said for r in reasons)
 
 
 def test_filters_show_the_share_of_the_recording_and_of_the_frame(shown):

@@ -166,12 +166,12 @@ def lines(
     return svg(figure, label)
 
 
-# Views of the world: x right, y down, z forward. Each is (horizontal, vertical) as (axis, sign).
+# Views of the world, x right, y down, z forward: each is (horizontal, vertical) as (axis, sign).
 VIEWS: dict[str, tuple[tuple[int, int], tuple[int, int]]] = {
     "above": ((0, 1), (2, 1)),
     "side": ((2, 1), (1, -1)),
 }
-_NAMES = {0: "x (right)", 1: "y (down)", 2: "z (forward)"}
+_NAMES = {0: "right", 1: "down", 2: "forward"}
 
 
 def project(points: Float64, view: str) -> Float64:

@@ -172,12 +172,14 @@ def still(scene: Scene, size: tuple[int, int] = (960, 600)) -> UInt8:
     T[:3, 3] = -R @ scene.center
     distance = 1.25 * scene.size
     scale = size[1] / (2 * np.tan(0.35) * distance)
-    points, colors = scene.points, scene.colors
+    points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
     if scene.normals is not None and len(points):
         # Surfaces that face away are walls between us and the inside.
         eye = scene.center - R.T @ np.array([0, 0, distance])
-        facing = ((eye - points) * np.nan_to_num(scene.normals)).sum(1) >= 0
-        points, colors = points[facing], colors[facing]
+        towards = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+        facing = (towards * np.nan_to_num(scene.normals)).sum(1)
+        colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
+        points, colors = points[facing >= 0], colors[facing >= 0]
     radius = int(np.clip(np.ceil(scene.spacing * scale), 1, 6))
     drawn = images.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
     out = np.empty((*drawn.shape[:2], 3), np.uint8)

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse._version import __version__
-from tofuse.fusion.cloud import Cloud
 from tofuse.geometry import se3
 from tofuse.recordings.frames import RangeFrame
-from tofuse.report import images, plots, words
+from tofuse.report import images, plots, straight, words
 from tofuse.report.extras import ReportExtras
 from tofuse.report.scene import Scene, finite, make_scene, packed, still
 from tofuse.results.types import FrameRecord, Reconstruction
@@ -84,6 +83,9 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     )
     for part in parts:
         out.update(part(subject))
+    if out["sizes"]:
+        size = " × ".join(row[2 if out["true_sizes"] else 1] for row in out["sizes"])
+        out["facts"].insert(5, ("width × height × depth", size))
     names = {
         "verdict": "Verdict",
         "model": "3D model",
@@ -123,10 +125,6 @@ def _verdict(s: Subject) -> Values:
     statuses: list[str] = [f.status for f in result.diagnostics.frames]
     facts = [(f"frames {name}", f"{statuses.count(name):,}") for name in words.STATUSES]
     facts.append(("model", words.count(s.scene.total, "point")))
-    size = _measured(result.cloud)
-    if size is not None:
-        width, height, depth = size[1] - size[0]
-        facts.append(("size x × y × z", f"{width:.2f} × {height:.2f} × {depth:.2f} m"))
     path = s.scene.after[:, :3, 3]
     if len(path) > 1:
         travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
@@ -182,50 +180,61 @@ def _model(s: Subject) -> Values:
     }
 
 
-def _measured(cloud: Cloud, outer: float = _OUTER) -> Float64 | None:
-    """Return the (2, 3) low and high corners of all but the outermost points, world frame."""
-    points = cloud.points[np.isfinite(cloud.points).all(1)]
-    if len(points) == 0:
-        return None
-    return np.percentile(points, [outer, 100 - outer], axis=0).astype(float) + cloud.offset
-
-
 def _views(s: Subject) -> Values:
-    points, truth = s.scene.points, s.extras.truth_points
+    cloud, truth = s.result.cloud, s.extras.truth_points
+    points = cloud.points[np.isfinite(cloud.points).all(1)].astype(float) + cloud.offset
     true = None
     if truth is not None:
         true = truth[np.isfinite(truth).all(1)].astype(float)
         true = true if len(true) else None
-    measured = _measured(s.result.cloud)
-    if measured is None or len(points) == 0:
-        return {"views": [], "sizes": [], "true_sizes": False, "views_legend": []}
-    path = s.scene.after[:, :3, 3]
+    if len(points) == 0:
+        return dict.fromkeys(("views", "sizes", "views_legend", "views_note"), "") | {
+            "true_sizes": False
+        }
+    R = straight.upright(points, _OUTER) if true is None else straight.boxed(true)
+    points = points @ R.T
+    true = None if true is None else true @ R.T
+    path = s.scene.after[:, :3, 3] @ R.T
+    measured = np.percentile(points, [_OUTER, 100 - _OUTER], axis=0)
     figures = [
         Figure(
             plots.model(points, path, true, view, measured=measured, label=f"Model, {name}"), name
         )
-        for view, name in (("above", "from above"), ("side", "from the side"))
+        for view, name in (("above", "From above"), ("side", "From the side"))
     ]
-    legend = [("after", "", "measured extents"), ("ink", "", "path of the camera")]
+    legend = [("after", "", "measured extents")]
+    if len(path):
+        legend.append(("ink", "", "path of the camera, a dot where it begins"))
     if true is not None:
         legend.insert(0, ("bad", "6 3", "true outline"))
-    sizes = []
-    whole = _measured(s.result.cloud, 0.0)
-    assert whole is not None
-    for axis, name in enumerate(("x (width)", "y (height)", "z (depth)")):
+    return {
+        "views": figures,
+        "sizes": _sizes(points, measured, true),
+        "true_sizes": true is not None,
+        "views_legend": legend,
+        "views_note": _turn_note(R),
+    }
+
+
+def _sizes(points: Float64, measured: Float64, true: Float64 | None) -> list[list[str]]:
+    rows = []
+    for axis, name in enumerate(("width", "height", "depth")):
         got = float(np.ptp(measured[:, axis]))
-        row = [name, words.length(got), words.length(float(np.ptp(whole[:, axis])))]
+        row = [name, words.length(got), words.length(float(np.ptp(points[:, axis])))]
         if true is not None:
             exact = float(np.ptp(true[:, axis]))
             row[1:1] = [words.length(exact)]
             row[3:3] = [words.signed_length(got - exact)]
-        sizes.append(row)
-    return {
-        "views": figures,
-        "sizes": sizes,
-        "true_sizes": true is not None,
-        "views_legend": legend,
-    }
+        rows.append(row)
+    return rows
+
+
+def _turn_note(R: Float64) -> str:
+    angle = float(np.degrees(se3.angle(R)))
+    text = "Right, down and forward are those of the first camera"
+    if angle < 0.25:
+        return text + "."
+    return f"{text}, turned by {angle:.0f}° so that the model lies straight."
 
 
 def _cameras(s: Subject) -> Values:
@@ -454,8 +463,8 @@ def _frames(s: Subject) -> Values:
     out["strip_label"] = "Status of each frame: " + ", ".join(counts)
     first, last = records[0].index, records[-1].index
     out["strip_hint"] = (
-        f"From left to right {words.frame_range(first, last)}. Point at a frame to see why it "
-        "got its status; the table below says the same."
+        f"From left to right {words.frame_range(first, last)}. Point at a frame to see what "
+        "became of it."
     )
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]

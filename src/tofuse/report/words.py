@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.results.types import Reason, Reconstruction, Verdict
+from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import REASONS
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
@@ -83,32 +84,49 @@ def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str
 
 @dataclass(frozen=True)
 class Finding:
-    """A reason for the verdict, as the report shows it."""
+    """The reasons with one code, as the report shows them.
 
-    level: Verdict | str
-    text: str
-    where: str
+    Attributes
+    ----------
+    level
+        "failed", "degraded" or "note".
+    meaning
+        What the code says.
+    texts
+        What each reason says, with its frames where the text does not name them.
+    frames
+        First and last frame of the first reason.
+    advice
+        What a person can do; may be empty.
+    """
+
+    level: str
     meaning: str
+    texts: tuple[str, ...]
+    frames: tuple[int, int]
     advice: str
 
 
 def findings(reasons: Sequence[Reason]) -> list[Finding]:
-    """Return the reasons for a person, the gravest first."""
+    """Return the reasons for a person, one finding for each code, the gravest first."""
     order = {"failed": 0, "degraded": 1, "note": 2}
-    out = []
+    by_code: dict[str, list[Reason]] = {}
     for reason in reasons:
-        level, meaning = REASONS.get(reason.code, ("note", ""))
-        text = reason.text or meaning
-        out.append(
-            Finding(
-                level,
-                text,
-                frame_range(*reason.frames),
-                "" if meaning == text else meaning,
-                ADVICE.get(reason.code, ""),
-            )
-        )
-    return sorted(out, key=lambda f: order[str(f.level)])
+        by_code.setdefault(reason.code, []).append(reason)
+    out = []
+    for code, group in by_code.items():
+        level, meaning = REASONS[code]
+        texts = tuple(_placed(r) for r in group if r.text.strip())
+        out.append(Finding(level, meaning, texts, group[0].frames, ADVICE.get(code, "")))
+    return sorted(out, key=lambda f: order[f.level])
+
+
+def _placed(reason: Reason) -> str:
+    """Add a reason's frames to its text, unless it names them."""
+    text = sentence(reason.text)
+    if {str(k) for k in reason.frames} <= set(re.findall(r"\d+", text)):
+        return text
+    return f"{text} ({frame_range(*reason.frames)})"
 
 
 def sentence(text: str) -> str:
@@ -131,9 +149,15 @@ def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
     grave = [f for f in found if f.level == d.verdict]
     if d.verdict == "good":
         return f"Good: {have}, and no check found fault with the result."
-    first = sentence(grave[0].text) if grave else ""
+    first = look = ""
+    if grave:
+        texts = grave[0].texts
+        first = f" {texts[0] if len(texts) == 1 else grave[0].meaning}"
+        begin, end = grave[0].frames
+        # Frames that are most of the recording are no place to look at.
+        if 2 * (end - begin) < len(d.frames) and str(end) not in first:
+            look = f" Look first at {frame_range(begin, end)}."
     more = f" {count(len(grave) - 1, 'more reason')} below." if len(grave) > 1 else ""
     if d.verdict == "degraded":
-        look = f" Look first at {grave[0].where}." if grave else ""
-        return f"Degraded: use this model with care. {first}{look}{more}"
-    return f"Failed: do not rely on this model; {have}. {first}{more}"
+        return f"Degraded: use this model with care.{first}{look}{more}"
+    return f"Failed: do not rely on this model; {have}.{first}{more}"

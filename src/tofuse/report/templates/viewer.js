@@ -14,7 +14,7 @@
     attribute vec3 place, color, normal;
     uniform mat4 view, lens;
     uniform vec3 low, extent, eye;
-    uniform float size, peel, byHeight, most;
+    uniform float size, peel, shade, byHeight, most;
     uniform vec2 heights;
     varying vec3 tint;
     vec3 ramp(float t) {
@@ -27,7 +27,8 @@
       gl_Position = lens * v;
       if (peel > .5 && dot(normal, eye - p) < 0.) gl_Position = vec4(2., 2., 2., 1.);
       gl_PointSize = clamp(size / max(-v.z, 1e-6), 1., most);
-      tint = byHeight > .5 ? ramp(clamp((-p.y - heights.x) / heights.y, 0., 1.)) : color;
+      tint = byHeight > .5 ? ramp(clamp((-p.y - heights.x) / heights.y, 0., 1.)) : mix(vec3(.14), vec3(1.), color);
+      if (shade > .5) tint *= .6 + .4 * abs(dot(normal, normalize(eye - p)));
     }`;
   const LINES = `
     attribute vec3 place;
@@ -132,6 +133,7 @@
       gl.uniform1f(u("size"), 1.5 * scene.spacing * f * narrow * height / 2);
       gl.uniform1f(u("most"), 10 * ratio);
       gl.uniform1f(u("peel"), on("peel") && buffers.normal ? 1 : 0);
+      gl.uniform1f(u("shade"), buffers.normal ? 1 : 0);
       gl.uniform1f(u("byHeight"), on("height") ? 1 : 0);
       gl.uniform2f(u("heights"), scene.heights[0], Math.max(scene.heights[1] - scene.heights[0], 1e-6));
       attribute(dots, "place", buffers.place, gl.UNSIGNED_SHORT, true);
