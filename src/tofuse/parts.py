@@ -112,7 +112,10 @@ def from_dict(hint: Any, data: Any, *, where: str) -> Any:
         return data
     if origin in (tuple, list, Sequence):
         return _from_sequence(origin, args, data, where)
-    if isinstance(hint, type) and getattr(hint, "part_kind", None) and isinstance(data, Mapping):
+    if isinstance(hint, type) and getattr(hint, "part_kind", None):
+        if not isinstance(data, Mapping):
+            remedy = f"write a table with a part, one of {list(known(hint.part_kind))}"  # type: ignore[attr-defined]
+            raise InputError(f"is {data!r}", where=where, remedy=remedy)
         return _part_from_dict(hint, data, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         if not isinstance(data, Mapping):
@@ -157,7 +160,7 @@ def _part_from_dict(interface: type, data: Mapping[str, Any], where: str) -> Any
     options = dict(data)
     name = options.pop("part", getattr(interface, "part_name", None))
     choices = known(kind)
-    if name not in choices:
+    if not isinstance(name, str) or name not in choices:
         raise InputError(
             f"there is no {kind} called {name!r}", where=where, remedy=f"use one of {list(choices)}"
         )
@@ -173,7 +176,7 @@ def _dataclass_from_dict(cls: type, data: Mapping[str, Any], where: str) -> Any:
             f"unknown option {unknown[0]!r}", where=where, remedy=f"use one of {list(fields)}"
         )
     values = {
-        key: from_dict(hints[key], value, where=f"{where}.{key}") for key, value in data.items()
+        key: from_dict(hints[key], value, where=_inside(where, key)) for key, value in data.items()
     }
     try:
         return cls(**values)
@@ -181,6 +184,11 @@ def _dataclass_from_dict(cls: type, data: Mapping[str, Any], where: str) -> Any:
         raise InputError(f"is incomplete ({error})", where=where) from error
     except ValueError as error:
         raise InputError(str(error), where=where) from error
+
+
+def _inside(where: str, key: str) -> str:
+    """Name a field: the file, a colon, and the path of fields in it."""
+    return f"{where}.{key}" if ": " in where else f"{where}: {key}"
 
 
 def _plain(hint: Any, data: Any, where: str) -> Any:

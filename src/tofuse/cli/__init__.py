@@ -31,6 +31,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output went away (`tofuse ... | head`): not an error of ours.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        # What the rooms have not turned into a message of their own.
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"tofuse: {where}{error.strerror or error}", file=sys.stderr)
+        return 2
     except MemoryError:
         print(
             "tofuse: out of memory; use --every, --max-depth or a larger voxel_m", file=sys.stderr

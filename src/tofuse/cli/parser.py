@@ -61,7 +61,7 @@ def _command(
     )
 
     def call(arguments: argparse.Namespace) -> int:
-        from tofuse.cli import commands as functions
+        import tofuse.cli.commands as functions
 
         function: Callable[[argparse.Namespace], int] = getattr(functions, name)
         return function(arguments)
@@ -80,8 +80,8 @@ def _run(commands: Any) -> None:
     g = p.add_argument_group("what to read")
     g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    g.add_argument("--start", type=int, default=0, metavar="I", help="first frame (0)")
-    g.add_argument("--end", type=int, metavar="I", help="stop before this frame")
+    g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
+    g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
     g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
     g.add_argument("--min-depth", type=_metres, metavar="M", help="drop points nearer than this")
     g.add_argument("--max-depth", type=_metres, metavar="M", help="drop points beyond this")
@@ -189,22 +189,32 @@ def _experiments(commands: Any) -> None:
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
 
 
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
+
+
 def _count(text: str) -> int:
-    value = int(text)
+    value = _whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
     return value
 
 
 def _seed_number(text: str) -> int:
-    value = int(text)
+    value = _whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
 
 
 def _metres(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not math.isfinite(value) or value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a distance in metres")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a distance in metres")
     return value

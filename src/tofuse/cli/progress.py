@@ -108,8 +108,24 @@ class JsonProgress:
         emit({"event": "note", "text": text})
 
 
-class QuietProgress(JsonProgress):
-    """Notes on standard error and nothing else, for logs and pipes."""
+class QuietProgress:
+    """Notes on standard error and nothing else, for logs and pipes.
+
+    They come at the end of a job that succeeded: one that fails says its one line alone.
+    """
+
+    def __init__(self) -> None:
+        self._notes: list[str] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            for text in self._notes:
+                print(f"note: {text}", file=sys.stderr)
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Say nothing."""
@@ -118,11 +134,11 @@ class QuietProgress(JsonProgress):
         """Say nothing."""
 
     def note(self, text: str) -> None:
-        """Print the note."""
-        print(f"note: {text}", file=sys.stderr)
+        """Keep the note for the end."""
+        self._notes.append(text)
 
 
-def progress_for(*, as_json: bool) -> TerminalProgress | JsonProgress:
+def progress_for(*, as_json: bool) -> TerminalProgress | JsonProgress | QuietProgress:
     """Choose by who is looking: a program, a terminal, or a log."""
     if as_json:
         return JsonProgress()

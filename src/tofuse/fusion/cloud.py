@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.kernels.threads import thread_count
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 
 Float32 = NDArray[np.float32]
@@ -212,7 +213,7 @@ def _normals(points: Float64, towards: Float64, neighbours: int) -> Float32 | No
     k = min(neighbours, len(points))
     if k < 3:
         return None
-    _, near = cKDTree(points).query(points, k=k, workers=-1)
+    _, near = cKDTree(points).query(points, k=k, workers=thread_count())
     out = np.empty((len(points), 3), np.float32)
     for start in range(0, len(points), 50_000):  # bounds the memory of the gathered neighbours
         part = slice(start, start + 50_000)

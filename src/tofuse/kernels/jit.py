@@ -7,8 +7,10 @@ temporary folder stands in where the home is read-only.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -34,20 +36,24 @@ def source_hash() -> str:
 @cache
 def cache_folder() -> str:
     """Return a folder that can be written, the same in every run where the machine allows it."""
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        base = Path(os.environ["NUMBA_CACHE_DIR"])
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", tempfile.gettempdir())) / "tofuse"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tofuse"
-    folder = base / f"kernels-{source_hash()}"
     try:
+        folder = _base() / f"kernels-{source_hash()}"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return str(folder)
     except (OSError, RuntimeError):
         # Private to this process: compiled code must never be loaded from a folder others own.
-        return tempfile.mkdtemp(prefix="tofuse-kernels-")
+        private = tempfile.mkdtemp(prefix="tofuse-kernels-")
+        atexit.register(shutil.rmtree, private, ignore_errors=True)
+        return private
+
+
+def _base() -> Path:
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(os.environ["NUMBA_CACHE_DIR"])
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", tempfile.gettempdir())) / "tofuse"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tofuse"
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,7 +17,11 @@ from typing import TypeVar
 R = TypeVar("R")
 
 _count = max(1, os.cpu_count() or 1)
-_pool: ThreadPoolExecutor | None = None
+# A pool for each number of threads that was asked for: none is ever shut down, as another Python
+# thread may be using it.
+_pools: dict[int, ThreadPoolExecutor] = {}
+_lock = threading.Lock()
+_here = threading.local()
 
 
 def thread_count() -> int:
@@ -26,12 +31,9 @@ def thread_count() -> int:
 
 def set_thread_count(count: int) -> None:
     """Use `count` (1 or more) threads from now on."""
-    global _count, _pool
+    global _count
     if count < 1:
         raise ValueError("the number of threads must be at least 1")
-    if count != _count and _pool is not None:
-        _pool.shutdown(wait=True)
-        _pool = None
     _count = count
 
 
@@ -56,15 +58,26 @@ def chunk_bounds(size: int, chunks: int = 16) -> list[tuple[int, int]]:
 def run_chunks(function: Callable[[int, int], R], size: int, chunks: int = 16) -> list[R]:
     """Return [function(start, stop) for each chunk], in chunk order, computed on the pool.
 
-    Must not be called from inside a chunk.
+    An exception in a chunk is raised here: that of the first chunk that failed. Called from inside
+    a chunk, the work is done there and then, as waiting for the pool could last for ever.
     """
-    global _pool
     bounds = chunk_bounds(size, chunks)
-    if _count == 1 or len(bounds) <= 1:
+    if _count == 1 or len(bounds) <= 1 or getattr(_here, "inside", False):
         return [function(a, b) for a, b in bounds]
-    if _pool is None:
-        _pool = ThreadPoolExecutor(_count, thread_name_prefix="tofuse")
-    return list(_pool.map(lambda ab: function(*ab), bounds))
+    return list(_pool(_count).map(lambda ab: function(*ab), bounds))
+
+
+def _pool(count: int) -> ThreadPoolExecutor:
+    with _lock:
+        if count not in _pools:
+            _pools[count] = ThreadPoolExecutor(
+                count, thread_name_prefix="tofuse", initializer=_mark_inside
+            )
+        return _pools[count]
+
+
+def _mark_inside() -> None:
+    _here.inside = True
 
 
 def run_all(tasks: Sequence[Callable[[], R]]) -> list[R]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from dataclasses import fields
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tofuse.errors import InputError
+from tofuse.errors import OutputError
+from tofuse.files.atomic import write_text
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.pipeline.run import Options, run
-from tofuse.results.output import RECORDING, OutputFolder
+from tofuse.pipeline.run import Options, resolve, run
+from tofuse.results.output import RECORDING, UNFINISHED, OutputFolder
 from tofuse.results.types import Reconstruction
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate
@@ -40,23 +44,53 @@ def demo(
         If nothing could be written; see the message for the remedy.
     """
     progress = progress or Silent()
-    OutputFolder(out, overwrite=overwrite).discard()
-    recording = out / RECORDING
-    simulate_to(scene, recording, seed=seed, overwrite=True, progress=progress)
-    config = None
-    if scene == "peaks":
-        config = recording / "peaks.toml"
-        config.write_text(PEAKS_CONFIG, encoding="utf-8")
     options = Options(
         out=out,
         method=method,
-        config=config,
         seed=seed,
         threads=threads,
         overwrite=True,
         **_SCENE_OPTIONS.get(scene, {}),
     )
-    return run([recording], options, progress)
+    # Whatever is wrong with the options or the folder is said before the work begins.
+    resolve(options)
+    folder = OutputFolder(out, overwrite=overwrite)
+    try:
+        with _replacing_recording(out / RECORDING) as fresh:
+            simulate_to(scene, fresh, seed=seed, progress=progress)
+            if scene == "peaks":
+                write_text(fresh / "peaks.toml", PEAKS_CONFIG)
+                options = replace(options, config=out / RECORDING / "peaks.toml")
+            os.replace(fresh, out / RECORDING)
+            return run([out / RECORDING], options, progress)
+    finally:
+        folder.discard()
+
+
+@contextmanager
+def _replacing_recording(path: Path) -> Iterator[Path]:
+    """Give a path to make a recording at, to be moved to `path`; a failure puts the old one back.
+
+    Only a simulated recording is ever replaced.
+    """
+    fresh, old = path.parent / f"{UNFINISHED}simulating", path.parent / f"{UNFINISHED}replaced"
+    if path.exists() and not (path / "truth").is_dir():
+        raise OutputError(
+            "is no simulated recording", where=path, remedy="move it away, or give another --out"
+        )
+    for left in (fresh, old):
+        shutil.rmtree(left, ignore_errors=True)
+    if path.exists():
+        os.replace(path, old)
+    try:
+        yield fresh
+    except BaseException:
+        for made in (fresh, path):
+            shutil.rmtree(made, ignore_errors=True)
+        if old.exists():
+            os.replace(old, path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 # Section 4.1.6: all points, a resolution of 1 m, no filters; loops would be 3 m apart.
@@ -85,12 +119,11 @@ def simulate_to(
     without: tuple[str, ...] = (),
     correction: bool = True,
     sigma: float | None = None,
-    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
     """Write a simulated recording; returns how many frames it has.
 
-    `without` names fields of `Effects` to switch off, or "all".
+    `without` names effects to switch off, or is ("all",); see `Effects.without`.
 
     Raises
     ------
@@ -100,7 +133,7 @@ def simulate_to(
         If the folder can't be written, or holds something already.
     """
     progress = progress or Silent()
-    effects = effects_without(without)
+    effects = Effects().without(*without)
     seen = 0
 
     def tell(done: int, total: int) -> None:
@@ -110,39 +143,24 @@ def simulate_to(
         seen = done
         progress.advance()
 
-    if overwrite:
-        _clear_recording(out)
+    ours = not out.exists() or (out.is_dir() and not any(out.iterdir()))
     options: dict[str, Any] = {} if sigma is None else {"sigma_m": sigma}
-    simulate(
-        scene,
-        out,
-        camera=camera,
-        seed=seed,
-        effects=effects,
-        every=every,
-        frames=frames,
-        correction=correction,
-        texture=texture,
-        progress=tell,
-        **options,
-    )
+    try:
+        simulate(
+            scene,
+            out,
+            camera=camera,
+            seed=seed,
+            effects=effects,
+            every=every,
+            frames=frames,
+            correction=correction,
+            texture=texture,
+            progress=tell,
+            **options,
+        )
+    except BaseException:
+        if ours:
+            shutil.rmtree(out, ignore_errors=True)
+        raise
     return seen or len(list(out.glob("cloud/*.ply")))
-
-
-def effects_without(names: tuple[str, ...]) -> Effects:
-    """Return all effects but those named; InputError for a name that is none."""
-    known = [f.name for f in fields(Effects) if f.name != "noise"]
-    if names == ("all",):
-        return Effects.none()
-    changes: dict[str, Any] = {}
-    for name in names:
-        if name not in known:
-            raise InputError(f"is {name!r}", where="--without", remedy=f"use some of {known}")
-        changes[name] = False if isinstance(getattr(Effects, name), bool) else 0.0
-    return Effects(**changes)
-
-
-def _clear_recording(out: Path) -> None:
-    """Remove an earlier simulated recording, and nothing else."""
-    if (out / "truth").is_dir():
-        shutil.rmtree(out)

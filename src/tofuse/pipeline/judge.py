@@ -81,8 +81,11 @@ def _poses(e: Evidence) -> Iterator[Reason]:
     for first, last in stretches(e.records, "skipped"):
         text = f"{_frames(first, last)} not been read."
         yield Reason("unreadable_frames", (first, last), text)
-    if len(readable) - len(lost) == 1 and len(readable) == 1:
-        yield Reason("single_frame", everything, "There was one frame only, nothing to register.")
+    posed = [r for r in readable if r.status != "lost"]
+    if len(posed) == 1:
+        frame = posed[0].index
+        text = f"Only frame {frame} has a pose, so there was nothing to register."
+        yield Reason("single_frame", (frame, frame), text)
 
 
 def _registrations(e: Evidence) -> Iterator[Reason]:
@@ -116,26 +119,40 @@ def _loops(e: Evidence) -> Iterator[Reason]:
         if (loop.i, loop.j) in e.given and not loop.accepted:
             text = f"The loop {loop.i} to {loop.j} given by hand was not used: {loop.reason}."
             yield Reason("loop_rejected", (loop.i, loop.j), text)
+    yield from _gap(e)
+    if not e.optimisation.converged:
+        text = "The optimiser ran out of iterations before it settled."
+        yield Reason("optimiser_gave_up", (first, last), text)
+
+
+def _gap(e: Evidence) -> Iterator[Reason]:
+    """Tell of the loop whose ends were furthest apart, compared with what its path allows."""
+    graph = e.optimisation.graph
     steps = np.linalg.norm(np.diff(e.sequential[:, :3, 3], axis=0), axis=1)
     turns = se3.angle(se3.inverse(e.sequential[:-1]) @ e.sequential[1:])
+    wide: list[tuple[float, int, int, float, float]] = []
     for (i, j), measured in zip(
         graph.edges[graph.loop], graph.measurements[graph.loop], strict=True
     ):
         a, b = min(i, j), max(i, j)
         gap = se3.inverse(measured) @ se3.inverse(e.sequential[i]) @ e.sequential[j]
         distance, angle = float(np.linalg.norm(gap[:3, 3])), float(se3.angle(gap))
-        too_far = distance > max(GAP_FLOOR_M, GAP_SHARE * float(steps[a:b].sum()))
-        too_bent = angle > max(GAP_FLOOR_RAD, GAP_SHARE * float(turns[a:b].sum()))
-        if too_far or too_bent:
-            ends = (int(graph.ids[a]), int(graph.ids[b]))
-            text = (
-                f"Before the loop {ends[0]} to {ends[1]} was closed its ends were "
-                f"{distance:.3f} m and {np.degrees(angle):.1f} degrees apart."
-            )
-            yield Reason("loop_gap", ends, text)
-    if not e.optimisation.converged:
-        text = "The optimiser ran out of iterations before it settled."
-        yield Reason("optimiser_gave_up", (first, last), text)
+        excess = max(
+            distance / max(GAP_FLOOR_M, GAP_SHARE * float(steps[a:b].sum())),
+            angle / max(GAP_FLOOR_RAD, GAP_SHARE * float(turns[a:b].sum())),
+        )
+        if excess > 1:
+            wide.append((excess, int(graph.ids[a]), int(graph.ids[b]), distance, angle))
+    if not wide:
+        return
+    _, first, last, distance, angle = max(wide)
+    closed = int(graph.loop.sum())
+    many = f" {len(wide)} of {closed} loops had too wide a gap; this is the worst." * (closed > 1)
+    text = (
+        f"Before the loop {first} to {last} was closed, its ends were {distance:.3f} m and "
+        f"{np.degrees(angle):.1f} degrees from where it puts them.{many}"
+    )
+    yield Reason("loop_gap", (first, last), text)
 
 
 def _images(e: Evidence) -> Iterator[Reason]:
@@ -143,10 +160,9 @@ def _images(e: Evidence) -> Iterator[Reason]:
     if a is None or a.pairs == 0:
         return
     frames = (int(e.optimisation.graph.ids[0]), int(e.optimisation.graph.ids[-1]))
-    found = (
-        f"{a.inlier_share:.0%} of what overlapping images saw agrees, with "
-        f"{a.rms_m * 1e3:.0f} mm rms"
-    )
+    found = f"{a.inlier_share:.0%} of what overlapping images saw agrees"
+    if np.isfinite(a.rms_m):
+        found += f", with {a.rms_m * 1e3:.1f} mm rms"
     if a.inlier_share < CONTRADICTED_SHARE:
         yield Reason("images_disagree", frames, f"Only {found}.")
         return
@@ -158,7 +174,7 @@ def _images(e: Evidence) -> Iterator[Reason]:
     share = inliers / max(compared, 1)
     rms = float(np.sqrt(sum(p.squares for p in near) / max(inliers, 1)))
     if a.inlier_share < AGREEMENT_RATIO * share or a.rms_m > RMS_RATIO * rms:
-        text = f"{found}; images next to each other reach {share:.0%} and {rms * 1e3:.0f} mm."
+        text = f"{found}; images next to each other reach {share:.0%} and {rms * 1e3:.1f} mm."
         yield Reason("images_differ", frames, text)
 
 

@@ -129,26 +129,31 @@ class Mapper:
         return step.T_world_camera
 
     def skip(self, index: int, timestamp: float, reason: str) -> None:
-        """Say that a frame could not be read."""
+        """Say that a frame could not be read; InputError if its index does not grow."""
+        self._check_order(index)
         self._records.append(FrameRecord(index, timestamp, "skipped", reason))
         self._steps.append(None)
         self._progress.advance(self._records[-1])
 
     def _check(self, frame: Frame) -> None:
+        self._check_order(frame.index)
+        kind = "range" if isinstance(frame, RangeFrame) else "cloud"
+        if self._kind and kind != self._kind:
+            raise InputError(
+                f"is a {kind} view among {self._kind} views",
+                where=f"frame {frame.index}",
+                remedy="give images only, or clouds only",
+            )
+        check_views(self.config, kind)
+        self._kind = kind
+
+    def _check_order(self, index: int) -> None:
         if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
-        kind = "range" if isinstance(frame, RangeFrame) else "cloud"
-        if not self._kind:
-            check_views(self.config, kind)
-            self._kind = kind
-        if kind != self._kind:
-            raise InputError(
-                f"is a {kind} view among {self._kind} views", where=f"frame {frame.index}"
-            )
-        if self._records and frame.index <= self._records[-1].index:
+        if self._records and index <= self._records[-1].index:
             raise InputError(
                 f"comes after frame {self._records[-1].index}",
-                where=f"frame {frame.index}",
+                where=f"frame {index}",
                 remedy="number the frames in the order in which they are pushed",
             )
 
@@ -187,6 +192,8 @@ class Mapper:
         InputError
             If no frame has a pose: there is nothing to make a model of.
         """
+        if self._finished:
+            raise InputError("is finished", where="mapper", remedy="make a new Mapper")
         self._finished = True
         if not self._views:
             raise InputError(

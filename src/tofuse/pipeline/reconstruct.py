@@ -97,7 +97,7 @@ def past_frames(
     past = []
     for k in range(max(0, index - count), index):
         try:
-            past.append(known.get(k) or recording.source.read(k))
+            past.append(known[k] if k in known else recording.source.read(k))
         except UnreadableFrameError:
             continue
     return past

@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from tofuse.files.trajectory import write_tum
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.results.types import Reconstruction
 
-STAGING = ".tofuse-unfinished"
+UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
+STAGING = f"{UNFINISHED}unfinished"
 RECORDING = "recording"  # what `tofuse demo` puts beside its result
 
 
@@ -41,20 +42,23 @@ class OutputFolder:
             not given, or can't be written.
         """
         self.path = Path(path)
+        self._staging = self.path / STAGING
+        self._made: list[Path] = []
         try:
             self._check(overwrite)
+            self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
-            self._staging = self.path / STAGING
             shutil.rmtree(self._staging, ignore_errors=True)
             self._staging.mkdir()
         except OSError as error:
+            self.discard()
             raise _output_error(self.path, error) from error
 
     def _check(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise OutputError("is a file", where=self.path, remedy="give --out a folder")
         entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
-        entries -= {STAGING}
+        entries -= {name for name in entries if name.startswith(UNFINISHED)}
         if not entries:
             return
         if not is_result(self.path) and entries - {RECORDING}:
@@ -65,7 +69,7 @@ class OutputFolder:
             )
         if not overwrite:
             raise OutputError(
-                "holds an earlier result",
+                "holds an earlier result" if "run.json" in entries else "holds a recording",
                 where=self.path,
                 remedy="give --overwrite to replace it, or another --out",
             )
@@ -79,18 +83,36 @@ class OutputFolder:
         try:
             yield self._staging
             files = sorted(self._staging.iterdir(), key=lambda p: (p.name == "run.json", p.name))
-            for file in files:
-                os.replace(file, self.path / file.name)
+            _move_all(files, self.path, self._staging / "replaced")
         except OSError as error:
             raise _output_error(self.path, error) from error
         finally:
             self.discard()
 
     def discard(self) -> None:
-        """Remove what is unfinished, and the folder itself if nothing else is in it."""
+        """Remove what is unfinished, and the folders made for it if nothing else is in them."""
         shutil.rmtree(self._staging, ignore_errors=True)
         with contextlib.suppress(OSError):
-            self.path.rmdir()
+            for folder in self._made:
+                folder.rmdir()
+
+
+def _move_all(files: Sequence[Path], folder: Path, aside: Path) -> None:
+    """Move files into a folder: all of them, or none, with what was there put back."""
+    aside.mkdir()
+    undo: list[tuple[Path, Path]] = []
+    try:
+        for file in files:
+            target = folder / file.name
+            if target.exists():
+                os.replace(target, aside / file.name)
+                undo.append((aside / file.name, target))
+            os.replace(file, target)
+            undo.append((target, file))
+    except BaseException:
+        for now, before in reversed(undo):
+            os.replace(now, before)
+        raise
 
 
 def _output_error(path: Path, error: OSError) -> OutputError:
@@ -147,7 +169,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
         {
             "schema": 1,
             "version": __version__,
-            "input": result.recording,
+            "input": {key: result.recording[key] for key in ("path", "format", "frames")},
             "seed": result.seed,
             "threads": result.threads,
             "config": result.config,
