@@ -433,6 +433,18 @@ def test_writer_refuses_what_would_not_read_back(tmp_path: Path) -> None:
         RecordingWriter(tmp_path / "a", PINHOLE)
 
 
+def test_the_example_of_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0]
+    about = json.loads(page.split("```json\n")[1].split("```")[0])
+    monkeypatch.chdir(tmp_path)
+    exec(code, {"depth_images": np.full((2, 424, 512), 1.5, np.float32)})
+    source = NativeSource(tmp_path / "my_recording")
+    assert source.read(1).points[:, 2] == pytest.approx(1.5, abs=1e-4)
+    written = json.loads((tmp_path / "my_recording" / "camera.json").read_text())
+    assert written == about
+
+
 def test_same_frames_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write(tmp_path / name, camera=CAMERAS[4])

@@ -315,6 +315,12 @@ def test_xyz(tmp_path: Path) -> None:
     assert frames[4].color[0].tolist() == [51, 51, 51]
 
 
+def test_map_coordinates_warn(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("500000.123 4000000.456 3\n")
+    (warning,) = open_recording(tmp_path / "a.xyz").warnings
+    assert "kept only to 0.25 m" in warning
+
+
 def test_slam6d_axes_units_and_poses(tmp_path: Path) -> None:
     """A left-handed world in cm: x right, y up, z forward."""
     (tmp_path / "scan000.3d").write_text("3\n100 200 300\n0 0 0\n-50 0 10\n")

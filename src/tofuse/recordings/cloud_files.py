@@ -19,6 +19,9 @@ from tofuse.recordings.sources import FileSource, check_timestamps, tum_poses
 
 Float64 = NDArray[np.float64]
 
+# From here on float32 steps by more than half a millimetre.
+MAP_COORDINATES_M = 8192.0
+
 LoadFrame = Callable[[Path, int, float], Frame]
 
 
@@ -38,6 +41,7 @@ class CloudFileSource(FileSource):
     def __init__(self, path: Path, files: list[Path], load_frame: LoadFrame) -> None:
         super().__init__(np.arange(len(files), dtype=float))
         self.files, self.load_frame = files, load_frame
+        self._far = False
         if is_folder(path):
             self._read_timestamps(path / "timestamps.txt")
             if is_file(path / "groundtruth.txt"):
@@ -49,7 +53,16 @@ class CloudFileSource(FileSource):
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
-        return self.load_frame(self.files[index], index, float(self.timestamps[index]))
+        frame = self.load_frame(self.files[index], index, float(self.timestamps[index]))
+        farthest = float(np.abs(frame.points).max(initial=0))
+        if farthest > MAP_COORDINATES_M and not self._far:
+            self._far = True
+            step = float(np.spacing(np.float32(farthest)))
+            self.warnings.append(
+                f"{self.files[index]}: coordinates of up to {farthest:.3g} m are kept only to "
+                f"{step:.2g} m; move the clouds near the origin"
+            )
+        return frame
 
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):

@@ -174,10 +174,11 @@ class JoinedSource:
         times: list[Float64] = []
         for part, name in zip(self.parts, names, strict=True):
             own = part.timestamps
-            if times and own[0] <= times[-1][-1]:
+            last = max((float(t.max()) for t in times), default=-np.inf)
+            if own.min() <= last:
                 steps = np.diff(own)
                 step = float(np.median(steps)) if len(steps) else 1.0
-                shift = float(times[-1][-1]) + max(step, 1e-3) - float(own[0])
+                shift = last + max(step, 1e-3) - float(own.min())
                 own = own + shift
                 self.warnings.append(f"{name}: starts anew in time, moved on by {shift:.6g} s")
             times.append(own)
