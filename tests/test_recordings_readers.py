@@ -260,6 +260,17 @@ def test_pcd_of_another_camera_among_them(tmp_path: Path) -> None:
         recording[11]
 
 
+@pytest.mark.parametrize("value", [3e38, -3e38, 1e20, 1e-40, 0.0, np.inf])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_absurd_numbers_in_an_organised_pcd(tmp_path: Path, value: float, axis: int) -> None:
+    for count in (1, 1200):
+        points = pcd_points(CAMERA, 1)
+        points.reshape(-1, 3)[:count, axis] = value
+        (tmp_path / "a.pcd").write_bytes(pcd_bytes(points))
+        frame = open_recording(tmp_path / "a.pcd")[0]
+        assert (np.abs(frame.points) < 1e9).all()
+
+
 def test_a_file_that_only_claims_to_be_pcd(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_text("This is no point cloud.\n" * 100)
     with pytest.raises(InputError, match="is no PCD file"):

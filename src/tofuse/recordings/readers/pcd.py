@@ -27,6 +27,7 @@ TOLERANCE_M = 5e-4
 TOLERANCE_SHARE = 1e-4
 # A lens this near to a pinhole is one: 0.01 px is 0.2 mm at 10 m.
 PINHOLE_PIXELS = 0.01
+STEEPEST = 100.0  # slope of a ray: 89.4 degrees off the axis
 
 
 @part("reader", "pcd", label="validated")
@@ -138,6 +139,8 @@ def common_camera(files: list[Path]) -> Camera | None:
         fit = table.fit
     except (InputError, np.linalg.LinAlgError):
         return None
+    if min(fit.fx, fit.fy) < 0.1:
+        return table
     known = np.asarray(np.isfinite(rays).all(-1))
     error = np.abs((fit.rays() - rays)[known]) * (fit.fx, fit.fy)
     return fit if error.max() < PINHOLE_PIXELS else table
@@ -157,7 +160,10 @@ def _common_rays(images: list[Float32]) -> Float32 | None:
         above += np.where(measured[..., None], image[..., :2], 0) * z[..., None]
         below += z**2
     with np.errstate(invalid="ignore", divide="ignore"):
-        rays = (above / np.where(below > 0, below, np.nan)[..., None]).astype(np.float32)
+        slopes = above / np.where(below > 0, below, np.nan)[..., None]
+    if (np.abs(slopes) > STEEPEST).any():
+        return None
+    rays = slopes.astype(np.float32)
     fits = all(_fits(image, mask, rays) for image, mask in zip(images, masks, strict=True))
     return rays if fits else None
 
