@@ -266,6 +266,7 @@ def model(
         origin="lower",
         interpolation="none",
         aspect="auto",
+        zorder=1,  # over the grid
     )
     if true is not None and len(true):
         _outline(axes, true)

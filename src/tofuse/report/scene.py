@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ class Scene:
 
     points: Float64
     colors: UInt8
-    normals: Float32 | None
+    normals: Float32 | Float64 | None
     total: int
     spacing: float
     before: Float64
@@ -53,24 +53,42 @@ class Scene:
     loops: Float64
 
     @property
+    def box(self) -> Float64:
+        """(2, 3) corners of the box around what is worth showing, without the outermost points.
+
+        Cameras count where they are not far off, as those that go round an object.
+        """
+        points, cameras = self.points, self.after[:, :3, 3]
+        boxes = [np.percentile(p, [3, 97], axis=0) for p in (points, cameras) if len(p)]
+        if not boxes:
+            return np.zeros((2, 3))
+        both = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
+        far = np.linalg.norm(np.ptp(both, axis=0)) > 4 * np.linalg.norm(np.ptp(boxes[0], axis=0))
+        return boxes[0] if far else both
+
+    @property
     def center(self) -> Float64:
-        """(3,) what the view turns about: the middle of all but the outermost points."""
-        spots = self._spots()
-        if len(spots) == 0:
-            return np.zeros(3)
-        return np.percentile(spots, [1, 99], axis=0).mean(0)
+        """(3,) what the view turns about."""
+        return self.box.mean(0)
 
     @property
     def size(self) -> float:
-        """Diagonal in m of the box around all but the outermost points; never 0."""
-        spots = self._spots()
-        if len(spots) == 0:
-            return 1.0
-        low, high = np.percentile(spots, [1, 99], axis=0)
-        return max(float(np.linalg.norm(high - low)), 1e-3)
+        """Diagonal of the box in m; never 0."""
+        return max(float(np.linalg.norm(np.ptp(self.box, axis=0))), 1e-3)
 
-    def _spots(self) -> Float64:
-        return self.points if len(self.points) else self.after[:, :3, 3]
+    def turned(self, R: Float64) -> Scene:
+        """Return the scene in axes that are the rows of R (3, 3)."""
+        T = np.eye(4)
+        T[:3, :3] = R
+        return replace(
+            self,
+            points=self.points @ R.T,
+            normals=None if self.normals is None else self.normals @ R.T,
+            before=T @ self.before,
+            after=T @ self.after,
+            reference=T @ self.reference,
+            loops=self.loops @ R.T,
+        )
 
 
 def finite(poses: Float64 | None) -> Float64:
@@ -114,7 +132,7 @@ def packed(scene: Scene) -> dict[str, Any]:
     high = scene.points.max(0) if len(scene.points) else np.ones(3)
     extent = np.maximum(high - low, 1e-6)
     steps = np.round((scene.points - low) / extent * 65535).astype("<u2")
-    normals = scene.normals
+    normals = None if scene.normals is None else np.nan_to_num(scene.normals.astype(float))
     step = -(-max(len(scene.after), len(scene.before), 1) // MAX_CAMERAS)
     edge = 0.018 * scene.size
     return {
@@ -129,9 +147,7 @@ def packed(scene: Scene) -> dict[str, Any]:
         "pitch": PITCH,
         "points": _base64(steps),
         "colors": _base64(scene.colors),
-        "normals": None
-        if normals is None
-        else _base64(np.round(np.nan_to_num(normals) * 127).astype(np.int8)),
+        "normals": None if normals is None else _base64(np.round(normals * 127).astype(np.int8)),
         "lines": {
             "before": _base64(camera_lines(scene.before, edge, step).astype("<f4")),
             "after": _base64(camera_lines(scene.after, edge, step).astype("<f4")),
@@ -170,7 +186,7 @@ def still(scene: Scene, size: tuple[int, int] = (960, 600)) -> UInt8:
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = -R @ scene.center
-    distance = 1.25 * scene.size
+    distance = 1.45 * scene.size
     scale = size[1] / (2 * np.tan(0.35) * distance)
     points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
     if scene.normals is not None and len(points):

@@ -45,6 +45,10 @@ class Subject:
         (N,) frame index of each row of the trajectory.
     rows
         The row of each frame index.
+    points, truth
+        (N, 3) and (K, 3) finite points of the model and of the true surfaces, world frame.
+    straight
+        (3, 3) axes, as rows, in which the model lies straight.
     """
 
     result: Reconstruction
@@ -53,6 +57,9 @@ class Subject:
     rows: dict[int, int]
     reference: Float64 | None
     scene: Scene
+    points: Float64
+    truth: Float64 | None
+    straight: Float64
 
 
 def sections(result: Reconstruction, extras: ReportExtras) -> Values:
@@ -65,7 +72,13 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     ):
         reference = None
     scene = make_scene(result, rows, reference)
-    subject = Subject(result, extras, index, rows, reference, scene)
+    cloud, truth = result.cloud, extras.truth_points
+    points = cloud.points[np.isfinite(cloud.points).all(1)].astype(float) + cloud.offset
+    if truth is not None:
+        truth = truth[np.isfinite(truth).all(1)]
+    true = truth.astype(float) if truth is not None and len(truth) else None
+    axes = straight.upright(points, _OUTER) if true is None else straight.boxed(true)
+    subject = Subject(result, extras, index, rows, reference, scene, points, true, axes)
     out: Values = {}
     parts: tuple[Callable[[Subject], Values], ...] = (
         _verdict,
@@ -119,7 +132,7 @@ def _row_indices(result: Reconstruction) -> Float64:
 
 def _verdict(s: Subject) -> Values:
     result = s.result
-    found = words.findings(result.diagnostics.reasons)
+    found = words.findings(result.diagnostics.reasons, len(result.diagnostics.frames))
     text = words.verdict_sentence(result, found)
     head, _, tail = text.partition(":")
     statuses: list[str] = [f.status for f in result.diagnostics.frames]
@@ -170,30 +183,25 @@ def _model(s: Subject) -> Values:
         toggles.append(("reference", "Reference path", "#8a8f98", False))
     if len(scene.loops):
         toggles.append(("loops", "Loops", "#5fd08a", True))
+    laid = scene.turned(s.straight)
     shown = len(scene.points)
     thinned = "" if shown == scene.total else f"{shown:,} of {scene.total:,} points are shown."
     return {
-        "scene": packed(scene),
-        "still": images.data_uri(still(scene)),
+        "scene": packed(laid),
+        "still": images.data_uri(still(laid)),
         "toggles": toggles,
         "thinned": thinned,
     }
 
 
 def _views(s: Subject) -> Values:
-    cloud, truth = s.result.cloud, s.extras.truth_points
-    points = cloud.points[np.isfinite(cloud.points).all(1)].astype(float) + cloud.offset
-    true = None
-    if truth is not None:
-        true = truth[np.isfinite(truth).all(1)].astype(float)
-        true = true if len(true) else None
-    if len(points) == 0:
+    if len(s.points) == 0:
         return dict.fromkeys(("views", "sizes", "views_legend", "views_note"), "") | {
             "true_sizes": False
         }
-    R = straight.upright(points, _OUTER) if true is None else straight.boxed(true)
-    points = points @ R.T
-    true = None if true is None else true @ R.T
+    R = s.straight
+    points = s.points @ R.T
+    true = None if s.truth is None else s.truth @ R.T
     path = s.scene.after[:, :3, 3] @ R.T
     measured = np.percentile(points, [_OUTER, 100 - _OUTER], axis=0)
     figures = [
@@ -232,7 +240,7 @@ def _sizes(points: Float64, measured: Float64, true: Float64 | None) -> list[lis
 def _turn_note(R: Float64) -> str:
     angle = float(np.degrees(se3.angle(R)))
     text = "Right, down and forward are those of the first camera"
-    if angle < 0.25:
+    if angle < 0.5:
         return text + "."
     return f"{text}, turned by {angle:.0f}° so that the model lies straight."
 

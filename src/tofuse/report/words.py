@@ -93,7 +93,7 @@ class Finding:
     meaning
         What the code says.
     texts
-        What each reason says, with its frames where the text does not name them.
+        What each reason says, with its frames where that tells more.
     frames
         First and last frame of the first reason.
     advice
@@ -107,8 +107,11 @@ class Finding:
     advice: str
 
 
-def findings(reasons: Sequence[Reason]) -> list[Finding]:
-    """Return the reasons for a person, one finding for each code, the gravest first."""
+def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
+    """Return the reasons for a person, one finding for each code, the gravest first.
+
+    `total` is the number of frames: what concerns most of them is said without their numbers.
+    """
     order = {"failed": 0, "degraded": 1, "note": 2}
     by_code: dict[str, list[Reason]] = {}
     for reason in reasons:
@@ -116,17 +119,19 @@ def findings(reasons: Sequence[Reason]) -> list[Finding]:
     out = []
     for code, group in by_code.items():
         level, meaning = REASONS[code]
-        texts = tuple(_placed(r) for r in group if r.text.strip())
+        texts = tuple(_placed(r, total) for r in group if r.text.strip())
         out.append(Finding(level, meaning, texts, group[0].frames, ADVICE.get(code, "")))
     return sorted(out, key=lambda f: order[f.level])
 
 
-def _placed(reason: Reason) -> str:
-    """Add a reason's frames to its text, unless it names them."""
+def _placed(reason: Reason, total: int) -> str:
+    """Add a reason's frames to its text, unless it names them or they are most of all."""
     text = sentence(reason.text)
-    if {str(k) for k in reason.frames} <= set(re.findall(r"\d+", text)):
+    first, last = reason.frames
+    named = {str(first), str(last)} <= set(re.findall(r"\d+", text))
+    if named or 2 * (last - first + 1) > total:
         return text
-    return f"{text} ({frame_range(*reason.frames)})"
+    return f"{text.rstrip('.')} ({frame_range(first, last)})."
 
 
 def sentence(text: str) -> str:
@@ -155,9 +160,9 @@ def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
         first = f" {texts[0] if len(texts) == 1 else grave[0].meaning}"
         begin, end = grave[0].frames
         # Frames that are most of the recording are no place to look at.
-        if 2 * (end - begin) < len(d.frames) and str(end) not in first:
+        if 2 * (end - begin + 1) <= len(d.frames) and str(end) not in first:
             look = f" Look first at {frame_range(begin, end)}."
     more = f" {count(len(grave) - 1, 'more reason')} below." if len(grave) > 1 else ""
     if d.verdict == "degraded":
         return f"Degraded: use this model with care.{first}{look}{more}"
-    return f"Failed: do not rely on this model; {have}.{first}{more}"
+    return f"Failed: do not rely on this model.{first or f' {have}.'}{more}"
