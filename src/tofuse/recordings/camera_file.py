@@ -15,7 +15,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_file, read_text
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
 from tofuse.geometry.se3 import check_pose
-from tofuse.recordings.frames import DepthKind
+from tofuse.recordings.frames import AmplitudeKind, DepthKind
 
 SCHEMA = 1
 MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
@@ -75,7 +75,7 @@ class CameraFile:
     frame_rate_hz: float | None = None
     ambiguity_m: float | None = None
     confidence_max: float | None = None
-    amplitude_kind: str | None = None
+    amplitude_kind: AmplitudeKind | None = None
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
 
@@ -147,7 +147,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         get.positive("frame_rate_hz"),
         get.positive("ambiguity_m"),
         get.positive("confidence_max"),
-        get.choice("amplitude_kind", AMPLITUDE_KINDS),
+        get.choice("amplitude_kind", AMPLITUDE_KINDS),  # type: ignore[arg-type]
         color,
         tuple(key for key in data if key not in _KEYS),
     )

@@ -22,6 +22,7 @@ UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
 DepthKind = Literal["z", "range"]
+AmplitudeKind = Literal["raw", "range_compensated", "ir"]
 
 SATURATED_AMPLITUDE = 65535.0
 
@@ -100,6 +101,11 @@ class RangeFrame:
         (H, W) float32, standard deviation of the range in m.
     normal_image
         (H, W, 3) float32 unit normals towards the camera, NaN where unknown.
+    amplitude_kind
+        What the amplitude counts: "raw", the modulated light that arrived, which falls with the
+        square of the range; "range_compensated", that times the square of the range (and divided
+        by the falloff of lens and lamp), which is the surface's albedo but for its slope; "ir",
+        active brightness by a map of the maker's own, to be taken as raw.
     """
 
     index: int
@@ -112,6 +118,7 @@ class RangeFrame:
     color_image: UInt8 | None = None
     sigma_image: Float32 | None = None
     normal_image: Float32 | None = None
+    amplitude_kind: AmplitudeKind = "raw"
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)

@@ -115,7 +115,15 @@ class NativeSource(FileSource):
         if self.color:
             color = self._registered(frame, self.color[index])
         return RangeFrame(
-            index, timestamp, self.camera, frame.depth, kind, amplitude, confidence, color
+            index,
+            timestamp,
+            self.camera,
+            frame.depth,
+            kind,
+            amplitude,
+            confidence,
+            color,
+            amplitude_kind=self.description.amplitude_kind or "raw",
         )
 
     def _read_camera(self, given: Path | None) -> tuple[CameraFile, Camera | None]:

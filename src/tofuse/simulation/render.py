@@ -303,4 +303,5 @@ def _frame(
         sensor.reported_amplitude(model, measured),
         sensor.reported_confidence(model, measured),
         sigma_image=sensor.reported_sigma(model, measured),
+        amplitude_kind=model.amplitude_kind,
     )

@@ -85,6 +85,7 @@ class Sr4000Source(FileSource):
             "confidence_max": 7.0,
             "frame_rate_hz": FRAME_RATE_HZ,
             "depth_kind": "z",
+            "amplitude_kind": "range_compensated",
         }
 
     def _read_timestamps(self) -> None:
@@ -128,6 +129,7 @@ class Sr4000Source(FileSource):
             None
             if confidence is None
             else np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8),
+            amplitude_kind="range_compensated",
         )
 
 
