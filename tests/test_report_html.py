@@ -314,7 +314,7 @@ def test_errors_shown_are_those_against_the_reference(shown):
             number, unit = cell.split()
             assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(value, rel=0.06)
     last = se3.angle(se3.inverse(extras.reference[-1]) @ result.diagnostics.sequential[-1])
-    assert shown.row("Before, at the last frame")[5] == f"{np.degrees(last):.2f}°"
+    assert shown.row("Before, last frame")[5] == f"{np.degrees(last):.2f}°"
     worst = np.nanargmax(
         np.linalg.norm(
             result.trajectory[:, :3, 3] - result.diagnostics.sequential[:, :3, 3], axis=1
@@ -328,7 +328,7 @@ def test_without_a_reference_the_displacement_is_shown(tmp_path):
     got = page(tmp_path, result, replace(extras, reference=None))
     assert "Displacement from the first camera" in got.sections["error"]
     moved = np.abs(result.trajectory[-1, 0, 3] - result.trajectory[0, 0, 3])
-    number, unit = got.row("After, at the last frame")[1].split()
+    number, unit = got.row("After, last frame")[1].split()
     assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(moved, rel=0.06)
 
 

@@ -40,13 +40,21 @@ _STYLE: Any = {
 }
 
 
+def _figure_class() -> type[Figure]:
+    """Import matplotlib without its words about building or missing a font cache."""
+    log = logging.getLogger("matplotlib")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        from matplotlib.figure import Figure
+    finally:
+        log.setLevel(level)
+    return Figure
+
+
 def _new(width: float, height: float, margins: tuple[float, float, float, float]) -> Any:
     """Make a figure of that many pixels, and axes; margins are left, bottom, right, top."""
-    # A first use builds or misses a font cache and says so: not on the person's terminal.
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width / 72, height / 72), dpi=72)
+    figure = _figure_class()(figsize=(width / 72, height / 72), dpi=72)
     left, bottom, right, top = margins
     axes = figure.add_axes(
         (

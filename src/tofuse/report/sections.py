@@ -366,12 +366,12 @@ def _error_rows(names: list[str], offsets: list[Float64], compared: bool) -> lis
         seen = o[np.isfinite(o).all(1)]
         if len(seen) == 0:
             continue
-        kinds = [("at the last frame", np.abs(seen[-1]))]
+        kinds = [("last frame", np.abs(seen[-1]))]
         if compared:
             kinds.append(("rms", np.sqrt((seen**2).mean(0))))
         kinds.append(("largest", np.abs(seen).max(0)))
         lengths = np.linalg.norm(seen[:, :3], axis=1)
-        totals = {"at the last frame": lengths[-1], "largest": lengths.max()}
+        totals = {"last frame": lengths[-1], "largest": lengths.max()}
         totals["rms"] = np.sqrt((lengths**2).mean())
         for kind, values in kinds:
             cells = [words.length(float(v)) for v in values[:3]]
