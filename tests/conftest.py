@@ -14,3 +14,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the real recordings are not on this machine (../shared/data)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated native recording of 8 frames; tests copy it where they change it."""
+    from tofuse.simulation.effects import Effects
+    from tofuse.simulation.record import simulate
+
+    folder = tmp_path_factory.mktemp("simulated") / "room"
+    return simulate("room", folder, frames=8, effects=Effects.none(shot_noise=True))

@@ -32,7 +32,9 @@ def within(name: str, value: float, least: float, most: float) -> None:
         raise ValueError(f"{name} must be from {least:g} to {most:g}, not {value!r}")
 
 
-def whole(name: str, value: int, least: int) -> None:
-    """Refuse anything but a whole number of at least `least`."""
+def whole(name: str, value: int, least: int, most: int | None = None) -> None:
+    """Refuse anything but a whole number from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, not {value!r}")
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be at most {most}, not {value!r}")

@@ -15,6 +15,9 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 
+# More neighbours than this are no neighbourhood, and need memory for each of them and each point.
+_MOST = 1000
+
 
 @part("filter", "neighbour_distance")
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class NeighbourDistance(Filter):
 
     def __post_init__(self) -> None:
         above("threshold", self.threshold, 0)
-        whole("k", self.k, 1)
+        whole("k", self.k, 1, _MOST)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
@@ -65,7 +68,7 @@ class NeighbourShare(Filter):
 
     def __post_init__(self) -> None:
         within("share", self.share, 0, 1)
-        whole("k", self.k, 1)
+        whole("k", self.k, 1, _MOST)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -40,7 +40,7 @@ class TemporalDeviation(Filter):
 
     def __post_init__(self) -> None:
         above("threshold", self.threshold, 0)
-        whole("frames", self.frames, 2)
+        whole("frames", self.frames, 2, 1000)
 
     @property
     def window(self) -> int:

@@ -69,8 +69,10 @@ class CloudFusion:
     def __post_init__(self) -> None:
         if self.voxel_m is not None and not 1e-5 < self.voxel_m < 100:
             raise ValueError(f"voxel_m is {self.voxel_m}; give metres, such as 0.01")
-        if self.min_views < 1 or self.normal_neighbours < 3:
-            raise ValueError("min_views must be at least 1 and normal_neighbours at least 3")
+        if self.min_views < 1:
+            raise ValueError(f"min_views is {self.min_views}, not 1 or more")
+        if not 3 <= self.normal_neighbours <= 1000:
+            raise ValueError(f"normal_neighbours is {self.normal_neighbours}, not 3 to 1000")
 
 
 def choose_voxel(frame: Frame) -> float:

@@ -122,9 +122,11 @@ def resolve(options: Options) -> Config:
 def fitted(config: Config, recording: Recording) -> Config:
     """Return the configuration with levels of confidence on the recording's own scale."""
     highest = recording.metadata.get("confidence_max")
-    if not isinstance(highest, int):
+    if not isinstance(highest, int | float) or not 1 <= highest <= 255:
         return config
-    filters = tuple(f.on_scale(highest) if isinstance(f, Confidence) else f for f in config.filters)
+    filters = tuple(
+        f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in config.filters
+    )
     return replace(config, filters=filters)
 
 

@@ -64,7 +64,7 @@ class Icp(Registrar):
     stopping: Stopping = field(default_factory=TwoLoops)
 
     def __post_init__(self) -> None:
-        if not (self.resolution > 0 and math.isfinite(self.resolution)):
+        if not 0 < self.resolution < 1e9:
             raise ValueError(f"resolution is {self.resolution}, not a length in metres")
 
     @property
