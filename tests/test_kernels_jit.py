@@ -1,0 +1,81 @@
+"""Compiled kernels where the cache can't be written, and a cache that can't go stale."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tofuse.kernels import jit
+
+_COMPILE = """
+import numpy as np
+from pathlib import Path
+from tofuse.kernels import jit
+from tofuse.kernels.lzf import lzf_decompress
+out = np.zeros(3, np.uint8)
+assert lzf_decompress(np.frombuffer(bytes([2]) + b"abc", np.uint8), out) == 3
+print(out.tobytes().decode())
+print(jit.cache_folder())
+print(len(list(Path(jit.cache_folder()).rglob("*.nbi"))))
+"""
+
+
+def _run(env: dict[str, str], code: str = _COMPILE) -> list[str]:
+    clean = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean | env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout.splitlines()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the home decides on other systems only")
+@pytest.mark.parametrize("place", ["file", "missing"])
+def test_a_home_that_cannot_be_written(tmp_path, place) -> None:
+    # Root may write anywhere but not below a file, nor in a system's own tree of processes.
+    if place == "file":
+        home = tmp_path / "home"
+        home.write_text("not a folder")
+    else:
+        home = Path("/proc/no-such-home")
+    env = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), "TMPDIR": str(tmp_path)}
+    text, folder, files = _run(env)
+    assert text == "abc"
+    assert Path(folder).parent == tmp_path
+    assert int(files) > 0
+    assert not Path(folder).exists()  # nothing is left behind
+    assert [p.name for p in tmp_path.iterdir()] == (["home"] if place == "file" else [])
+
+
+def test_the_cache_is_kept_where_it_can_be_written(tmp_path) -> None:
+    env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    text, folder, files = _run(env)
+    assert text == "abc"
+    assert Path(folder) == tmp_path / "cache" / f"kernels-{jit.source_hash()}"
+    stamps = {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")}
+    assert len(stamps) >= int(files) > 0
+    assert _run(env)[0] == "abc"
+    assert {p: p.stat().st_mtime_ns for p in Path(folder).rglob("*.nb*")} == stamps  # was used
+
+
+def test_the_key_changes_with_any_kernel(tmp_path) -> None:
+    package = tmp_path / "kernels"
+    shutil.copytree(Path(jit.__file__).parent, package, ignore=shutil.ignore_patterns("__pyc*"))
+    code = (
+        "import importlib.util as u, sys;"
+        f"s = u.spec_from_file_location('copy', r'{package / 'jit.py'}');"
+        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.source_hash())"
+    )
+    assert _run({}, code) == [jit.source_hash()]
+    with (package / "lzf.py").open("a") as file:
+        file.write("# changed\n")
+    changed = _run({}, code)
+    assert changed != [jit.source_hash()]
+    (package / "lzf.py").rename(package / "renamed.py")
+    assert _run({}, code) != changed

@@ -1,0 +1,141 @@
+"""Parts: found by name, described by their fields, refused with the field's name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol
+
+import pytest
+
+from tofuse import parts
+from tofuse.errors import InputError
+from tofuse.pipeline.config import Config, changed, from_method, methods
+
+
+class Shape(Protocol):
+    part_kind: ClassVar[str] = "test-shape"
+
+
+@parts.part("test-shape", "round", label="validated")
+@dataclass(frozen=True)
+class Round(Shape):
+    radius: float = 1.0
+    kind: Literal["disc", "ball"] = "disc"
+
+    def __post_init__(self) -> None:
+        if not self.radius > 0:
+            raise ValueError(f"radius is {self.radius}, not above 0")
+
+
+@parts.part("test-shape", "square")
+@dataclass(frozen=True)
+class Square(Shape):
+    corner: tuple[float, float]
+    holes: tuple[Shape, ...] = ()
+    count: int | None = None
+    solid: bool = True
+
+
+def read(data):
+    return parts.from_dict(Shape, data, where="my.toml")
+
+
+@pytest.mark.parametrize("method", methods())
+def test_methods_survive_the_way_through_json(method) -> None:
+    config = from_method(method)
+    text = json.dumps(config.to_dict(), allow_nan=False)
+    back = parts.from_dict(Config, json.loads(text), where="run.json")
+    assert back == config
+    assert json.dumps(back.to_dict()) == text
+
+
+def test_nested_parts_survive() -> None:
+    shape = Square((1.0, 2.0), (Round(0.5, "ball"), Square((0.0, 0.0))), count=3)
+    data = parts.to_dict(shape)
+    assert data["part"] == "square"
+    assert data["holes"][0] == {"part": "round", "radius": 0.5, "kind": "ball"}
+    assert read(data) == shape
+
+
+def test_labels_and_names() -> None:
+    assert parts.known("test-shape") == {"round": Round, "square": Square}
+    assert parts.known("no such kind") == {}
+    assert parts.name_of(Round()) == "round"
+    assert (Round.part_label, Square.part_label) == ("validated", "experimental")
+
+
+def test_two_parts_of_one_name_are_refused() -> None:
+    with pytest.raises(ValueError, match="two parts are called test-shape 'round'"):
+
+        @parts.part("test-shape", "round")
+        @dataclass(frozen=True)
+        class Other:
+            pass
+
+    assert parts.known("test-shape")["round"] is Round
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"part": "round", "radius": "a"}, r"my\.toml: radius: is 'a'; .*type float"),
+        ({"part": "round", "radius": True}, r"my\.toml: radius: is True; .*type float"),
+        ({"part": "round", "radius": -1}, r"my\.toml: radius is -1\.0, not above 0"),
+        ({"part": "round", "radius": float("nan")}, r"radius is nan"),
+        ({"part": "round", "radios": 1}, r"my\.toml: unknown option 'radios'; .*'radius', 'kind'"),
+        ({"part": "round", "kind": "cube"}, r"my\.toml: kind: is 'cube'; .*'disc', 'ball'"),
+        ({"part": "oval"}, r"my\.toml: there is no test-shape called 'oval'; .*'round', 'square'"),
+        ({"part": ["round"]}, r"no test-shape called \['round'\]; .*'round', 'square'"),
+        ({}, r"no test-shape called None; .*'round', 'square'"),
+        (3, r"my\.toml: is 3; write a table with a part, one of \['round', 'square'\]"),
+        (None, r"my\.toml: is None"),
+        ({"part": "square"}, r"my\.toml: is incomplete .*corner"),
+        ({"part": "square", "corner": 3}, r"my\.toml: corner: is 3; write a list"),
+        ({"part": "square", "corner": [1]}, r"my\.toml: corner: has 1 values; give 2"),
+        ({"part": "square", "corner": [1, "b"]}, r"my\.toml: corner\[1\]: is 'b'"),
+        ({"part": "square", "corner": [1, 2], "count": 1.5}, r"count: is 1\.5; .*type int"),
+        ({"part": "square", "corner": [1, 2], "solid": 1}, r"solid: is 1; .*type bool"),
+        (
+            {"part": "square", "corner": [1, 2], "holes": [{"part": "round", "radius": []}]},
+            r"my\.toml: holes\[0\]\.radius: is \[\]",
+        ),
+    ],
+)
+def test_errors_name_the_field(data, message) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read(data)
+    assert "\n" not in str(caught.value)
+
+
+def test_whole_numbers_are_fine_where_a_float_is_asked_for() -> None:
+    assert read({"part": "round", "radius": 2}) == Round(2.0)
+    assert isinstance(read({"part": "round", "radius": 2}).radius, float)
+    assert read({"part": "square", "corner": [1, 2], "count": None}).count is None
+
+
+def test_changes_are_merged_into_a_configuration() -> None:
+    config = from_method("thesis")
+    new = changed(config, {"odometry": {"registration": {"resolution": 0.07}}}, where="c.toml")
+    assert new.odometry.registration.resolution == 0.07
+    assert new.odometry.registration.source == config.odometry.registration.source
+    assert new.filters == config.filters
+
+
+def test_another_part_starts_from_its_own_defaults_and_a_list_replaces_the_list() -> None:
+    config = from_method("thesis")
+    every = {"odometry": {"registration": {"source": {"part": "all"}}}, "filters": []}
+    new = changed(config, every, where="c.toml")
+    assert parts.name_of(new.odometry.registration.source) == "all"
+    assert new.filters == ()
+    two = changed(config, {"filters": [{"part": "median"}, {"part": "distance"}]}, where="c.toml")
+    assert [parts.name_of(f) for f in two.filters] == ["median", "distance"]
+
+
+def test_errors_in_a_configuration_name_the_file_and_the_path_of_the_field() -> None:
+    with pytest.raises(InputError, match=r"^c\.toml: filters\[1\]\.k: is 'x'"):
+        changed(
+            from_method("thesis"),
+            {"filters": [{"part": "median"}, {"part": "neighbour_share", "k": "x"}]},
+            where="c.toml",
+        )
