@@ -110,7 +110,7 @@ class CloudBuilder:
         world = se3.transform(T_world_camera, local)
         towards = (T_world_camera[:3, :3] @ frame.origin + T_world_camera[:3, 3]) - world
         distance = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-        rows = np.zeros((len(world), 12))
+        rows = np.zeros((len(world), 13))
         rows[:, 0:3] = world
         rows[:, 3:6] = towards / distance
         rows[:, 6] = 1
@@ -119,8 +119,8 @@ class CloudBuilder:
             rows[:, 10] = 1
         elif frame.amplitude is not None:
             # Light falls off with the square of the range: this is nearly the surface's albedo.
-            rows[:, 7] = frame.amplitude * distance[:, 0] ** 2
-            rows[:, 11] = 1
+            rows[:, 11] = frame.amplitude * distance[:, 0] ** 2
+            rows[:, 12] = 1
         keys = _voxel_keys(world, self.voxel_m)
         keys, sums = _sum_by_key(keys, rows)
         sums[:, :] /= sums[:, 6:7]  # one vote a frame, however many pixels fell into the voxel
@@ -195,14 +195,14 @@ def _sum_by_key(keys: NDArray[np.int64], rows: Float64) -> tuple[NDArray[np.int6
 
 
 def _colors(sums: Float64) -> NDArray[np.uint8] | None:
-    rgb, grey = sums[:, 10] > 0, sums[:, 11] > 0
+    rgb, grey = sums[:, 10] > 0, sums[:, 12] > 0
     if not (rgb.any() or grey.any()):
         return None
     out = np.full((len(sums), 3), 128, np.uint8)
     out[rgb] = np.round(sums[rgb, 7:10] / sums[rgb, 10:11]).clip(0, 255).astype(np.uint8)
     grey &= ~rgb
     if grey.any():
-        value = sums[grey, 7] / sums[grey, 11]
+        value = sums[grey, 11] / sums[grey, 12]
         low, high = np.percentile(value, [1, 99])
         # Gamma 1/2.2: albedo is linear, screens are not.
         share = ((value - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)

@@ -1,0 +1,197 @@
+"""The fused cloud: exact averages of voxels, normals, colours, bounded memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.fusion import cloud as fusion
+from tofuse.fusion.cloud import CloudBuilder, CloudFusion, as_cloud, choose_voxel
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels.threads import threads
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+
+EYE = np.eye(4)
+
+
+def view(points, index=0, **channels) -> CloudFrame:
+    return CloudFrame(index, float(index), np.asarray(points, np.float32), **channels)
+
+
+def fuse(views, *, voxel=0.1, poses=None, **options):
+    builder = CloudBuilder(CloudFusion(**options), voxel)
+    for k, item in enumerate(views):
+        builder.add(item, EYE if poses is None else poses[k])
+    return builder.finish()
+
+
+def plane(rng, n=2000, z=2.0):
+    points = np.empty((n, 3), np.float32)
+    points[:, :2] = rng.uniform(-0.5, 0.5, (n, 2))
+    points[:, 2] = z
+    return points
+
+
+def test_a_voxel_averages_views_and_each_view_has_one_vote() -> None:
+    first = view([[0.01, 0.02, 1.01], [0.03, 0.02, 1.03], [0.55, 0.05, 1.05]])
+    second = view([[0.06, 0.06, 1.06]], 1)
+    found = fuse([first, second])
+    assert len(found) == 2
+    # Two points of the first view count as one, at their mean.
+    np.testing.assert_allclose(found.points[0], [0.04, 0.04, 1.04], atol=1e-6)
+    np.testing.assert_allclose(found.points[1], [0.55, 0.05, 1.05], atol=1e-6)
+    assert found.views.tolist() == [2, 1]
+    assert found.points.dtype == np.float32
+
+
+def test_voxels_below_zero_are_as_large_as_others() -> None:
+    found = fuse([view([[-0.01, 0.05, 1.05], [0.01, 0.05, 1.05], [-0.09, 0.05, 1.05]])])
+    np.testing.assert_allclose(sorted(found.points[:, 0]), [-0.05, 0.01], atol=1e-6)
+
+
+def test_poses_move_the_points() -> None:
+    T = se3.exp(np.array([0.5, -0.2, 0.1, 0.2, -0.4, 0.3]))
+    points = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 2.0], [0.0, 0.5, 3.0]])
+    found = fuse([view(points)], poses=[T], voxel=0.001)
+    expected = se3.transform(T, points)
+    order = np.lexsort(expected.T[::-1])
+    got = found.points[np.lexsort(found.points.T[::-1])]
+    np.testing.assert_allclose(got, expected[order], atol=1e-6)
+
+
+def test_the_order_of_views_does_not_matter() -> None:
+    rng = np.random.default_rng(1)
+    views = [
+        view(rng.uniform(0, 1, (500, 3)), k, amplitude=rng.uniform(1, 9, 500).astype(np.float32))
+        for k in range(5)
+    ]
+    one, other = fuse(views), fuse(views[::-1])
+    np.testing.assert_array_equal(one.views, other.views)
+    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
+    assert np.abs(one.color.astype(int) - other.color).max() <= 1
+
+
+def test_the_number_of_threads_changes_no_byte() -> None:
+    rng = np.random.default_rng(2)
+    views = [view(plane(rng), k) for k in range(3)]
+    found = []
+    for count in (1, 2, 3):
+        with threads(count):
+            cloud = fuse(views, voxel=0.02)
+            found.append(cloud.points.tobytes() + cloud.normals.tobytes())
+    assert len(set(found)) == 1
+
+
+def test_points_of_few_views_are_left_out() -> None:
+    both, once = [0.05, 0.05, 1.05], [0.55, 0.05, 1.05]
+    views = [view([both, once]), view([both], 1)]
+    np.testing.assert_allclose(fuse(views, min_views=2).points, [both], atol=1e-6)
+    assert len(fuse(views, min_views=3)) == 0
+
+
+def test_nothing_gives_an_empty_cloud() -> None:
+    for found in (fuse([]), fuse([view(np.zeros((0, 3)))])):
+        assert len(found) == 0
+        assert found.points.shape == (0, 3)
+        assert found.normals is None
+
+
+def test_normals_look_at_the_camera() -> None:
+    points = plane(np.random.default_rng(3))
+    found = fuse([view(points)], voxel=0.02)
+    np.testing.assert_allclose(found.normals, np.tile([0, 0, -1], (len(found), 1)), atol=1e-5)
+    # Seen from behind, the same plane looks the other way.
+    T_behind = se3.exp(np.array([0, 0, 0, 0, np.pi, 0.0]))
+    T_behind[:3, 3] = [0, 0, 4]
+    behind = fuse([view(se3.transform(se3.inverse(T_behind), points))], poses=[T_behind])
+    np.testing.assert_allclose(behind.normals, np.tile([0, 0, 1], (len(behind), 1)), atol=1e-5)
+
+
+def test_too_few_points_for_a_plane_have_no_normals() -> None:
+    assert fuse([view([[0, 0, 1.0], [1, 0, 1.0]])]).normals is None
+
+
+def test_amplitude_becomes_grey_whatever_the_distance() -> None:
+    # One albedo at 1 m and 3 m: the amplitude falls with the square, the grey must not.
+    z = np.repeat([1.0, 3.0], 50)
+    albedo = np.tile(np.repeat([0.2, 0.8], 25), 2)
+    points = np.c_[np.arange(100) * 0.0, np.arange(100) * 0.0, z + np.tile(np.arange(50), 2) * 1e-3]
+    distance = np.linalg.norm(points, axis=1)
+    found = fuse([view(points, amplitude=(albedo / distance**2).astype(np.float32))], voxel=0.000_5)
+    grey = found.color[:, 0].astype(int)
+    assert (found.color == found.color[:, :1]).all()
+    near = found.points[:, 2] < 2
+    dark = (found.points[:, 2] % 1) < 0.0245
+    assert grey[near & dark].max() <= grey[near & ~dark].min() - 100
+    assert abs(grey[near & dark].mean() - grey[~near & dark].mean()) < 2
+    assert abs(grey[near & ~dark].mean() - grey[~near & ~dark].mean()) < 2
+
+
+def test_colour_is_averaged_and_goes_before_amplitude() -> None:
+    point = [[0.05, 0.05, 1.05]]
+    views = [
+        view(point, 0, color=np.array([[10, 20, 30]], np.uint8)),
+        view(point, 1, color=np.array([[30, 40, 50]], np.uint8)),
+        view([*point, [0.55, 0.05, 1.05]], 2, amplitude=np.array([5, 5], np.float32)),
+    ]
+    found = fuse(views)
+    assert found.color[0].tolist() == [20, 30, 40]
+    assert found.color[1, 0] == found.color[1, 1] == found.color[1, 2]
+    assert fuse([view(point)]).color is None
+
+
+def test_memory_does_not_grow_with_the_number_of_views(monkeypatch) -> None:
+    monkeypatch.setattr(fusion, "_BUFFER_ROWS", 20_000)
+    item = view(plane(np.random.default_rng(4)))
+    builder = CloudBuilder(CloudFusion(), 0.01)
+    most = 0
+    for k in range(50):
+        builder.add(view(item.points, k), EYE)
+        most = max(most, sum(len(keys) for keys in builder._keys))
+    found = builder.finish()
+    assert most <= 20_000 + len(item)
+    assert set(found.views.tolist()) == {50}
+
+
+def test_a_voxel_fits_the_sensor() -> None:
+    camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
+    depth = np.full((80, 100), 2.0, np.float32)
+    assert choose_voxel(RangeFrame(0, 0.0, camera, depth)) == pytest.approx(0.01)  # 2 m / 200
+    assert choose_voxel(RangeFrame(0, 0.0, camera, depth / 1000)) == 0.002
+    assert choose_voxel(RangeFrame(0, 0.0, camera, depth * 1000)) == 0.1
+    square = np.mgrid[0:50, 0:50, 0:1].reshape(3, -1).T * 0.02
+    assert choose_voxel(view(square)) == pytest.approx(0.02, rel=0.1)
+    assert choose_voxel(view(np.zeros((0, 3)))) > 0
+
+
+def test_thinning_keeps_every_channel_together() -> None:
+    n = 1003
+    item = view(
+        np.arange(3 * n).reshape(n, 3),
+        7,
+        amplitude=np.arange(n, dtype=np.float32),
+        color=np.arange(3 * n).reshape(n, 3).astype(np.uint8),
+    )
+    thin = as_cloud(item, 100)
+    assert 50 <= len(thin) <= 100
+    assert thin.index == 7
+    np.testing.assert_array_equal(thin.points[:, 0], 3 * thin.amplitude)
+    np.testing.assert_array_equal(thin.points.astype(np.uint8), thin.color)
+    assert len(as_cloud(item, 5000)) == n
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"voxel_m": 0.0},
+        {"voxel_m": float("nan")},
+        {"voxel_m": 1e6},
+        {"min_views": 0},
+        {"normal_neighbours": 2},
+        {"normal_neighbours": 10**9},
+    ],
+)
+def test_options_that_make_no_sense(options) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        CloudFusion(**options)
