@@ -186,7 +186,7 @@ def still(scene: Scene, size: tuple[int, int] = (960, 600)) -> UInt8:
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = -R @ scene.center
-    distance = 1.45 * scene.size
+    distance = 1.2 * scene.size
     scale = size[1] / (2 * np.tan(0.35) * distance)
     points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
     if scene.normals is not None and len(points):

@@ -77,7 +77,7 @@
     reference: [0.92, 0.92, 0.92], loops: [0.37, 0.85, 0.55],
   };
 
-  const start = { yaw: scene.yaw, pitch: scene.pitch, distance: 1.45 * scene.size, target: scene.center };
+  const start = { yaw: scene.yaw, pitch: scene.pitch, distance: 1.2 * scene.size, target: scene.center };
   const eye = {};
   function reset(changes) {
     Object.assign(eye, start, { target: start.target.slice() }, changes || {});
