@@ -1,0 +1,197 @@
+"""The verdict: each reason comes from its own evidence, and none from good evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.consistency import Consistency, PairAgreement
+from tofuse.geometry import se3
+from tofuse.pipeline.judge import Evidence, judge, stretches
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.graph import LoopRecord, Optimisation
+from tofuse.registration.base import Registration
+from tofuse.results.types import FrameRecord, Reason
+from tofuse.results.verdict import REASONS, verdict_of
+
+STEP = se3.exp(np.array([0.05, 0, 0, 0, 0.02, 0]))
+
+
+def registration(share=0.5, converged=True) -> Registration:
+    return Registration(STEP, converged, 10, int(1000 * share), 1000, 0.3, 0.01, np.eye(6) * 1e4)
+
+
+def pair(i, j, share=0.95, rms=0.004, compared=10_000) -> PairAgreement:
+    inliers = int(share * compared)
+    return PairAgreement(i, j, 0.8, compared, inliers, inliers * rms**2)
+
+
+def agreement(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> Consistency:
+    near = [pair(k, k + 1, near_share, near_rms) for k in range(4)]
+    far = [pair(0, k, far_share, far_rms) for k in range(2, 9)]
+    return Consistency.of(near + far, 9)
+
+
+def evidence(
+    statuses=("tracked",) * 9,
+    *,
+    shares=None,
+    converged=None,
+    gaps=((0, 8, [0.0] * 6),),
+    rejected=(),
+    given=(),
+    settled=True,
+    images=None,
+) -> Evidence:
+    """Nine frames of a walk, closed by loops (i, j, error of the chain as a 6-vector)."""
+    n = len(statuses)
+    records = tuple(FrameRecord(k, 0.1 * k, s) for k, s in enumerate(statuses))
+    posed = [k for k, s in enumerate(statuses) if s in ("tracked", "predicted")]
+    poses = np.stack([np.linalg.matrix_power(STEP, k) for k in posed])
+    shares = shares or [0.5] * n
+    converged = converged or [True] * n
+    registrations = tuple(
+        registration(shares[k], converged[k]) if k in posed[1:] else None for k in range(n)
+    )
+    sequence = [Measured(a, b, STEP, np.eye(6)) for a, b in pairwise(posed)]
+    row = {frame: k for k, frame in enumerate(posed)}
+    closed = [
+        Measured(
+            i,
+            j,
+            se3.inverse(poses[row[i]]) @ poses[row[j]] @ se3.exp(-np.asarray(gap, float)),
+            np.eye(6),
+        )
+        for i, j, gap in gaps
+        if i in row and j in row
+    ]
+    graph = build_graph(posed, poses, sequence, closed)
+    loops = [LoopRecord(i, j, True, "") for i, j, _ in gaps]
+    loops += [LoopRecord(i, j, False, "only 3% of the points correspond") for i, j in rejected]
+    return Evidence(
+        records,
+        registrations,
+        tuple(loops),
+        poses,
+        Optimisation(graph, (1.0, 0.5), settled),
+        agreement() if images is None else images,
+        frozenset(given),
+    )
+
+
+def codes(e: Evidence) -> list[str]:
+    return [reason.code for reason in judge(e)[1]]
+
+
+def test_good_evidence_gives_no_reason() -> None:
+    assert judge(evidence()) == ("good", ())
+    predicted = evidence(("tracked",) * 4 + ("predicted",) + ("tracked",) * 4)
+    assert judge(predicted) == ("good", ())
+
+
+CASES = {
+    "few_poses": evidence(("tracked",) + ("lost",) * 7 + ("tracked",)),
+    "images_disagree": evidence(images=agreement(0.2, near_share=0.9)),
+    "lost_frames": evidence(("tracked",) * 4 + ("lost",) * 2 + ("tracked",) * 3),
+    "images_differ": evidence(images=agreement(0.75)),
+    "weak_registration": evidence(shares=[0.5] * 4 + [0.04] + [0.5] * 4),
+    "not_converged": evidence(converged=[True] * 4 + [False] + [True] * 4),
+    "unchecked_drift": evidence(gaps=()),
+    "loop_gap": evidence(gaps=((0, 8, [0.2, 0, 0, 0, 0, 0]),)),
+    "optimiser_gave_up": evidence(settled=False),
+    "unreadable_frames": evidence(("tracked",) * 4 + ("skipped",) + ("tracked",) * 4),
+    "single_frame": evidence(("tracked",)),
+    "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
+}
+
+
+def test_every_reason_has_a_case() -> None:
+    assert set(CASES) == set(REASONS)
+
+
+@pytest.mark.parametrize("code", CASES)
+def test_each_reason_comes_from_its_own_evidence(code) -> None:
+    verdict, reasons = judge(CASES[code])
+    found = [r for r in reasons if r.code == code]
+    assert len(found) == 1
+    assert verdict == verdict_of(reasons)
+    force = {"failed": 2, "degraded": 1, "note": 0}
+    assert force[REASONS[code][0]] <= {"good": 0, "degraded": 1, "failed": 2}[verdict]
+    text = found[0].text
+    assert text.endswith(".")
+    assert "\n" not in text
+    assert "nan" not in text
+    first, last = found[0].frames
+    assert isinstance(first, int)
+    assert 0 <= first <= last <= 8
+    # Nothing else is said, but for what follows from it.
+    follows = {"few_poses": {"lost_frames"}}
+    assert {r.code for r in reasons} - {code} <= follows.get(code, set())
+
+
+def test_frames_of_reasons() -> None:
+    (lost,) = judge(CASES["lost_frames"])[1]
+    assert lost.frames == (4, 5)
+    assert lost.text == "Frames 4 to 5 have no pose."
+    (weak,) = judge(CASES["weak_registration"])[1]
+    assert weak.frames == (4, 4)
+    (skipped,) = judge(CASES["unreadable_frames"])[1]
+    assert skipped.text == "Frame 4 has not been read."
+
+
+def test_each_stretch_of_lost_frames_is_told() -> None:
+    e = evidence(("tracked", "lost", "tracked", "lost", "lost", "tracked", "tracked"))
+    assert [r.frames for r in judge(e)[1] if r.code == "lost_frames"] == [(1, 1), (3, 4)]
+    assert stretches(e.records, "skipped") == []
+
+
+def test_a_loop_within_what_drift_allows_is_no_gap() -> None:
+    # Eight steps of 5 cm and 1.1 degrees: 3 cm and 2 degrees are allowed.
+    assert codes(evidence(gaps=((0, 8, [0.025, 0, 0, 0, 0, 0]),))) == []
+    assert codes(evidence(gaps=((0, 8, [0.035, 0, 0, 0, 0, 0]),))) == ["loop_gap"]
+    assert codes(evidence(gaps=((0, 8, [0, 0, 0, 0, np.radians(1.8), 0]),))) == []
+    assert codes(evidence(gaps=((0, 8, [0, 0, 0, 0, np.radians(2.2), 0]),))) == ["loop_gap"]
+
+
+def test_many_gaps_are_one_reason_that_tells_the_worst() -> None:
+    far = [0.1, 0, 0, 0, 0, 0]
+    gaps = [(0, k, far) for k in (5, 6, 8)] + [(1, 7, [0.3, 0, 0, 0, 0, 0]), (0, 4, np.zeros(6))]
+    (reason,) = judge(evidence(gaps=gaps))[1]
+    assert reason.code == "loop_gap"
+    assert reason.frames == (1, 7)
+    assert "0.300 m" in reason.text
+    assert "4 of 5 loops" in reason.text
+
+
+def test_a_loop_that_was_found_and_rejected_is_no_news() -> None:
+    assert codes(evidence(rejected=[(1, 7)])) == []
+
+
+def test_images_without_inliers_disagree() -> None:
+    verdict, reasons = judge(evidence(images=Consistency.of([pair(0, 1, 0.0)], 2)))
+    assert verdict == "failed"
+    assert reasons[0].text == "Only 0% of what overlapping images saw agrees."
+
+
+def test_images_that_do_not_overlap_say_nothing() -> None:
+    assert codes(evidence(images=Consistency.of([], 5))) == []
+    assert codes(replace(evidence(), agreement=None)) == []
+
+
+def test_noise_that_neighbours_share_is_no_difference() -> None:
+    assert codes(evidence(images=agreement(0.8, 0.02, 0.8, 0.02))) == []
+    assert codes(evidence(images=agreement(far_rms=0.02))) == ["images_differ"]
+
+
+def test_the_gravest_reason_decides() -> None:
+    def of(*names: str) -> str:
+        return verdict_of([Reason(name, (0, 1), "") for name in names])
+
+    assert of() == "good"
+    assert of("unreadable_frames", "single_frame") == "good"
+    assert of("unreadable_frames", "loop_gap") == "degraded"
+    assert of("loop_gap", "few_poses", "single_frame") == "failed"
+    assert {force for force, _ in REASONS.values()} == {"failed", "degraded", "note"}
