@@ -1,0 +1,97 @@
+"""What became of each frame, and of each candidate for a loop."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.report import plots, words
+from tofuse.report.subject import ROWS, Figure, Subject, Values
+from tofuse.results.types import FrameRecord
+
+_STRIP = 600  # cells in the strip of frames
+
+
+def frames(s: Subject) -> Values:
+    """Return the strip of frames, the plots of their health and the table of problems."""
+    records = s.result.diagnostics.frames
+    out: Values = {
+        "lanes": list(words.STATUSES),
+        "strip": [],
+        "health": [],
+        "problems": [],
+        "problems_more": "",
+        "health_legend": [],
+    }
+    if not records:
+        return out | {"strip_label": "", "strip_hint": ""}
+    # With more frames than cells, a cell stands for several and shows the worst of them.
+    size = -(-len(records) // _STRIP)
+    for start in range(0, len(records), size):
+        group = records[start : start + size]
+        worst = max(group, key=lambda r: (1, 2, 3, 0)[words.STATUSES.index(r.status)])
+        lane = words.STATUSES.index(worst.status)
+        out["strip"].append({"status": worst.status, "lane": lane, "title": _told(worst)})
+    counts = [f"{sum(r.status == name for r in records)} {name}" for name in words.STATUSES]
+    out["strip_label"] = "Status of each frame: " + ", ".join(counts)
+    first, last = records[0].index, records[-1].index
+    out["strip_hint"] = (
+        f"From left to right {words.frame_range(first, last)}. Point at a frame to see what "
+        "became of it."
+    )
+    index = np.array([r.index for r in records], float)
+    bad = index[[r.status in ("lost", "skipped") for r in records]]
+    if len(bad):
+        out["health_legend"] = [("bad", "x", "lost or skipped")]
+    share = np.array([np.nan if r.inlier_share is None else r.inlier_share for r in records], float)
+    rms = np.array([np.nan if r.rms_m is None else r.rms_m for r in records], float)
+    for values, scale, ylabel, label in (
+        (share, 100.0, "points with a correspondence, %", "Share of correspondences over frames"),
+        (rms, 1000.0, "rms distance of correspondences, mm", "Rms distance over frames"),
+    ):
+        if np.isfinite(values).any():
+            series = [(values * scale, plots.AFTER, "-")]
+            drawn = plots.lines(index, series, label=label, ylabel=ylabel, bad=bad, floor=True)
+            out["health"].append(Figure(drawn))
+    runs = words.runs((r.index, r.status, r.reason) for r in records)
+    runs = [run for run in runs if run[3] != "tracked"]
+    out["problems"] = [
+        (words.frame_range(a, b), f"{n:,}", status, why or "–")
+        for a, b, n, status, why in runs[:ROWS]
+    ]
+    if len(runs) > ROWS:
+        out["problems_more"] = f"{len(runs) - ROWS:,} more are not shown."
+    return out
+
+
+def _told(record: FrameRecord) -> str:
+    parts = [f"Frame {record.index}: {record.status}"]
+    if record.reason:
+        parts[0] += f" – {record.reason}"
+    if record.inlier_share is not None:
+        parts.append(f"{words.share(record.inlier_share)} correspondences")
+    if record.rms_m is not None:
+        parts.append(f"rms {words.length(record.rms_m)}")
+    if len(record.unobservable):
+        parts.append(f"{len(record.unobservable)} of 6 directions not held by the data")
+    return ", ".join(parts)
+
+
+def loops(s: Subject) -> Values:
+    """Return the table of loops."""
+    loops = sorted(s.result.diagnostics.loops, key=lambda p: (not p.accepted, p.i, p.j))
+    accepted = sum(p.accepted for p in loops)
+    rows = [
+        (
+            f"{p.i} and {p.j}",
+            "✓ accepted" if p.accepted else "✗ rejected",
+            p.reason or "–",
+            words.share(p.overlap),
+            words.length(p.rms_m),
+            words.share(p.free_space_violation),
+        )
+        for p in loops
+    ]
+    more = f"{len(rows) - ROWS:,} more are not shown." if len(rows) > ROWS else ""
+    text = f"{words.count(len(loops), 'candidate')}: {accepted:,} accepted, "
+    text += f"{len(loops) - accepted:,} rejected."
+    return {"loops": rows[:ROWS], "loops_text": text, "loops_more": more}

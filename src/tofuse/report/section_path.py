@@ -1,0 +1,169 @@
+"""The path: cameras before and after, error per axis, and the optimiser's objective."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.report import plots, words
+from tofuse.report.subject import Figure, Subject, Values
+
+Float64 = NDArray[np.float64]
+
+
+def cameras(s: Subject) -> Values:
+    """Return the drawings of the cameras before and after (figures 5.4, 5.5)."""
+    before, after = s.scene.before, s.scene.after
+    if len(after) < 2:
+        return {"cameras": [], "cameras_legend": [], "moved": ""}
+    figures = []
+    groups = [before, after] + ([s.scene.reference] if s.reference is not None else [])
+    for view, name in (("above", "from above"), ("side", "from the side")):
+        flat = [plots.project(g[:, :3, 3], view) for g in groups]
+        box = plots.limits(*flat, room=0.11, least=0.01)
+        for poses, color, when in ((before, plots.BEFORE, "before"), (after, plots.AFTER, "after")):
+            title = f"{when}, {name}"
+            if len(poses):
+                drawing = plots.cameras(
+                    poses,
+                    box,
+                    view,
+                    color=color,
+                    label=f"Cameras {title}",
+                    loops=s.scene.loops if when == "after" else None,
+                    reference=s.scene.reference if s.reference is not None else None,
+                )
+                figures.append(Figure(drawing, title[0].upper() + title[1:]))
+    legend = [("before", "", "cameras before"), ("after", "", "cameras after")]
+    if len(s.scene.loops):
+        legend.append(("loop", "", "loops closed"))
+    if s.reference is not None:
+        legend.append(("reference", "2 3", "reference path"))
+    return {"cameras": figures, "cameras_legend": legend, "moved": _moved(s)}
+
+
+def _moved(s: Subject) -> str:
+    sequential = s.result.diagnostics.sequential
+    if sequential.shape != s.result.trajectory.shape:
+        return ""
+    both = np.isfinite(sequential[:, 0, 0]) & s.result.has_pose
+    if not both.any():
+        return ""
+    shift = np.linalg.norm(s.result.trajectory[:, :3, 3] - sequential[:, :3, 3], axis=1)
+    shift[~both] = 0
+    k = int(shift.argmax())
+    if shift[k] < 1e-6:
+        return "Optimisation moved no camera: the path is that of frame-by-frame registration."
+    return (
+        f"Optimisation moved the cameras by up to {words.length(float(shift[k]))}, "
+        f"most at frame {int(s.index[k])}."
+    )
+
+
+def error(s: Subject) -> Values:
+    """Return the error or displacement per axis over frames (figures 5.2, 5.6)."""
+    result, reference = s.result, s.reference
+    compared = reference is not None
+    title = "Cumulative error" if compared else "Displacement from the first camera"
+    after, before = result.trajectory, result.diagnostics.sequential
+    if before.shape != after.shape:
+        before = np.full_like(after, np.nan)
+    if int(result.has_pose.sum()) < 2:
+        return {"error": [], "error_title": title} | dict.fromkeys(
+            ("error_text", "error_legend", "error_rows"), ""
+        )
+    names = (("Before", before, plots.BEFORE, "--"), ("After", after, plots.AFTER, "-"))
+    offsets = [_offsets(poses, reference) for _, poses, _, _ in names]
+    bad = s.index[~result.has_pose]
+    what = "error" if compared else "displacement"
+    figures = []
+    for k, axis in enumerate(("x (right)", "y (down)", "z (forward)", "rotation")):
+        scale, unit = (180 / np.pi, "degrees") if k == 3 else (1.0, "m")
+        rows = [o[:, k] * scale for o in offsets]
+        if k < 3 and max(np.nanmax(np.abs(r)) for r in rows if np.isfinite(r).any()) < 0.1:
+            rows, unit = [1000 * r for r in rows], "mm"
+        series = [(r, color, style) for r, (_, _, color, style) in zip(rows, names, strict=True)]
+        label = f"{what.capitalize()} in {axis} over frames, before and after optimisation"
+        drawn = plots.lines(
+            s.index, series, label=label, ylabel=f"{axis}, {unit}", zero=True, bad=bad
+        )
+        figures.append(Figure(drawn))
+    text = (
+        "Estimated minus reference position along each axis of the first camera, "
+        "both starting at the identity, without further alignment."
+        if compared
+        else "There is no reference for this recording, so this is the displacement relative to "
+        "the first camera: where the camera truly came back, what is left is error."
+    )
+    legend = [("before", "6 3", "before optimisation"), ("after", "", "after optimisation")]
+    if len(bad):
+        legend.append(("bad", "x", f"{words.count(len(bad), 'frame')} without a pose"))
+    return {
+        "error": figures,
+        "error_title": title,
+        "error_text": text,
+        "error_legend": legend,
+        "error_rows": _error_rows([n for n, *_ in names], offsets, compared),
+    }
+
+
+def _offsets(poses: Float64, reference: Float64 | None) -> Float64:
+    """Return (N, 4): position along x, y, z in m and angle in rad, against the reference.
+
+    Without a reference, against the first pose. NaN where there is none.
+    """
+    out = np.full((len(poses), 4), np.nan)
+    there = np.isfinite(poses).all((1, 2))
+    if reference is None:
+        base = poses[there][:1]
+        if len(base) == 0:
+            return out
+        against = np.broadcast_to(base, poses.shape)
+    else:
+        there &= np.isfinite(reference).all((1, 2))
+        against = reference
+    out[there, :3] = poses[there, :3, 3] - against[there, :3, 3]
+    relative = np.swapaxes(against[there, :3, :3], 1, 2) @ poses[there, :3, :3]
+    out[there, 3] = se3.angle(relative)
+    return out
+
+
+def _error_rows(names: list[str], offsets: list[Float64], compared: bool) -> list[list[str]]:
+    rows = []
+    for name, o in zip(names, offsets, strict=True):
+        seen = o[np.isfinite(o).all(1)]
+        if len(seen) == 0:
+            continue
+        kinds = [("last frame", np.abs(seen[-1]))]
+        if compared:
+            kinds.append(("rms", np.sqrt((seen**2).mean(0))))
+        kinds.append(("largest", np.abs(seen).max(0)))
+        lengths = np.linalg.norm(seen[:, :3], axis=1)
+        totals = {"last frame": lengths[-1], "largest": lengths.max()}
+        totals["rms"] = np.sqrt((lengths**2).mean())
+        for kind, values in kinds:
+            cells = [words.length(float(v)) for v in values[:3]]
+            angle = f"{np.degrees(values[3]):.2f}°"
+            rows.append([f"{name}, {kind}", *cells, words.length(float(totals[kind])), angle])
+    return rows
+
+
+def objective(s: Subject) -> Values:
+    """Return the objective over iterations (figure 5.3)."""
+    values = np.array(s.result.diagnostics.objective, float)
+    if not np.isfinite(values).any():
+        return {"objective": None, "objective_text": ""}
+    x = np.arange(len(values), dtype=float)
+    seen = values[np.isfinite(values)]
+    drawn = plots.lines(
+        x,
+        [(values, plots.AFTER, "-")],
+        label="Objective over iterations",
+        ylabel="objective",
+        xlabel="iteration",
+        log=True,
+        size=(480, 240),
+    )
+    text = f"From {seen[0]:.4g} to {seen[-1]:.4g} in {words.count(len(values) - 1, 'iteration')}."
+    return {"objective": Figure(drawn), "objective_text": text}

@@ -1,0 +1,85 @@
+"""What the sections of a report are made from, and what they are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.report import straight
+from tofuse.report.extras import ReportExtras
+from tofuse.report.scene import Scene, finite, make_scene
+from tofuse.results.types import Reconstruction
+
+Float64 = NDArray[np.float64]
+Values = dict[str, Any]
+
+OUTER = 0.25  # percent of the points at each end that do not count for the measured size
+ROWS = 150  # in a table
+
+
+@dataclass(frozen=True)
+class Figure:
+    """An inline SVG and what is said below it."""
+
+    svg: str
+    caption: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """The result with what several sections need of it.
+
+    Attributes
+    ----------
+    index
+        (N,) frame index of each row of the trajectory.
+    rows
+        The row of each frame index.
+    points, truth
+        (N, 3) and (K, 3) finite points of the model and of the true surfaces, world frame.
+    straight
+        (3, 3) axes, as rows, in which the model lies straight.
+    """
+
+    result: Reconstruction
+    extras: ReportExtras
+    index: Float64
+    rows: dict[int, int]
+    reference: Float64 | None
+    scene: Scene
+    points: Float64
+    truth: Float64 | None
+    straight: Float64
+
+    @classmethod
+    def of(cls, result: Reconstruction, extras: ReportExtras) -> Subject:
+        """Gather it; a reference of another length or without any pose in common is left out."""
+        index = _row_indices(result)
+        rows = {int(k): row for row, k in enumerate(index)}
+        reference = extras.reference
+        if reference is not None and (
+            reference.shape != result.trajectory.shape
+            or len(finite(reference[result.has_pose])) == 0
+        ):
+            reference = None
+        scene = make_scene(result, rows, reference)
+        cloud, truth = result.cloud, extras.truth_points
+        points = cloud.points[np.isfinite(cloud.points).all(1)].astype(float) + cloud.offset
+        if truth is not None:
+            truth = truth[np.isfinite(truth).all(1)]
+        true = truth.astype(float) if truth is not None and len(truth) else None
+        axes = straight.upright(points, OUTER) if true is None else straight.boxed(true)
+        return cls(result, extras, index, rows, reference, scene, points, true, axes)
+
+
+def _row_indices(result: Reconstruction) -> Float64:
+    """Return the frame index of each row of the trajectory."""
+    records = result.diagnostics.frames
+    number = len(result.trajectory)
+    for chosen in (records, [r for r in records if r.status != "skipped"]):
+        if len(chosen) == number:
+            return np.array([r.index for r in chosen], float)
+    return np.arange(number, dtype=float)
