@@ -1,0 +1,301 @@
+"""What the documents say is so: code runs, commands parse, lists are complete, links lead on."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse import parts
+from tofuse.cli.parser import DEMO_SCENES, make_parser
+from tofuse.files.trajectory import read_tum
+from tofuse.geometry import se3
+from tofuse.pipeline.config import changed, from_method, methods
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.results.output import run_json
+from tofuse.results.verdict import REASONS
+from tofuse.sensor.models import CAMERAS
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
+PART_ROOMS = (
+    "tofuse.filters",
+    "tofuse.registration",
+    "tofuse.odometry",
+    "tofuse.posegraph",
+    "tofuse.recordings.readers",
+)
+
+
+@cache
+def text_of(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def blocks(name: str, language: str) -> list[str]:
+    """Fenced code blocks of a document in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(name), re.MULTILINE | re.DOTALL)
+
+
+def with_blocks(language: str) -> list[str]:
+    return [name for name in NAMES if blocks(name, language)]
+
+
+def sections(name: str) -> dict[str, str]:
+    """Text below each heading, by heading, up to the next one of any level."""
+    pieces = re.split(r"^#+ +(.+)$", text_of(name), flags=re.MULTILINE)
+    return dict(zip(pieces[1::2], pieces[2::2], strict=True))
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of the tables in a text, without their heads."""
+    lines = re.findall(r"^\|(.*)\|\s*$", text, re.MULTILINE)
+    cells = [[cell.strip() for cell in line.split("|")] for line in lines]
+    rules = [k for k, row in enumerate(cells) if all(set(cell) <= set("-: ") for cell in row)]
+    heads = {k - 1 for k in rules}
+    return [row for k, row in enumerate(cells) if k not in rules and k not in heads]
+
+
+def codes(text: str) -> set[str]:
+    return set(re.findall(r"`([^`]+)`", text))
+
+
+@pytest.mark.parametrize("name", with_blocks("python"))
+def test_python_in_documents_runs(
+    name: str, room_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(room_recording, tmp_path / "recording")
+    monkeypatch.chdir(tmp_path)
+    registered_parts()  # imported now, so that only what the document makes up goes away with it
+    known = {kind: dict(known) for kind, known in parts._registry.items()}
+    monkeypatch.setattr(parts, "_registry", known)
+    # What docs/formats.md takes for given: depth images of the camera that it shows.
+    names: dict[str, Any] = {"depth_images": np.ones((2, 424, 512), np.float32)}
+    for k, code in enumerate(blocks(name, "python")):
+        exec(compile(code, f"{name}, python block {k}", "exec", dont_inherit=True), names)
+
+
+def test_worked_pose_is_the_line_that_the_document_gives(tmp_path: Path) -> None:
+    (line,) = re.findall(r"^12\.5 .*$", text_of("docs/conventions.md"), re.MULTILINE)
+    (tmp_path / "trajectory.txt").write_text(line + "\n")
+    times, (T,) = read_tum(tmp_path / "trajectory.txt")
+    assert times.tolist() == [12.5]
+    # 30 degrees about y, by the definition of a rotation matrix.
+    c, s = np.sqrt(3) / 2, 0.5
+    np.testing.assert_allclose(
+        T, [[c, 0, s, 0.5], [0, 1, 0, 0], [-s, 0, c, 0.2], [0, 0, 0, 1]], atol=1e-8
+    )
+    np.testing.assert_allclose(se3.transform(T, [[0, 0, 2]]), [[1.5, 0, 0.2 + np.sqrt(3)]])
+
+
+@pytest.mark.parametrize("name", with_blocks("bash"))
+def test_command_lines_in_documents_parse(name: str) -> None:
+    lines = [line for block in blocks(name, "bash") for line in block.splitlines() if line.strip()]
+    for line in lines:
+        program, *arguments = shlex.split(line, comments=True)
+        assert program == "tofuse", line
+        make_parser().parse_args(arguments)
+
+
+@pytest.mark.parametrize("name", with_blocks("toml"))
+def test_configurations_in_documents_are_accepted(name: str) -> None:
+    for block in blocks(name, "toml"):
+        changes = tomllib.loads(block)
+        config = changed(from_method(changes.get("method", "default")), changes, where=name)
+        for key in changes:
+            assert key in config.to_dict()
+
+
+@pytest.mark.parametrize("name", with_blocks("json"))
+def test_json_in_documents_is_json(name: str) -> None:
+    for block in blocks(name, "json"):
+        json.loads(block)
+
+
+def anchors(name: str) -> set[str]:
+    """Anchors that the headings of a document get on code hosting sites."""
+    headings = re.findall(r"^#+ +(.+)$", text_of(name), re.MULTILINE)
+    kept = [re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings]
+    return {heading.replace(" ", "-") for heading in kept}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_lead_somewhere(name: str) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(name)):
+        if target.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (ROOT / name).parent / path if path else ROOT / name
+        assert file.exists(), f"{name} links to {target}"
+        if anchor:
+            linked = str(file.resolve().relative_to(ROOT))
+            assert anchor in anchors(linked), f"{name} links to {target}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_that_documents_name_exist(name: str) -> None:
+    """Paths in backticks that look like this project's own files."""
+    bases = [ROOT, ROOT / "src" / "tofuse"]
+    rooms = {p.name for p in bases[1].iterdir() if p.is_dir()} | {"benchmarks", "tests", "docs"}
+    for code in codes(text_of(name)):
+        path = code.removeprefix("src/tofuse/")
+        if path.split("/")[0] in rooms and re.fullmatch(r"[\w./]+\.(py|md)", path):
+            assert any((base / path).exists() for base in bases), f"{name} names {code}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_document_is_reached_from_the_readme(name: str) -> None:
+    reached, todo = set(), ["README.md"]
+    while todo:
+        here = todo.pop()
+        if here in reached:
+            continue
+        reached.add(here)
+        for target in re.findall(r"\]\(([^)#\s]+\.md)", text_of(here)):
+            if not target.startswith("http"):
+                linked = ((ROOT / here).parent / target).resolve().relative_to(ROOT)
+                todo.append(str(linked))
+    assert name in reached or name == "CHANGELOG.md"
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    (action,) = (a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return dict(action.choices)
+
+
+def options(parser: argparse.ArgumentParser) -> set[str]:
+    return {option for a in parser._actions for option in a.option_strings} - {"-h", "--help"}
+
+
+@pytest.mark.parametrize("command", sorted(commands()))
+def test_every_option_of_a_command_is_documented(command: str) -> None:
+    section = sections("docs/commands.md")[f"tofuse {command}"]
+    documented = {
+        word
+        for row in rows(section)
+        for code in codes(row[0])
+        for word in code.split()
+        if word.startswith("--")
+    }
+    assert documented == options(commands()[command])
+
+
+def test_every_documented_command_exists() -> None:
+    documented = {
+        heading.removeprefix("tofuse ")
+        for heading in sections("docs/commands.md")
+        if heading.startswith("tofuse ")
+    }
+    assert documented == set(commands())
+
+
+def test_choices_are_documented() -> None:
+    found = sections("docs/commands.md")
+    assert set(DEMO_SCENES) <= codes(found["tofuse demo"])
+    assert set(CAMERAS) <= codes(found["tofuse simulate"])
+    assert {row[0].strip("`") for row in rows(sections("docs/methods.md")["Configurations"])} == (
+        set(methods())
+    )
+    for action in commands()["run"]._actions:
+        if action.choices:
+            assert set(action.choices) <= codes(found["tofuse run"])
+
+
+def test_reason_codes_are_the_closed_list() -> None:
+    table = rows(sections("docs/commands.md")["The verdict"])
+    assert {row[0].strip("`"): (row[1], row[2]) for row in table} == REASONS
+
+
+def test_every_field_of_run_json_is_documented(room_recording: Path) -> None:
+    result = tofuse.reconstruct(tofuse.open(room_recording))
+    data = run_json(result)
+    section = sections("docs/commands.md")["run.json"]
+    top, frames, loops = re.split(r"^Fields of a \w+:$", section, flags=re.MULTILINE)
+    assert {c for row in rows(top) for c in codes(row[0])} == set(data)
+    assert {row[0].strip("`") for row in rows(frames)} == set(data["frames"][0])
+    record = {f.name for f in dataclasses.fields(LoopRecord)}
+    assert {c for row in rows(loops) for c in codes(row[0])} == record
+    meaning = {c: row[1] for row in rows(top) for c in codes(row[0])}
+    assert set(data["input"]) <= codes(meaning["input"])
+    assert {"code", "frames", "text"} <= codes(meaning["reasons"])
+    assert all(set(entry) <= codes(meaning["filters"]) for entry in data["filters"].values())
+
+
+def documented_parts() -> dict[str, dict[str, list[str]]]:
+    """Rows of docs/methods.md by kind and name; the kind is in the heading."""
+    out: dict[str, dict[str, list[str]]] = {}
+    for heading, text in sections("docs/methods.md").items():
+        kind = re.search(r"\(`([\w-]+)`\)$", heading)
+        if kind:
+            listed = [row for row in rows(text) if row[1] in ("validated", "experimental")]
+            out[kind[1]] = {row[0].strip("`"): row for row in listed}
+    return out
+
+
+def registered_parts() -> dict[str, dict[str, type]]:
+    for room in PART_ROOMS:
+        parts.discover(room)
+    found = {kind: parts.known(kind) for kind in parts._registry}
+    # Parts that other tests have made up are not the package's.
+    ours = {
+        kind: {n: c for n, c in known.items() if c.__module__.startswith("tofuse.")}
+        for kind, known in found.items()
+    }
+    return {kind: known for kind, known in ours.items() if known}
+
+
+def test_every_part_is_listed_with_its_label() -> None:
+    listed = {
+        kind: {name: row[1] for name, row in known.items()}
+        for kind, known in documented_parts().items()
+    }
+    assert listed == {
+        kind: {name: cls.part_label for name, cls in known.items()}  # type: ignore[attr-defined]
+        for kind, known in registered_parts().items()
+    }
+
+
+def test_every_option_of_a_part_is_listed() -> None:
+    documented = documented_parts()
+    for kind, known in registered_parts().items():
+        for name, cls in known.items():
+            named = codes(" ".join(documented[kind][name][2:]))
+            fields = {f.name for f in dataclasses.fields(cls)}
+            assert fields <= named, f"{kind} {name}: {fields - named}"
+
+
+def test_every_room_is_described_in_the_order_of_imports() -> None:
+    project = tomllib.loads(text_of("pyproject.toml"))
+    layers = project["tool"]["importlinter"]["contracts"][0]["layers"]
+    ranks = {room.strip(): rank for rank, layer in enumerate(layers) for room in layer.split("|")}
+    table = rows(sections("ARCHITECTURE.md")["Rooms"])
+    described = [row[0].strip("`") for row in table if not row[0].strip("`").endswith(("/", "."))]
+    assert set(described) == set(ranks) - {"_version"}
+    order = [ranks[room] for room in described]
+    assert order == sorted(order, reverse=True)
+
+
+def test_version_is_the_same_everywhere() -> None:
+    assert f"version: {tofuse.__version__}\n" in text_of("CITATION.cff")
+    assert f"## [{tofuse.__version__}]" in text_of("CHANGELOG.md")
+
+
+def test_documents_are_small_enough_to_clone() -> None:
+    tracked = subprocess.run(
+        ["git", "ls-files", "docs"], cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.split()
+    for name in tracked:
+        assert (ROOT / name).stat().st_size < 200_000, name
