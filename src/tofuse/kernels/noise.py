@@ -1,0 +1,102 @@
+"""Standard deviation of the range of each pixel, by rows: one pass over the image."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+BY_RANGE, BY_AMPLITUDE, BY_CONFIDENCE, BY_CAMERA = 0, 1, 2, 3
+SATURATED = 65535.0
+
+Float32 = NDArray[np.float32]
+
+
+@kernel
+def range_sigma(
+    depth: Float32,
+    is_range: bool,
+    rays: Float32,
+    law: int,
+    channel: Float32,
+    compensated: bool,
+    levels: NDArray[np.float64],
+    cosine: Float32,
+    parameters: NDArray[np.float64],
+    start: int,
+    stop: int,
+    out: Float32,
+) -> None:
+    """Write the standard deviation in m of the radial range of each pixel of some rows.
+
+    Parameters
+    ----------
+    depth
+        (H, W) in m, 0 where invalid; radial range or z.
+    is_range
+        Which of the two.
+    rays
+        (H, W, 2) x/z and y/z, NaN where unknown.
+    law
+        `BY_RANGE`, `BY_AMPLITUDE`, `BY_CONFIDENCE`, or `BY_CAMERA`.
+    channel
+        (H, W) amplitude, confidence or the camera's own sigma, as the law needs; (0, 0) if none.
+    compensated
+        Whether the amplitude was multiplied by the squared range and divided by the falloff.
+    levels
+        (K,) sigma in m at 1 m of each level of confidence.
+    cosine
+        (H, W) of the incidence, NaN where unknown; (0, 0) if not known at all.
+    parameters
+        floor, ceiling, shot, dark, falloff, a, b, power, footprint: fields of the noise model.
+    start, stop
+        Rows of `out` (H, W) to write: 0 where invalid.
+    """
+    floor, ceiling, shot, dark, falloff, a, b, power, footprint = parameters
+    width = depth.shape[1]
+    slanted = cosine.shape[0] > 0 and footprint > 0
+    for i in range(start, stop):
+        for j in range(width):
+            out[i, j] = 0
+            x, y = float(rays[i, j, 0]), float(rays[i, j, 1])
+            measured = float(depth[i, j])
+            if not (measured > 0 and x == x and y == y):
+                continue
+            length2 = 1 + x * x + y * y
+            length = math.sqrt(length2)
+            distance = measured if is_range else measured * length
+            variance = floor * floor
+            if law == BY_AMPLITUDE:
+                light = float(channel[i, j])
+                if not light < SATURATED:
+                    light = 0.0
+                elif compensated:
+                    light /= distance * distance
+                    if falloff > 0:
+                        light *= length2 ** (-0.5 * falloff)
+                if light > 0:
+                    variance += (shot * shot + dark * dark / light) / light
+                else:
+                    variance = ceiling * ceiling
+            elif law == BY_CONFIDENCE:
+                level = min(max(int(channel[i, j]), 0), len(levels) - 1)
+                sigma = levels[level] * distance**power
+                variance += sigma * sigma
+            elif law == BY_CAMERA:
+                own = float(channel[i, j])
+                variance = own * own if own > 0 else ceiling * ceiling
+            else:
+                sigma = a + b * distance * distance
+                variance += sigma * sigma
+            variance = min(variance, ceiling * ceiling)
+            if slanted and cosine[i, j] == cosine[i, j]:
+                other = j + 1 if j + 1 < width else j - 1
+                step = math.hypot(rays[i, other, 0] - x, rays[i, other, 1] - y)
+                if step == step:
+                    c = min(max(abs(float(cosine[i, j])), 0.1), 1.0)
+                    change = footprint * step * (distance / length) * math.sqrt(1 - c * c) / c
+                    variance += change * change
+            out[i, j] = math.sqrt(variance)

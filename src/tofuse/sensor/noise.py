@@ -1,0 +1,385 @@
+"""How far the range of a pixel can be trusted: its standard deviation, camera by camera.
+
+The phase of a modulated camera is the angle of a phasor of amplitude A, whose two components
+carry the same noise: shot noise of the signal itself, which grows as the root of A, and noise that
+doesn't depend on it (ambient light, read-out). Their ratio gives
+
+    sigma_r^2 = floor^2 + shot^2 / A + dark^2 / A^2,    A in raw counts
+
+(Lange 2000, ch. 4; the usual "noise over amplitude" is its last term). On a surface of one albedo
+A falls as 1/r^2, so that sigma grows as r^2 in the dark limit. Cameras that don't give their
+amplitude are described by a table over their levels of confidence, or over the range alone,
+``sigma_r = a + b r^2``, which is also the law of triangulating cameras (Khoshelham 2011).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.atomic import write_text
+from tofuse.files.reading import read_text
+from tofuse.geometry.cameras import Camera, ray_lengths
+from tofuse.kernels import noise as kernels
+from tofuse.kernels.threads import run_chunks
+from tofuse.parts import from_dict, to_dict
+from tofuse.sensor.models import CAMERAS, SPEED_OF_LIGHT, CameraModel
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Law = Literal["range", "amplitude", "confidence", "camera"]
+
+SCHEMA = 1
+_CODES = {
+    "range": kernels.BY_RANGE,
+    "amplitude": kernels.BY_AMPLITUDE,
+    "confidence": kernels.BY_CONFIDENCE,
+    "camera": kernels.BY_CAMERA,
+}
+# A metre of noise is a number in millimetres.
+_LARGEST_M = 5.0
+# Share of a bright office's light on a half white wall: what cameras indoors work in.
+_USUAL_AMBIENT = 0.15
+_NONE = np.empty((0, 0), np.float32)
+
+
+class NoisyImage(Protocol):
+    """What of a range image its noise is told from; a `RangeFrame` is one."""
+
+    @property
+    def camera(self) -> Camera: ...  # noqa: D102
+    @property
+    def depth(self) -> Float32: ...  # noqa: D102
+    @property
+    def depth_kind(self) -> Literal["z", "range"]: ...  # noqa: D102
+    @property
+    def amplitude_image(self) -> Float32 | None: ...  # noqa: D102
+    @property
+    def amplitude_kind(self) -> Literal["raw", "range_compensated", "ir"]: ...  # noqa: D102
+    @property
+    def confidence_image(self) -> NDArray[np.uint8] | None: ...  # noqa: D102
+    @property
+    def sigma_image(self) -> Float32 | None: ...  # noqa: D102
+    @property
+    def normal_image(self) -> Float32 | None: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class AmplitudeLaw:
+    """``sigma^2 = shot^2 / A + dark^2 / A^2`` over the raw amplitude A in counts.
+
+    Attributes
+    ----------
+    shot
+        m times the root of a count: shot noise of the signal.
+    dark
+        m times a count: noise that doesn't depend on the signal.
+    falloff
+        A range-compensated amplitude was divided by the cosine of the pixel's angle to the axis to
+        this power, besides being multiplied by the squared range.
+    """
+
+    shot: float
+    dark: float
+    falloff: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("shot", "dark", "falloff"):
+            _check(name, getattr(self, name), 0, math.inf)
+        if self.shot == 0 and self.dark == 0:
+            raise ValueError("shot and dark are both 0: give at least one")
+
+
+@dataclass(frozen=True)
+class ConfidenceLaw:
+    """``sigma = sigma_m[level] * r^power``, a table over the levels of confidence.
+
+    Attributes
+    ----------
+    sigma_m
+        m at 1 m, of the levels 0, 1, ...; must not grow. Higher levels count as the last.
+    power
+        How sigma grows with the range at one level; 0 where the level says it all.
+    """
+
+    sigma_m: tuple[float, ...]
+    power: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.sigma_m:
+            raise ValueError("sigma_m is empty: give one number for each level of confidence")
+        for value in self.sigma_m:
+            _check("sigma_m", value, 0, _LARGEST_M, "give metres")
+        _check("power", self.power, 0, 4)
+        if any(b > a for a, b in zip(self.sigma_m, self.sigma_m[1:], strict=False)):
+            raise ValueError("sigma_m grows with confidence: higher levels must be better")
+
+
+@dataclass(frozen=True)
+class RangeLaw:
+    """``sigma = a + b r^2`` over the radial range r; `a` in m, `b` in 1/m."""
+
+    a: float
+    b: float
+
+    def __post_init__(self) -> None:
+        _check("a", self.a, 0, _LARGEST_M, "give metres")
+        _check("b", self.b, 0, 1, "give metres of noise at 1 m")
+        if self.a == 0 and self.b == 0:
+            raise ValueError("a and b are both 0: give at least one")
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Standard deviation of the radial range of one camera, in m.
+
+    A frame that brings its camera's own sigma keeps it. Else the first law decides that the model
+    has and the frame has the channel for: amplitude, confidence, range.
+
+    Attributes
+    ----------
+    name
+        Of the camera.
+    range
+        Always there, for frames with nothing but depth.
+    amplitude, confidence
+        Or None.
+    floor_m
+        Noise that no light helps against (rounding, jitter); added in squares.
+    ceiling_m
+        Noise of a pixel that saw nothing: the period's length over the root of 12. Pixels without
+        amplitude, and saturated ones, get this.
+    footprint
+        A surface at an angle changes its range inside a pixel; this share of the change counts as
+        noise, if the incidence is known. The standard deviation of a uniform distribution is
+        0.29.
+    """
+
+    name: str
+    range: RangeLaw
+    amplitude: AmplitudeLaw | None = None
+    confidence: ConfidenceLaw | None = None
+    floor_m: float = 0.0
+    ceiling_m: float = 1.0
+    footprint: float = 0.29
+
+    def __post_init__(self) -> None:
+        _check("floor_m", self.floor_m, 0, _LARGEST_M, "give metres")
+        _check("ceiling_m", self.ceiling_m, self.floor_m, 100, "give metres, more than floor_m")
+        _check("footprint", self.footprint, 0, 1)
+        if self.ceiling_m == 0:
+            raise ValueError("ceiling_m is 0")
+
+    def law(self, frame: NoisyImage) -> Law:
+        """Which law decides for this frame; "camera" where it brings its own sigma."""
+        if frame.sigma_image is not None:
+            return "camera"
+        if self.amplitude is not None and frame.amplitude_image is not None:
+            return "amplitude"
+        if self.confidence is not None and frame.confidence_image is not None:
+            return "confidence"
+        return "range"
+
+    def sigma(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+        """Standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
+
+        Parameters
+        ----------
+        frame
+            Its channels.
+        incidence
+            (H, W) cosine between normal and ray, NaN where unknown. Taken from the frame's normals
+            if not given; without either, surfaces count as seen head-on.
+        """
+        law = self.law(frame)
+        channel: Float32 | None = None
+        if law == "camera":
+            channel = frame.sigma_image
+        elif law == "amplitude":
+            channel = frame.amplitude_image
+        elif law == "confidence" and frame.confidence_image is not None:
+            channel = frame.confidence_image.astype(np.float32)
+        cosine = incidence_cosine(frame) if incidence is None else np.asarray(incidence, np.float32)
+        out = np.empty(frame.depth.shape, np.float32)
+        channel_image = _NONE if channel is None else np.asarray(channel, np.float32)
+        cosine_image = _NONE if cosine is None else cosine
+        depth, rays = np.asarray(frame.depth, np.float32), frame.camera.rays()
+        parameters, levels = self._parameters(), self._levels()
+        code, compensated = _CODES[law], frame.amplitude_kind == "range_compensated"
+
+        def rows(start: int, stop: int) -> None:
+            kernels.range_sigma(
+                depth, frame.depth_kind == "range", rays, code, channel_image, compensated,
+                levels, cosine_image, parameters, start, stop, out,
+            )  # fmt: skip
+
+        run_chunks(rows, len(out))
+        return out
+
+    def sigma_z(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
+        """Standard deviation (H, W) float32 in m of the z depth; 0 where invalid."""
+        sigma = self.sigma(frame, incidence)
+        return np.where(sigma > 0, sigma / ray_lengths(frame.camera), np.float32(0))
+
+    def _parameters(self) -> Float64:
+        light = self.amplitude
+        shot, dark, falloff = (
+            (0, 0, 0) if light is None else (light.shot, light.dark, light.falloff)
+        )
+        power = 0.0 if self.confidence is None else self.confidence.power
+        return np.array(
+            [self.floor_m, self.ceiling_m, shot, dark, falloff, self.range.a, self.range.b, power,
+             self.footprint]
+        )  # fmt: skip
+
+    def _levels(self) -> Float64:
+        return np.array((0.0,) if self.confidence is None else self.confidence.sigma_m, float)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what noise.json holds."""
+        out: dict[str, Any] = {"schema": SCHEMA, **to_dict(self)}
+        return {key: value for key, value in out.items() if value is not None}
+
+    @classmethod
+    def from_dict(cls, data: Any, *, where: str = "noise") -> Self:
+        """Build a model of what noise.json holds.
+
+        Raises
+        ------
+        InputError
+            Naming the field, for anything that makes no sense.
+        """
+        if not isinstance(data, dict):
+            raise InputError("holds no JSON object", where=where, remedy="write {...}")
+        data = dict(data)
+        schema = data.pop("schema", None)
+        if schema != SCHEMA or isinstance(schema, bool):
+            raise InputError(
+                f"is {schema!r}" if schema is not None else "is missing",
+                where=f"{where}: schema",
+                remedy=f"write {SCHEMA}, the only version there is",
+            )
+        model: Self = from_dict(cls, data, where=where)
+        _check_finite(model, where)
+        return model
+
+    def save(self, path: str | Path) -> None:
+        """Write a noise.json; raise OutputError if that's impossible."""
+        write_text(path, json.dumps(self.to_dict(), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a noise.json.
+
+        Raises
+        ------
+        InputError
+            If it can't be read, or makes no sense.
+        """
+        try:
+            data = json.loads(read_text(path, limit=1 << 20))
+        except (ValueError, RecursionError) as error:
+            raise InputError(
+                f"is broken JSON ({error})", where=path, remedy="write it again by `tofuse noise`"
+            ) from error
+        return cls.from_dict(data, where=str(path))
+
+
+def incidence_cosine(frame: NoisyImage) -> Float32 | None:
+    """Cosine (H, W) between ray and normal, NaN where unknown; None without normals."""
+    normals = frame.normal_image
+    if normals is None:
+        return None
+    rays = frame.camera.rays()
+    dot = normals[..., 0] * rays[..., 0] + normals[..., 1] * rays[..., 1] + normals[..., 2]
+    return (np.abs(dot) / ray_lengths(frame.camera)).astype(np.float32)
+
+
+def _check(name: str, value: float, low: float, high: float, remedy: str = "") -> None:
+    if not (low <= value <= high) or not math.isfinite(value):
+        raise ValueError(f"{name} is {value}; " + (remedy or f"give {low:g} to {high:g}"))
+
+
+def _check_finite(model: Any, where: str) -> None:
+    for field in fields(model):
+        value = getattr(model, field.name)
+        if is_dataclass(value):
+            _check_finite(value, f"{where}.{field.name}")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"is {value}", where=f"{where}.{field.name}", remedy="give a number")
+
+
+def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
+    """Noise of a modulated camera of known electronics.
+
+    From the phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` of bucket differences D, each with the
+    variance of all its electrons: ``sigma_phase^2 = (S / m + E + 2 R^2) / (2 S^2)`` for amplitude
+    S, contrast m, ambient electrons E and read noise R; ``sigma_r = sigma_phase period / (2 pi)``.
+
+    Parameters
+    ----------
+    model
+        The camera.
+    far
+        Law over the range alone; that of a grey wall (albedo 0.4) if not given.
+    """
+    per_rad, gain = model.period_m / (2 * math.pi), model.counts_per_electron
+    ambient = _USUAL_AMBIENT * model.ambient_electrons
+    dark_electrons2 = (2 * model.read_noise_electrons**2 + ambient) / 2
+    shot = per_rad * math.sqrt(gain / (2 * model.modulation_contrast))
+    dark = per_rad * gain * math.sqrt(dark_electrons2)
+    falloff = model.falloff if model.amplitude_kind == "range_compensated" else 0.0
+    wall = 0.4 * model.signal_electrons * model.modulation_contrast * gain
+    return NoiseModel(
+        model.name,
+        far or RangeLaw(0.5 * shot / math.sqrt(wall), dark / wall + 0.5 * shot / math.sqrt(wall)),
+        AmplitudeLaw(shot, dark, falloff),
+        floor_m=model.depth_unit_m / math.sqrt(12),
+        ceiling_m=SPEED_OF_LIGHT / (2 * (model.unwrap_hz or model.modulation_hz)) / math.sqrt(12),
+    )
+
+
+# Noise of each family of cameras. Those of modulated cameras follow from their electronics (see
+# `sensor.models`: the SR4000's is fitted to a real recording, the others have the scale that the
+# makers state); docs/noise.md says where the other numbers are from.
+NOISE: dict[str, NoiseModel] = {
+    model.name: model
+    for model in (
+        replace(
+            of_camera(CAMERAS["sr4000"]),
+            confidence=ConfidenceLaw((0.6, 0.20, 0.13, 0.094, 0.062, 0.041, 0.028, 0.016)),
+        ),
+        of_camera(CAMERAS["kinect2"]),
+        of_camera(CAMERAS["azure-nfov"]),
+        of_camera(CAMERAS["pico-flexx"]),
+        of_camera(CAMERAS["ifm-o3r"]),
+        NoiseModel("pico-zense", RangeLaw(0.003, 0.0035)),
+        NoiseModel(
+            "iphone", RangeLaw(0.003, 0.0012), confidence=ConfidenceLaw((0.04, 0.015, 0.005), 1.0)
+        ),
+        NoiseModel("kinect1", RangeLaw(0.0005, 0.001425)),
+        NoiseModel("unknown", RangeLaw(0.003, 0.003)),
+    )
+}
+
+
+def noise_model(name: str) -> NoiseModel:
+    """Return the noise of the family called `name`.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if name not in NOISE:
+        raise InputError(
+            f"there is no camera called {name!r}", where="noise", remedy=f"use one of {[*NOISE]}"
+        )
+    return NOISE[name]
