@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,25 @@ def test_amplitude_becomes_grey_whatever_the_distance() -> None:
     assert grey[near & dark].max() <= grey[near & ~dark].min() - 100
     assert abs(grey[near & dark].mean() - grey[~near & dark].mean()) < 2
     assert abs(grey[near & ~dark].mean() - grey[~near & ~dark].mean()) < 2
+
+
+@pytest.mark.parametrize("thinned", [False, True])
+def test_amplitude_that_the_camera_compensated_is_not_compensated_again(thinned) -> None:
+    camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
+    depth = np.full((80, 100), 1.0, np.float32)
+    depth[:, 50:] = 3.0
+    albedo = np.where(np.arange(80)[:, None] < 40, 200.0, 800.0) * np.ones((1, 100))
+    frame = RangeFrame(0, 0.0, camera, depth)
+    square = (frame.point_image.astype(float) ** 2).sum(-1)
+    raw = replace(frame, amplitude_image=(1000 * albedo / square).astype(np.float32))
+    compensated = replace(
+        frame,
+        amplitude_image=albedo.astype(np.float32),
+        amplitude_kind="range_compensated",
+    )
+    found = [fuse([as_cloud(f, 10**6) if thinned else f]) for f in (raw, compensated)]
+    assert np.ptp(found[0].color) == 255
+    assert np.abs(found[0].color.astype(int) - found[1].color).max() <= 1
 
 
 def test_colour_is_averaged_and_goes_before_amplitude() -> None:

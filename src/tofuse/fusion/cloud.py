@@ -119,7 +119,7 @@ class CloudBuilder:
             rows[:, 10] = 1
         elif frame.amplitude is not None:
             # Light falls off with the square of the range: this is nearly the surface's albedo.
-            rows[:, 11] = frame.amplitude * distance[:, 0] ** 2
+            rows[:, 11] = _raw_amplitude(frame) * distance[:, 0] ** 2
             rows[:, 12] = 1
         keys = _voxel_keys(world, self.voxel_m)
         keys, sums = _sum_by_key(keys, rows)
@@ -163,8 +163,12 @@ def empty_cloud() -> Cloud:
 
 
 def as_cloud(frame: Frame, most: int) -> CloudFrame:
-    """Return the view as a cloud of at most `most` points, taken at an even stride."""
+    """Return the view as a cloud of at most `most` points, taken at an even stride.
+
+    Its amplitude falls with the square of the range, whatever the view's own counts.
+    """
     part = slice(None, None, max(1, -(-len(frame) // most)))
+    amplitude = None if frame.amplitude is None else _raw_amplitude(frame)
 
     def cut(values: NDArray[Any] | None) -> Any:
         return None if values is None else values[part].copy()
@@ -175,10 +179,20 @@ def as_cloud(frame: Frame, most: int) -> CloudFrame:
         cut(frame.points),
         cut(frame.normals),
         cut(frame.sigma),
-        cut(frame.amplitude),
+        cut(amplitude),
         cut(frame.color),
         frame.origin,
     )
+
+
+def _raw_amplitude(frame: Frame) -> Float32:
+    """Return the amplitude (N,) as the light that arrived, which falls with the range squared."""
+    amplitude = frame.amplitude
+    assert amplitude is not None
+    if isinstance(frame, RangeFrame) and frame.amplitude_kind == "range_compensated":
+        square = np.einsum("ni,ni->n", frame.points, frame.points)
+        return (amplitude / np.maximum(square, 1e-6)).astype(np.float32)
+    return amplitude
 
 
 def _voxel_keys(points: Float64, voxel: float) -> NDArray[np.int64]:

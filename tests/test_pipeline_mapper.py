@@ -1,0 +1,234 @@
+"""The engine: online and whole runs agree, and what is pushed wrongly is refused."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.errors import InputError
+from tofuse.filters.base import Filter
+from tofuse.filters.temporal import TemporalDeviation
+from tofuse.kernels.threads import thread_count
+from tofuse.parts import part
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.mapper import Mapper, covariance_of
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.recording import ArraySource, Recording
+
+
+@pytest.fixture(scope="module")
+def recording(room_recording) -> Recording:
+    return tofuse.open(room_recording)
+
+
+@pytest.fixture(scope="module")
+def frames(recording):
+    return list(recording)
+
+
+@pytest.fixture(scope="module")
+def whole(recording):
+    return reconstruct(recording)
+
+
+def in_memory(frames, **options) -> Recording:
+    return Recording.of(ArraySource(frames, **options), "memory", "frames")
+
+
+def blank(frame: RangeFrame) -> RangeFrame:
+    return replace(frame, depth=np.zeros_like(frame.depth))
+
+
+def test_frames_pushed_one_by_one_give_the_same_bytes(frames, whole) -> None:
+    mapper = Mapper()
+    poses = [mapper.push(frame) for frame in frames]
+    result = mapper.finish()
+    np.testing.assert_array_equal(poses, whole.diagnostics.sequential)
+    assert result.trajectory.tobytes() == whole.trajectory.tobytes()
+    assert result.cloud.points.tobytes() == whole.cloud.points.tobytes()
+    assert result.cloud.normals.tobytes() == whole.cloud.normals.tobytes()
+    assert result.graph.information.tobytes() == whole.graph.information.tobytes()
+    assert result.recording == {"path": None, "format": "frames", "frames": 8}
+
+
+def test_result_of_a_whole_run(whole, recording) -> None:
+    assert whole.trajectory.shape == (8, 4, 4)
+    np.testing.assert_array_equal(whole.trajectory[0], np.eye(4))
+    np.testing.assert_array_equal(whole.timestamps, recording.timestamps)
+    assert whole.mesh is None
+    assert whole.graph.ids.tolist() == list(range(8))
+    assert len(whole.cloud) > 1000
+    assert {"filters", "tracking", "loops", "fusion", "checking"} <= set(whole.diagnostics.seconds)
+    assert 0 < whole.diagnostics.removed["neighbour_share"] < 1
+    # The camera of the simulation turned; the estimate must be near, not merely there.
+    error = np.linalg.norm(whole.trajectory[:, :3, 3] - recording.reference[:, :3, 3], axis=1)
+    assert error.max() < 0.1
+
+
+def test_seed_and_threads(recording, whole) -> None:
+    same = reconstruct(recording, threads=1)
+    assert same.trajectory.tobytes() == whole.trajectory.tobytes()
+    assert same.threads == 1
+    other = reconstruct(recording, seed=1)
+    assert other.trajectory.tobytes() != whole.trajectory.tobytes()
+    np.testing.assert_allclose(other.trajectory, whole.trajectory, atol=0.1)
+
+
+def test_the_number_of_threads_is_put_back(frames) -> None:
+    before = thread_count()
+    mapper = Mapper(threads=before + 1)
+    mapper.push(frames[0])
+    mapper.finish()
+    assert thread_count() == before
+
+
+def test_order_kind_and_end(frames) -> None:
+    mapper = Mapper()
+    mapper.push(frames[3])
+    for index in (3, 1):
+        with pytest.raises(InputError, match=f"frame {index}: comes after frame 3; number"):
+            mapper.push(frames[index])
+        with pytest.raises(InputError, match=f"frame {index}: comes after frame 3"):
+            mapper.skip(index, 0.0, "broken")
+    cloud = CloudFrame.of(frames[4].points, index=4)
+    with pytest.raises(InputError, match="frame 4: is a cloud view among range views"):
+        mapper.push(cloud)
+    mapper.push(frames[4])
+    assert mapper.finish().has_pose.tolist() == [True, True]
+    for call in (lambda: mapper.push(frames[5]), mapper.finish, lambda: mapper.skip(6, 0.0, "")):
+        with pytest.raises(InputError, match="mapper: is finished; make a new Mapper"):
+            call()
+
+
+def test_nothing_pushed_or_nothing_usable(frames) -> None:
+    with pytest.raises(InputError, match="none of the 0 frames"):
+        Mapper().finish()
+    mapper = Mapper()
+    assert mapper.push(blank(frames[0])) is None
+    with pytest.raises(InputError, match=r"none of the 1 frames has enough valid points.*0 valid"):
+        mapper.finish()
+
+
+def test_a_filter_for_images_refuses_clouds_before_work_starts(frames) -> None:
+    config = replace(from_method("default"), filters=(TemporalDeviation(),))
+    mapper = Mapper(config)
+    with pytest.raises(InputError, match=r"filter 'temporal' takes .'range'. views"):
+        mapper.push(CloudFrame.of(frames[0].points))
+    mapper.push(frames[0])  # the refused view has not decided what comes next
+
+
+def test_a_lost_frame_has_no_pose_and_the_next_goes_on(frames) -> None:
+    lost = [blank(f) if f.index == 3 else f for f in frames]
+    result = reconstruct(in_memory(lost))
+    assert result.has_pose.tolist() == [k != 3 for k in range(8)]
+    assert [f.status for f in result.diagnostics.frames].count("lost") == 1
+    assert "0 valid points" in result.diagnostics.frames[3].reason
+    assert result.graph.ids.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert [2, 3] in result.graph.edges.tolist()  # frame 2 to frame 4
+    assert result.diagnostics.verdict == "degraded"
+
+
+def test_a_lost_first_frame_is_not_the_world(frames) -> None:
+    result = reconstruct(in_memory([blank(frames[0]), *frames[1:]]))
+    assert not result.has_pose[0]
+    np.testing.assert_array_equal(result.trajectory[1], np.eye(4))
+
+
+def test_loops_given_by_hand(frames, whole) -> None:
+    measured = np.linalg.inv(whole.trajectory[0]) @ whole.trajectory[7]
+    given = [GivenLoop(0, 7, measured), GivenLoop(1, 3, np.eye(4))]
+    lost = [blank(f) if f.index == 3 else f for f in frames]
+    result = reconstruct(in_memory(lost), loops=given)
+    used, refused = result.diagnostics.loops[1], result.diagnostics.loops[0]
+    assert (used.i, used.j, used.accepted) == (0, 7, True)
+    assert (refused.i, refused.j, refused.accepted) == (1, 3, False)
+    assert "loop_rejected" in [r.code for r in result.diagnostics.reasons]
+    assert result.graph.loop.sum() == 1
+    assert len(result.diagnostics.objective) > 0
+
+
+def test_clouds_alone_make_a_model(frames) -> None:
+    clouds = [CloudFrame.of(f.points[::3], index=f.index, timestamp=f.index) for f in frames[:4]]
+    result = reconstruct(in_memory(clouds))
+    assert result.has_pose.all()
+    assert result.cloud.color is None
+
+
+def test_covariance_is_the_inverse_of_the_information(whole) -> None:
+    record = whole.diagnostics.frames[2]
+    edge = np.flatnonzero((whole.graph.edges == [1, 2]).all(1))[0]
+    np.testing.assert_allclose(
+        record.covariance @ whole.graph.information[edge], np.eye(6), atol=1e-6
+    )
+
+    @dataclass
+    class Nothing:
+        information: object = field(default_factory=lambda: np.diag([1.0, 1, 1, 1, 1, 0]))
+
+    assert covariance_of(Nothing()) is None
+
+
+@part("filter", "test-history")
+@dataclass(frozen=True)
+class SeesHistory(Filter):
+    """Notes which frames it was given, and how many points they had."""
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+    seen: ClassVar[list[tuple[int, list[int], list[int]]]] = []
+
+    @property
+    def window(self) -> int:
+        return 3
+
+    def mask(self, frame, history):
+        self.seen.append((frame.index, [f.index for f in history], [len(f) for f in history]))
+        keep = frame.valid.copy()
+        keep[::2] = False
+        return keep
+
+
+def test_temporal_filters_see_raw_neighbours_whatever_was_selected(recording, frames) -> None:
+    SeesHistory.seen.clear()
+    config = replace(from_method("default"), filters=(SeesHistory(),))
+    result = reconstruct(recording.select(0, None, 3), config)
+    assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1, 2]), (6, [4, 5])]
+    for _, past, counts in SeesHistory.seen:
+        assert counts == [len(frames[k]) for k in past]  # unfiltered
+    assert [f.index for f in result.diagnostics.frames] == [0, 3, 6]
+
+
+def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path) -> None:
+    copy = shutil.copytree(room_recording, tmp_path / "copy")
+    (copy / "depth" / "000002.png").write_bytes(b"no image")
+    SeesHistory.seen.clear()
+    config = replace(from_method("default"), filters=(SeesHistory(),))
+    result = reconstruct(tofuse.open(copy).select(0, None, 3), config)
+    assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1]), (6, [4, 5])]
+    assert result.has_pose.all()
+
+
+def test_pushed_frames_are_each_others_history(frames) -> None:
+    SeesHistory.seen.clear()
+    mapper = Mapper(replace(from_method("default"), filters=(SeesHistory(),)))
+    for frame in frames[:4]:
+        mapper.push(frame)
+    assert [past for _, past, _ in SeesHistory.seen] == [[], [0], [0, 1], [1, 2]]
+    assert SeesHistory.seen[3][2] == [len(frames[1]), len(frames[2])]
+
+
+def test_odometry_is_used_where_it_is_asked_for(frames, recording) -> None:
+    base = from_method("default")
+    config = replace(base, odometry=replace(base.odometry, guess="odometry"))
+    odometry = recording.reference.copy()
+    with_odometry = reconstruct(in_memory(frames, odometry=odometry), config)
+    without = reconstruct(in_memory(frames), config)
+    assert with_odometry.trajectory.tobytes() != without.trajectory.tobytes()
+    odometry[3] = np.nan
+    assert reconstruct(in_memory(frames, odometry=odometry), config).has_pose.all()
