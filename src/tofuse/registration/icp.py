@@ -28,6 +28,7 @@ from tofuse.registration.matchers import ClosestPoint
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.rejectors import MaxDistance, Unique
 from tofuse.registration.selectors import All, Random
+from tofuse.registration.shape import NEIGHBOURS
 from tofuse.registration.stopping import TwoLoops
 
 _FEWEST_POINTS = 3
@@ -53,6 +54,9 @@ class Icp(Registrar):
         Turns pairs into a motion.
     stopping
         Ends the iterations.
+    neighbours
+        Points of each plane fit, where a part needs normals, curvature or boundaries that the
+        view doesn't bring.
     """
 
     resolution: float = 0.01
@@ -62,8 +66,11 @@ class Icp(Registrar):
     rejectors: tuple[Rejector, ...] = (MaxDistance(), Unique())
     metric: Metric = field(default_factory=PointToPoint)
     stopping: Stopping = field(default_factory=TwoLoops)
+    neighbours: int = NEIGHBOURS
 
     def __post_init__(self) -> None:
+        if self.neighbours < 3:
+            raise ValueError(f"neighbours is {self.neighbours}, not 3 or more")
         if not 0 < self.resolution < 1e9:
             raise ValueError(f"resolution is {self.resolution}, not a length in metres")
 
@@ -97,14 +104,23 @@ class Icp(Registrar):
         history = History()
         converged = False
         while not converged and len(history) < self.stopping.max_iterations:
+            if self.source.each_iteration and len(history) > 0:
+                data = self._select(self.source, source, rng)
+                moved = transform_points(T, data.points)
+            if self.target.each_iteration and len(history) > 0:
+                model = self._select(self.target, target, rng)
+                search = self.matcher.prepare(model)
             alignment = Alignment(data, model, self.resolution, T, moved)
             matches = search.match(alignment, reach)
             for rejector in self.rejectors:
                 matches = rejector.reject(matches, alignment)
+            before = moved
             T = self.metric.motion(matches, alignment) @ T
             moved = transform_points(T, data.points)
             history.correspondences.append(len(matches))
             history.errors.append(float(matches.distance.sum()) / (len(data) * self.resolution))
+            step = math.sqrt(float(((moved - before) ** 2).sum()) / len(data))
+            history.steps.append(step / self.resolution)
             converged = self.stopping.met(history)
 
         T = se3.orthonormalise(T)
@@ -118,12 +134,12 @@ class Icp(Registrar):
             error=history.errors[-1],
             rms_m=math.sqrt(float((matches.distance**2).mean())),
             information=self.metric.information(matches, final),
+            unobservable=self.metric.unobservable(matches, final),
             errors=tuple(history.errors),
         )
 
-    @staticmethod
-    def _select(selector: Selector, view: Frame, rng: np.random.Generator) -> Points:
-        chosen = Points.of(view, selector.select(view, rng))
+    def _select(self, selector: Selector, view: Frame, rng: np.random.Generator) -> Points:
+        chosen = Points.of(view, selector.select(view, rng), self.neighbours)
         if len(chosen) < _FEWEST_POINTS:
             raise RegistrationError(
                 f"has {len(chosen)} points, {_FEWEST_POINTS} are needed",

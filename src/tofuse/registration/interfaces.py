@@ -8,12 +8,15 @@ turns the pairs into a motion, the *stopping* rule looks at the history. Before 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.errors import RegistrationError
 from tofuse.recordings.frames import Frame
+from tofuse.registration.shape import NEIGHBOURS, Shape, normals_at, shape_at
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -32,16 +35,55 @@ class Points:
         (n,) positions of the points in ``view.points``.
     points
         (n, 3) m, in the view's frame.
+    neighbours
+        Points of the view that each plane fit takes, where normals or curvature are needed.
     """
 
     view: Frame
     index: Int64
     points: Float64
+    neighbours: int = NEIGHBOURS
 
     @classmethod
-    def of(cls, view: Frame, index: Int64) -> Self:
+    def of(cls, view: Frame, index: Int64, neighbours: int = NEIGHBOURS) -> Self:
         """Take the points of a view at the positions `index`."""
-        return cls(view, index, view.points[index].astype(np.float64))
+        return cls(view, index, view.points[index].astype(np.float64), neighbours)
+
+    @cached_property
+    def normals(self) -> Float64:
+        """(n, 3) unit normals towards the sensor: the view's own, else plane fits; may be NaN."""
+        return normals_at(self.view, self.index, self.neighbours)
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Curvature and boundary of the view's surface at the points."""
+        return shape_at(self.view, self.index, self.neighbours)
+
+    @cached_property
+    def amplitude(self) -> Float64:
+        """(n,) amplitude in counts; RegistrationError if the view has none."""
+        if self.view.amplitude is None:
+            raise RegistrationError(
+                "has no amplitude, which this registration compares",
+                where=f"frame {self.view.index}",
+            )
+        return self.view.amplitude[self.index].astype(np.float64)
+
+    @cached_property
+    def color(self) -> Float64:
+        """(n, 3) RGB, 0 to 1; RegistrationError if the view has none."""
+        if self.view.color is None:
+            raise RegistrationError(
+                "has no colour, which this registration compares",
+                where=f"frame {self.view.index}",
+            )
+        return self.view.color[self.index].astype(np.float64) / 255
+
+    @cached_property
+    def variance(self) -> Float64 | None:
+        """(n,) variance of the range in m^2; None if not known."""
+        sigma = self.view.sigma
+        return None if sigma is None else sigma[self.index].astype(np.float64) ** 2
 
     def __len__(self) -> int:
         return len(self.index)
@@ -107,19 +149,34 @@ class Matches:
 
 @dataclass
 class History:
-    """What the iterations so far gave: number of correspondences and E, one for each."""
+    """What the iterations so far gave, one for each.
+
+    Attributes
+    ----------
+    correspondences
+        Number of pairs.
+    errors
+        E.
+    steps
+        How far the last motion took the source's points, rms, in resolutions.
+    """
 
     correspondences: list[int] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.errors)
 
 
 class Selector(Protocol):
-    """Chooses the points of a view that take part, once for all iterations (section 2.9.2)."""
+    """Chooses the points of a view that take part (section 2.9.2).
+
+    Once for all iterations, unless `each_iteration` says that it wants to choose anew.
+    """
 
     part_kind: ClassVar[str] = "selector"
+    each_iteration: ClassVar[bool] = False
 
     def select(self, view: Frame, rng: np.random.Generator) -> Int64:
         """Return rising positions (n,) in ``view.points``."""
@@ -182,6 +239,13 @@ class Metric(Protocol):
     def information(self, matches: Matches, alignment: Alignment) -> Float64:
         """Return the information (6, 6) of the estimate, as in `Registration.information`."""
         ...
+
+    def unobservable(self, matches: Matches, alignment: Alignment) -> Float64:
+        """Return the directions (k, 6) that the pairs don't hold, as in `Registration`.
+
+        None, where the metric can't tell.
+        """
+        return np.zeros((0, 6))
 
 
 class Stopping(Protocol):

@@ -51,3 +51,30 @@ class TwoLoops(Stopping):
             return False
         # The first loop must have ended at `first` or before.
         return any(counts[i] == counts[i - 1] for i in range(1, first + 1))
+
+
+@part("stopping", "small-step", label="validated")
+@dataclass(frozen=True)
+class SmallStep(Stopping):
+    """Ends when a motion takes the points less far than a share of the resolution.
+
+    Attributes
+    ----------
+    epsilon
+        In resolutions, root mean square over the source's points.
+    max_iterations
+        Iterations after which it ends in any case.
+    """
+
+    epsilon: float = 1e-3
+    max_iterations: int = 50
+
+    def __post_init__(self) -> None:
+        if not self.epsilon > 0:
+            raise ValueError(f"epsilon is {self.epsilon}, not more than 0")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations is {self.max_iterations}, not 1 or more")
+
+    def met(self, history: History) -> bool:
+        """See `Stopping.met`."""
+        return history.steps[-1] < self.epsilon

@@ -1,0 +1,254 @@
+"""The shape of a surface round each point of a cloud: plane fits, curvature, edges, moments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+# A neighbourhood thinner than this share of its length is a line and has no normal.
+_LINE = 1e-8
+
+
+@kernel
+def symmetric_eigen(A: Float64, values: Float64, vectors: Float64) -> None:
+    """Eigenvalues (3,), rising, and eigenvectors, in columns (3, 3), of a symmetric A (3, 3).
+
+    By Jacobi's rotations, which keep small eigenvalues accurate. A is overwritten.
+    """
+    for a in range(3):
+        for b in range(3):
+            vectors[a, b] = 1.0 if a == b else 0.0
+    for _ in range(20):
+        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
+        if off <= 1e-18 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if A[p, q] == 0:
+                    continue
+                theta = (A[q, q] - A[p, p]) / (2 * A[p, q])
+                sign = 1.0 if theta >= 0 else -1.0
+                t = sign / (abs(theta) + math.sqrt(theta * theta + 1))
+                c = 1 / math.sqrt(t * t + 1)
+                s = t * c
+                for k in range(3):
+                    x = A[k, p]
+                    y = A[k, q]
+                    A[k, p] = c * x - s * y
+                    A[k, q] = s * x + c * y
+                for k in range(3):
+                    x = A[p, k]
+                    y = A[q, k]
+                    A[p, k] = c * x - s * y
+                    A[q, k] = s * x + c * y
+                for k in range(3):
+                    x = vectors[k, p]
+                    y = vectors[k, q]
+                    vectors[k, p] = c * x - s * y
+                    vectors[k, q] = s * x + c * y
+    for a in range(3):
+        values[a] = A[a, a]
+    for a in range(2):
+        low = a
+        for b in range(a + 1, 3):
+            if values[b] < values[low]:
+                low = b
+        if low != a:
+            values[a], values[low] = values[low], values[a]
+            for k in range(3):
+                vectors[k, a], vectors[k, low] = vectors[k, low], vectors[k, a]
+
+
+@kernel
+def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
+    """Centroid (3,) and covariance (3, 3) of the points `index`, up to the first -1."""
+    count = 0
+    mean[:] = 0.0
+    C[:, :] = 0.0
+    for k in range(len(index)):
+        if index[k] < 0:
+            break
+        count += 1
+        for a in range(3):
+            mean[a] += points[index[k], a]
+    if count == 0:
+        return 0
+    mean /= count
+    for k in range(count):
+        for a in range(3):
+            x = points[index[k], a] - mean[a]
+            for b in range(a + 1):
+                C[a, b] += x * (points[index[k], b] - mean[b])
+    for a in range(3):
+        for b in range(a + 1):
+            C[a, b] /= count
+            C[b, a] = C[a, b]
+    return count
+
+
+@kernel
+def _mean_curvature(
+    points: Float64, index: Int64, count: int, centre: Float64, u: Float64, v: Float64, n: Float64
+) -> float:
+    """Mean curvature of the paraboloid ``h = (a x^2 + 2 b x y + c y^2) / 2 + d`` fitted there."""
+    M = np.zeros((4, 5))
+    f = np.ones(4)
+    for k in range(count):
+        x = 0.0
+        y = 0.0
+        h = 0.0
+        for a in range(3):
+            gap = points[index[k], a] - centre[a]
+            x += gap * u[a]
+            y += gap * v[a]
+            h += gap * n[a]
+        f[0] = x * x / 2
+        f[1] = x * y
+        f[2] = y * y / 2
+        for a in range(4):
+            for b in range(4):
+                M[a, b] += f[a] * f[b]
+            M[a, 4] += f[a] * h
+    # Gaussian elimination with pivots; units of length differ, so each pivot has its own scale.
+    scale = np.empty(4)
+    for a in range(4):
+        scale[a] = M[a, a]
+    for a in range(4):
+        if not M[a, a] > 1e-9 * scale[a]:
+            return np.nan
+        for b in range(a + 1, 4):
+            w = M[b, a] / M[a, a]
+            for c in range(a, 5):
+                M[b, c] -= w * M[a, c]
+    for a in range(3, -1, -1):
+        for b in range(a + 1, 4):
+            M[a, 4] -= M[a, b] * M[b, 4]
+        M[a, 4] /= M[a, a]
+    # Bulging towards the side that the normal points to counts as positive.
+    return -(M[0, 4] + M[2, 4]) / 2
+
+
+@kernel
+def _widest_gap(
+    points: Float64, index: Int64, count: int, centre: Float64, u: Float64, v: Float64
+) -> float:
+    """Widest angle (rad) in the tangent plane without a neighbour in it; 2 pi if there are none."""
+    angles = np.empty(count)
+    m = 0
+    for k in range(count):
+        x = 0.0
+        y = 0.0
+        for a in range(3):
+            gap = points[index[k], a] - centre[a]
+            x += gap * u[a]
+            y += gap * v[a]
+        if x != 0 or y != 0:
+            angles[m] = math.atan2(y, x)
+            m += 1
+    if m == 0:
+        return 2 * math.pi
+    angles = np.sort(angles[:m])
+    widest = angles[0] + 2 * math.pi - angles[m - 1]
+    for k in range(1, m):
+        widest = max(widest, angles[k] - angles[k - 1])
+    return widest
+
+
+@kernel
+def local_shapes(
+    points: Float64,
+    index: Int64,
+    centres: Float64,
+    origin: Float64,
+    normals: Float64,
+    curvature: Float64,
+    gap: Float64,
+) -> None:
+    """Fit the surface round each of the `centres` (m, 3) to its neighbours ``points[index[i]]``.
+
+    `index` (m, k) holds -1 after the last neighbour. Writes unit normals (m, 3) on the side of
+    `origin` (3,), NaN where the neighbours lie on a line; the mean curvature (m,) in 1/m, positive
+    where the surface bulges towards `origin`, NaN where it is not fixed; and the widest angle
+    (m,) in rad round the centre that holds no neighbour.
+    """
+    mean = np.empty(3)
+    C = np.empty((3, 3))
+    values = np.empty(3)
+    vectors = np.empty((3, 3))
+    for i in range(len(centres)):
+        count = _moments(points, index[i], mean, C)
+        symmetric_eigen(C, values, vectors)
+        if count < 3 or not values[1] > _LINE * values[2]:
+            normals[i, :] = np.nan
+            curvature[i] = np.nan
+            gap[i] = 2 * math.pi
+            continue
+        side = 0.0
+        for a in range(3):
+            side += vectors[a, 0] * (origin[a] - centres[i, a])
+        sign = 1.0 if side >= 0 else -1.0
+        for a in range(3):
+            normals[i, a] = sign * vectors[a, 0]
+        u = vectors[:, 2].copy()
+        v = vectors[:, 1].copy()
+        curvature[i] = _mean_curvature(points, index[i], count, mean, u, v, normals[i])
+        gap[i] = _widest_gap(points, index[i], count, centres[i], u, v)
+
+
+@kernel
+def ball_moments(
+    arranged: Float64, axes: Int64, cuts: Float64, depth: int, centres: Float64, radius: float
+) -> Float64:
+    """Second-order moments of the points within `radius` of each of the `centres` (m, 3).
+
+    Takes the arrays of a `KdTree`. Returns (m, 3): the eigenvalues, rising, of the moment matrix
+    ``sum (x - c)(x - c)^T / count`` about the ball's centre c, in m^2; zero where it is empty.
+    """
+    n = len(arranged)
+    inner = len(cuts)
+    out = np.zeros((len(centres), 3))
+    waiting = np.empty(depth + 1, np.int64)
+    M = np.empty((3, 3))
+    vectors = np.empty((3, 3))
+    for q in range(len(centres)):
+        M[:, :] = 0.0
+        found = 0
+        waiting[0] = 0
+        count = 1
+        while count > 0:
+            count -= 1
+            node = waiting[count]
+            while node < inner:
+                gap = centres[q, axes[node]] - cuts[node]
+                near = 2 * node + 1
+                far = near + 1
+                if gap >= 0:
+                    near, far = far, near
+                if abs(gap) <= radius:
+                    waiting[count] = far
+                    count += 1
+                node = near
+            leaf = node - inner
+            for i in range(n * leaf >> depth, n * (leaf + 1) >> depth):
+                d = 0.0
+                for a in range(3):
+                    d += (arranged[i, a] - centres[q, a]) ** 2
+                if d <= radius * radius:
+                    found += 1
+                    for a in range(3):
+                        for b in range(3):
+                            M[a, b] += (arranged[i, a] - centres[q, a]) * (
+                                arranged[i, b] - centres[q, b]
+                            )
+        if found > 0:
+            M /= found
+            symmetric_eigen(M, out[q], vectors)
+    return out

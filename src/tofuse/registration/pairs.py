@@ -1,0 +1,227 @@
+"""Pairs of points with the normals of their surfaces, in the frame where motions are solved for.
+
+Everything is turned into the source's frame, about the centroid of its paired points: there the
+right perturbation is nearly free of coupling between translation and rotation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.kernels.cloud_sums import direction_products, plane_sums
+from tofuse.kernels.icp import transform_points
+from tofuse.registration.interfaces import Alignment, Matches
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Loss = Literal["square", "huber", "cauchy", "tukey"]
+
+FEWEST_PAIRS = 6
+# Residuals below this share of the resolution say nothing about the true error of the points.
+_SMALLEST_SIGMA = 1e-3
+# Tuning constants for 95 % efficiency on normal errors, in standard deviations.
+_HUBER, _CAUCHY, _TUKEY = 1.345, 2.385, 4.685
+_MAD = 1.4826
+# Eigenvalues this small, relatively, are rounding errors.
+_RANK_TOLERANCE = 1e-10
+# Normals further apart than 60 degrees are of different surfaces.
+_ALIKE = 0.5
+# Standard deviations by which a direction's information must exceed chance.
+_SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePairs:
+    """m pairs in the source's frame, about `centre`.
+
+    Attributes
+    ----------
+    T_target_source
+        (4, 4) the estimate.
+    centre
+        (3,) centroid of the paired source points, m, source frame.
+    points
+        (m, 3) source points relative to it, m.
+    residual
+        (m, 3) from target point to moved source point, m, turned into the source's frame.
+    target_normals, source_normals
+        (m, 3) unit normals of both surfaces, turned into the source's frame.
+    weight
+        (m,) of the pairs, by their noise.
+    resolution
+        m.
+    """
+
+    T_target_source: Float64
+    centre: Float64
+    points: Float64
+    residual: Float64
+    target_normals: Float64
+    source_normals: Float64
+    weight: Float64
+    resolution: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def size(self) -> float:
+        """Root mean square distance of the points from their centroid, m."""
+        return max(float(np.sqrt((self.points**2).sum(1).mean())), self.resolution)
+
+    def motion(self, xi: Float64) -> Float64:
+        """Return the motion (4, 4) in the target's frame of a perturbation about the centre."""
+        to, back = np.eye(4), np.eye(4)
+        to[:3, 3], back[:3, 3] = self.centre, -self.centre
+        T = self.T_target_source
+        return T @ to @ se3.exp(xi) @ back @ se3.inverse(T)
+
+    def to_origin(self, H: Float64) -> Float64:
+        """Turn information (6, 6) about the centre into that about the source's origin."""
+        shift = np.eye(4)
+        shift[:3, 3] = -self.centre
+        adjoint = se3.adjoint(shift)
+        H = adjoint.T @ H @ adjoint
+        return (H + H.T) / 2
+
+    def keep(self, mask: Bool) -> SurfacePairs:
+        """Return the pairs of the mask, about the same centre."""
+        return SurfacePairs(
+            self.T_target_source,
+            self.centre,
+            self.points[mask],
+            self.residual[mask],
+            self.target_normals[mask],
+            self.source_normals[mask],
+            self.weight[mask],
+            self.resolution,
+        )
+
+
+def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = False) -> SurfacePairs:
+    """Turn matches into pairs with normals of the target and, if asked for, of the source.
+
+    Pairs without them are left out. Raises RegistrationError where fewer than six remain.
+    """
+    i, j = matches.source, matches.target
+    T = alignment.T_target_source
+    turn = np.eye(4)
+    turn[:3, :3] = T[:3, :3].T
+    p = alignment.source.points[i]
+    residual = transform_points(turn, alignment.moved[i] - alignment.target.points[j])
+    of_target = transform_points(turn, alignment.target.normals[j])
+    of_source = alignment.source.normals[i] if source else np.zeros((len(i), 3))
+    weight = matches.weights() * _noise_weights(matches, alignment)
+    known = np.isfinite(of_target).all(1) & np.isfinite(of_source).all(1) & (weight > 0)
+    if np.count_nonzero(known) < FEWEST_PAIRS:
+        raise RegistrationError(
+            f"only {np.count_nonzero(known)} points of the views correspond and have normals, "
+            f"{FEWEST_PAIRS} are needed"
+        )
+    centre = p[known].mean(0)
+    pairs = SurfacePairs(
+        T, centre, p - centre, residual, of_target, of_source, weight, alignment.resolution
+    )
+    return pairs.keep(known)
+
+
+def _noise_weights(matches: Matches, alignment: Alignment) -> Float64:
+    """Inverse variance of each pair relative to their mean, ones where sigma isn't known."""
+    a, b = alignment.source.variance, alignment.target.variance
+    if a is None or b is None or len(matches) == 0:
+        return np.ones(len(matches))
+    floor = (_SMALLEST_SIGMA * alignment.resolution) ** 2
+    inverse = 1 / np.maximum(a[matches.source] + b[matches.target], floor)
+    return inverse / inverse.mean()
+
+
+def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
+    """Weights (m,) of pairs in a sum of information: less where many share one target point.
+
+    With noise alike in both views, m pairs with one target point tell as much about its plane as
+    ``2 m / (1 + m)`` pairs with a target point of their own.
+    """
+    count = np.bincount(matches.target, minlength=len(alignment.target))
+    return 2 / (1 + count[matches.target])
+
+
+def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
+    """Weights (m,), 0 to 1, of a robust loss for residuals (m,) in m.
+
+    Their scale is 1.4826 times the median of the absolute residuals, and a thousandth of the
+    resolution at least.
+    """
+    if loss == "square":
+        return np.ones(len(residual))
+    size = np.abs(residual)
+    x = size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * resolution)
+    if loss == "huber":
+        return np.minimum(1.0, _HUBER / np.maximum(x, _HUBER))
+    if loss == "cauchy":
+        return 1 / (1 + (x / _CAUCHY) ** 2)
+    return np.where(x < _TUKEY, (1 - (x / _TUKEY) ** 2) ** 2, 0.0)
+
+
+def variance_of(square: float, weight: Float64, resolution: float) -> float:
+    """Variance in m^2 of residuals with the weighted sum of squares `square`."""
+    variance = square / max(float(weight.sum()) - 6, 1.0)
+    return max(variance, (_SMALLEST_SIGMA * resolution) ** 2)
+
+
+def solve(H: Float64, g: Float64, size: float) -> Float64:
+    """Solve ``H xi = -g``, with no motion along directions that H doesn't hold at all.
+
+    `size` (m) makes rotations comparable with translations.
+    """
+    scale = np.array([1, 1, 1, 1 / size, 1 / size, 1 / size])
+    values, vectors = np.linalg.eigh(H * scale[:, None] * scale)
+    good = values > _RANK_TOLERANCE * values[-1]
+    step = np.zeros(6)
+    for value, vector in zip(values[good], vectors.T[good], strict=True):
+        step -= vector * float((vector * scale * g).sum()) / value
+    return scale * step
+
+
+def cross_information(pairs: SurfacePairs, variance: float) -> Float64:
+    """Return ``sum w (Jt^T Js + Js^T Jt) / (2 variance)`` (6, 6), about the pairs' centre.
+
+    Jt and Js are the derivatives of the distance along the target's and along the source's
+    normal. The noise of the two views is independent and cancels in the product, where in the
+    plain information ``Jt^T Jt`` it adds up, and makes a flat wall look known in every direction.
+    """
+    a, b = pairs.target_normals, pairs.source_normals
+    H, _, _ = plane_sums(pairs.points, a, b, np.zeros(len(pairs)), pairs.weight)
+    return (H + H.T) / (2 * variance)
+
+
+def unobservable_directions(pairs: SurfacePairs, variance: float, correlated: float) -> Float64:
+    """Return the directions (k, 6) of the right perturbation that the pairs don't hold.
+
+    Eigenvectors of the cross-information, with lengths in resolutions and angles in those that
+    move points at the rms distance from the centroid by one. One is not held where its sigma is
+    above one, or where its information is no more than chance gives: less than four standard
+    deviations of a sum of products of independent noise.
+
+    `correlated` is how many pairs share the same noise: the points of one plane fit.
+    """
+    together = (pairs.target_normals * pairs.source_normals).sum(1)
+    pairs = pairs.keep(together > _ALIKE)
+    unit = pairs.resolution
+    scale = unit * np.array([1, 1, 1, 1 / pairs.size, 1 / pairs.size, 1 / pairs.size])
+    C = cross_information(pairs, variance) * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(C)
+    directions = np.ascontiguousarray((vectors * scale[:, None]).T)
+    total, square, _ = direction_products(
+        pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
+    )
+    held = (values > 1) & (total > _SIGNIFICANT * np.sqrt(correlated * square))
+    shift = np.eye(4)
+    shift[:3, 3] = pairs.centre
+    free = directions[~held] @ se3.adjoint(shift).T
+    return free / np.linalg.norm(free, axis=1, keepdims=True)

@@ -1,0 +1,205 @@
+"""Error metrics that know the surfaces: point-to-plane, symmetric, plane-to-plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from tofuse.geometry import se3
+from tofuse.kernels.cloud_sums import (
+    matrix_sums,
+    plane_sums,
+    plane_to_plane_weights,
+    symmetric_sums,
+)
+from tofuse.parts import part
+from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
+from tofuse.registration.pairs import (
+    Loss,
+    SurfacePairs,
+    cross_information,
+    loss_weights,
+    shared_weights,
+    solve,
+    surface_pairs,
+    unobservable_directions,
+    variance_of,
+)
+
+
+class SurfaceMetric(Metric, Protocol):
+    """What the metrics with normals have in common."""
+
+    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+        """Return the information (6, 6) about the pairs' centre, and the variance in m^2."""
+        ...
+
+    def information(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.information`; sigma is estimated from the residuals.
+
+        Pairs with the same target point share its noise and count less.
+        """
+        pairs = _measurements(matches, alignment)
+        return pairs.to_origin(self.fit(pairs)[0])
+
+    def cross_information(self, matches: Matches, alignment: Alignment) -> Float64:
+        """Return the information (6, 6) in which independent noise of the normals cancels.
+
+        Of the right perturbation in the source's frame, as `information`; not positive definite
+        where the noise is larger than what the surface tells.
+        """
+        pairs = _measurements(matches, alignment)
+        return pairs.to_origin(cross_information(pairs, self.fit(pairs)[1]))
+
+    def unobservable(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.unobservable`."""
+        pairs = _measurements(matches, alignment)
+        correlated = min(alignment.source.neighbours, alignment.target.neighbours)
+        return unobservable_directions(pairs, self.fit(pairs)[1], correlated)
+
+
+def _measurements(matches: Matches, alignment: Alignment) -> SurfacePairs:
+    weight = matches.weights() * shared_weights(matches, alignment)
+    return surface_pairs(replace(matches, weight=weight), alignment, source=True)
+
+
+@part("metric", "point-to-plane", label="validated")
+@dataclass(frozen=True)
+class PointToPlane(SurfaceMetric):
+    """Distances from the source's points to the target's tangent planes (Chen and Medioni 1992).
+
+    ``sum w_i ((T d_i - m_i) . n_i)^2``, with one Gauss-Newton step on SE(3) for each matching.
+
+    Attributes
+    ----------
+    loss
+        "square" as in the paper; "huber", "cauchy" or "tukey" count large residuals less.
+    """
+
+    loss: Loss = "square"
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`; no motion along directions that no plane holds."""
+        pairs = surface_pairs(matches, alignment)
+        r, weight = self._weigh(pairs, pairs.target_normals)
+        n = pairs.target_normals
+        H, g, _ = plane_sums(pairs.points, n, n, r, weight)
+        return pairs.motion(solve(H, g, pairs.size))
+
+    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+        """See `SurfaceMetric.fit`."""
+        n = pairs.target_normals
+        r, weight = self._weigh(pairs, n)
+        H, _, square = plane_sums(pairs.points, n, n, r, weight)
+        variance = variance_of(square, weight, pairs.resolution)
+        return H / variance, variance
+
+    def _weigh(self, pairs: SurfacePairs, n: Float64) -> tuple[Float64, Float64]:
+        r: Float64 = (pairs.residual * n).sum(1)
+        return r, pairs.weight * loss_weights(self.loss, r, pairs.resolution)
+
+
+@part("metric", "symmetric", label="validated")
+@dataclass(frozen=True)
+class Symmetric(SurfaceMetric):
+    """Distances along the sum of both normals (Rusinkiewicz 2019).
+
+    ``sum w_i ((R p_i - R^-1 q_i + t) . (n_pi + n_qi))^2``: half of the rotation is given to each
+    view. It is zero wherever two points and their normals lie on one circle, so that curved
+    surfaces may slide along themselves, and converges faster and from further away than
+    point-to-plane.
+
+    Attributes
+    ----------
+    loss
+        "square" as in the paper; "huber", "cauchy" or "tukey" count large residuals less.
+    """
+
+    loss: Loss = "square"
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`; no motion along directions that no plane holds."""
+        pairs = surface_pairs(matches, alignment, source=True)
+        n = pairs.source_normals + pairs.target_normals
+        r = (pairs.residual * n).sum(1)
+        weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
+        # p and q in one frame, that of the source; centred between both.
+        p = pairs.points
+        q = p - pairs.residual
+        centre = (p.mean(0) + q.mean(0)) / 2
+        H, g = symmetric_sums(p - centre, q - centre, n, weight)
+        x = solve(H, g, 2 * pairs.size)
+        tangent = float(np.linalg.norm(x[3:]))
+        angle = math.atan(tangent)
+        half = np.eye(4)
+        if tangent > 0:
+            half[:3, :3] = se3.so3_exp(x[3:] * (angle / tangent))
+        shift, to, back = np.eye(4), np.eye(4), np.eye(4)
+        shift[:3, 3] = x[:3] * math.cos(angle)
+        to[:3, 3] = pairs.centre + centre
+        back[:3, 3] = -to[:3, 3]
+        T = pairs.T_target_source
+        return T @ to @ half @ shift @ half @ back @ se3.inverse(T)
+
+    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+        """See `SurfaceMetric.fit`: along the mean normal."""
+        n = pairs.source_normals + pairs.target_normals
+        n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+        r = (pairs.residual * n).sum(1)
+        weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
+        H, _, square = plane_sums(pairs.points, n, n, r, weight)
+        variance = variance_of(square, weight, pairs.resolution)
+        return H / variance, variance
+
+
+@part("metric", "gicp", label="validated")
+@dataclass(frozen=True)
+class PlaneToPlane(SurfaceMetric):
+    """Generalised ICP (Segal, Haehnel and Thrun 2009), plane to plane.
+
+    ``sum r_i^T (C_qi + R C_pi R^T)^-1 r_i``, r_i = T p_i - q_i: each point stands for a disc of
+    its surface, with variance 1 along it and `epsilon` across. One Gauss-Newton step is made for
+    each matching.
+
+    Attributes
+    ----------
+    epsilon
+        Variance across the surface relative to that along it (section III of the paper: 0.001).
+    loss
+        "square" as in the paper; "huber", "cauchy" or "tukey" count large residuals less.
+    """
+
+    epsilon: float = 1e-3
+    loss: Loss = "square"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.epsilon <= 1:
+            raise ValueError(f"epsilon is {self.epsilon}, not above 0 and at most 1")
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`."""
+        pairs = surface_pairs(matches, alignment, source=True)
+        W, weight = self._weigh(pairs)
+        H, g, _ = matrix_sums(pairs.points, pairs.residual, W, weight)
+        return pairs.motion(solve(H, g, pairs.size))
+
+    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+        """See `SurfaceMetric.fit`; the variance is that across the surface."""
+        W, weight = self._weigh(pairs)
+        H, _, square = matrix_sums(pairs.points, pairs.residual, W, weight)
+        variance = variance_of(square, weight, pairs.resolution)
+        return H / variance, variance
+
+    def _weigh(self, pairs: SurfacePairs) -> tuple[Float64, Float64]:
+        """W in units in which a residual across two parallel discs counts as it is, in m."""
+        W = (
+            2
+            * self.epsilon
+            * plane_to_plane_weights(pairs.target_normals, pairs.source_normals, self.epsilon)
+        )
+        square = np.einsum("ki,kij,kj->k", pairs.residual, W, pairs.residual)
+        size = np.sqrt(np.maximum(square, 0))
+        return W, pairs.weight * loss_weights(self.loss, size, pairs.resolution)
