@@ -1,0 +1,235 @@
+"""The output folder: all files of a result or none, and nobody else's files."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError, OutputError
+from tofuse.fusion.cloud import empty_cloud
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.results.output import (
+    STAGING,
+    OutputFolder,
+    is_result,
+    plain,
+    read_run_json,
+    run_json,
+    write_result,
+)
+from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
+
+FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
+
+
+def result(seed=0) -> Reconstruction:
+    trajectory = np.stack([np.eye(4), np.full((4, 4), np.nan)])
+    graph = PoseGraph(
+        np.array([0]),
+        np.eye(4)[None],
+        np.zeros((0, 2), np.intp),
+        np.zeros((0, 4, 4)),
+        np.zeros((0, 6, 6)),
+        np.zeros(0, bool),
+    )
+    frames = (
+        FrameRecord(0, 0.0, "tracked", "", 0.5, None, np.float32(0.25), np.eye(6), np.ones((2, 6))),
+        FrameRecord(1, 0.1, "lost", "no points", 0.0, float("nan"), float("inf")),
+    )
+    diagnostics = Diagnostics(
+        "degraded",
+        (Reason("lost_frames", (1, 1), "Frame 1 has no pose."),),
+        frames,
+        (),
+        trajectory,
+        (),
+        {"median": 0.25},
+        {"tracking": 0.123456},
+    )
+    recording = {"path": "/somewhere", "format": "native", "frames": 2, "warnings": ["w"]}
+    return Reconstruction(
+        trajectory,
+        np.array([0.0, 0.1]),
+        graph,
+        empty_cloud(),
+        diagnostics,
+        {"method": "default"},
+        recording,
+        seed,
+        2,
+    )
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_new_folder_and_its_parents_are_made(tmp_path) -> None:
+    out = tmp_path / "a" / "b"
+    write_result(result(), OutputFolder(out), lambda r, f: (f / "report.html").write_text("x"))
+    assert set(contents(out)) == FILES | {"report.html"}
+    assert [p.name for p in out.iterdir() if p.is_dir()] == []
+    assert is_result(out)
+
+
+def test_folders_that_were_made_go_when_nothing_is_written(tmp_path) -> None:
+    OutputFolder(tmp_path / "a" / "b").discard()
+    assert list(tmp_path.iterdir()) == []
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    OutputFolder(mine).discard()
+    assert mine.is_dir()  # was there before
+
+
+def test_an_earlier_result_is_only_replaced_when_asked(tmp_path) -> None:
+    write_result(result(), OutputFolder(tmp_path))
+    before = contents(tmp_path)
+    with pytest.raises(OutputError, match="holds an earlier result; give --overwrite"):
+        OutputFolder(tmp_path)
+    assert contents(tmp_path) == before
+    write_result(result(seed=5), OutputFolder(tmp_path, overwrite=True))
+    assert read_run_json(tmp_path / "run.json")["seed"] == 5
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "run.json", "trajectory.txt", ".hidden"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, name, overwrite) -> None:
+    (tmp_path / name).write_text('{"a": 1}')
+    with pytest.raises(OutputError, match="is not empty and holds no earlier result"):
+        OutputFolder(tmp_path, overwrite=overwrite)
+    assert contents(tmp_path) == {name: b'{"a": 1}'}
+
+
+def test_a_file_or_a_place_below_a_file(tmp_path) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(OutputError, match="is a file; give --out a folder"):
+        OutputFolder(file)
+    with pytest.raises(OutputError, match="can't be written"):
+        OutputFolder(file / "below")
+    assert file.read_text() == "mine"
+
+
+def test_what_a_killed_run_left_does_not_count(tmp_path) -> None:
+    left = tmp_path / STAGING
+    left.mkdir()
+    (left / "trajectory.txt").write_text("half")
+    write_result(result(), OutputFolder(tmp_path))
+    assert set(contents(tmp_path)) == FILES
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
+def test_a_failure_while_writing_changes_nothing(tmp_path, overwrite, failure) -> None:
+    out = tmp_path / "out"
+    if overwrite:
+        write_result(result(), OutputFolder(out))
+    before = contents(tmp_path)
+
+    def report(_result, folder) -> None:
+        (folder / "report.html").write_text("half")
+        raise failure
+
+    expected = OutputError if isinstance(failure, OSError) else KeyboardInterrupt
+    with pytest.raises(expected) as caught:
+        write_result(result(seed=1), OutputFolder(out, overwrite=overwrite), report)
+    if expected is OutputError:
+        assert "No space left" in str(caught.value)
+        assert str(out) in str(caught.value)
+    assert contents(tmp_path) == before
+    assert out.exists() == overwrite
+
+
+@pytest.mark.parametrize("when", range(8))
+def test_a_failure_while_moving_puts_everything_back(tmp_path, monkeypatch, when) -> None:
+    write_result(result(), OutputFolder(tmp_path))
+    before = contents(tmp_path)
+    folder = OutputFolder(tmp_path, overwrite=True)
+    moves, move = [], os.replace
+
+    def fail_once(source, target) -> None:
+        if Path(target).parent == tmp_path or Path(source).parent == tmp_path:
+            moves.append(target)
+            if len(moves) == when + 1:
+                raise OSError(errno.ENOSPC, "No space left")
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", fail_once)
+    with pytest.raises(OutputError, match=r"can.t be written .No space left."):
+        write_result(result(seed=1), folder)
+    monkeypatch.undo()
+    assert contents(tmp_path) == before
+    assert {p.name for p in tmp_path.iterdir()} == FILES
+
+
+def test_run_json_is_what_the_contract_says(tmp_path) -> None:
+    write_result(result(), OutputFolder(tmp_path))
+    data = json.loads((tmp_path / "run.json").read_text(), parse_constant=lambda c: pytest.fail(c))
+    assert list(data) == [
+        "schema",
+        "version",
+        "input",
+        "seed",
+        "threads",
+        "config",
+        "seconds",
+        "verdict",
+        "reasons",
+        "frames",
+        "loops",
+        "filters",
+    ]
+    assert data["schema"] == 1
+    assert data["input"] == {"path": "/somewhere", "format": "native", "frames": 2}
+    assert data["reasons"] == [
+        {"code": "lost_frames", "frames": [1, 1], "text": "Frame 1 has no pose."}
+    ]
+    assert data["frames"][0]["covariance"] == np.eye(6).ravel().tolist()
+    assert data["frames"][0]["unobservable"] == [[1.0] * 6] * 2
+    assert data["frames"][0]["rms_m"] == 0.25
+    lost = data["frames"][1]
+    assert (lost["inlier_share"], lost["rms_m"], lost["covariance"]) == (None, None, None)
+    assert lost["unobservable"] == []
+    assert data["filters"] == {"median": {"removed": 0.25}}
+
+
+def test_only_frames_with_a_pose_have_a_line(tmp_path) -> None:
+    write_result(result(), OutputFolder(tmp_path))
+    lines = (tmp_path / "trajectory.txt").read_text().splitlines()
+    values = [line.split() for line in lines if not line.startswith("#")]
+    assert [[float(v) for v in line] for line in values] == [[0, 0, 0, 0, 0, 0, 0, 1]]
+
+
+def test_plain_values() -> None:
+    assert plain({"1": (np.int64(2), np.float32(0.5), np.nan, -np.inf, None, True, "x")}) == {
+        "1": [2, 0.5, None, None, None, True, "x"]
+    }
+    assert plain(np.array([[1.0, np.nan]])) == [[1.0, None]]
+    json.dumps(run_json(replace(result(), seed=3)), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "is not a run.json of schema 1"),
+        ('{"schema": 2}', "is not a run.json of schema 1"),
+        ("\xff", "is not JSON"),
+    ],
+)
+def test_a_broken_run_json(tmp_path, text, message) -> None:
+    file = tmp_path / "run.json"
+    file.write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=message):
+        read_run_json(file)
+    assert not is_result(tmp_path)
+    with pytest.raises(InputError, match="can't be read"):
+        read_run_json(tmp_path / "none.json")
+    with pytest.raises(InputError, match="can't be read"):
+        read_run_json(tmp_path)
