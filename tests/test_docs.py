@@ -258,23 +258,28 @@ def registered_parts() -> dict[str, dict[str, type]]:
 
 
 def test_every_part_is_listed_with_its_label() -> None:
+    """A new part gets a row in docs/methods.md, below the heading with its kind."""
     listed = {
-        kind: {name: row[1] for name, row in known.items()}
+        (kind, name, row[1])
         for kind, known in documented_parts().items()
+        for name, row in known.items()
     }
-    assert listed == {
-        kind: {name: cls.part_label for name, cls in known.items()}  # type: ignore[attr-defined]
+    registered = {
+        (kind, name, cls.part_label)  # type: ignore[attr-defined]
         for kind, known in registered_parts().items()
+        for name, cls in known.items()
     }
+    assert registered - listed == set(), "not in docs/methods.md"
+    assert listed - registered == set(), "only in docs/methods.md"
 
 
 def test_every_option_of_a_part_is_listed() -> None:
-    documented = documented_parts()
-    for kind, known in registered_parts().items():
-        for name, cls in known.items():
-            named = codes(" ".join(documented[kind][name][2:]))
-            fields = {f.name for f in dataclasses.fields(cls)}
-            assert fields <= named, f"{kind} {name}: {fields - named}"
+    registered = registered_parts()
+    for kind, known in documented_parts().items():
+        for name, row in known.items():
+            fields = {f.name for f in dataclasses.fields(registered[kind][name])}
+            missing = fields - codes(" ".join(row[2:]))
+            assert not missing, f"{kind} {name}"
 
 
 def test_every_room_is_described_in_the_order_of_imports() -> None:
