@@ -142,6 +142,7 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
+    from tofuse.errors import InputError
     from tofuse.evaluation.consistency import map_consistency, poses_of_frames
     from tofuse.evaluation.trajectory import evaluate_trajectory
     from tofuse.files.trajectory import read_tum
@@ -156,7 +157,11 @@ def evaluate(arguments: argparse.Namespace) -> int:
     reference_times, reference = read_tum(reference_file)
     recording = None if arguments.recording is None else open_recording(arguments.recording)
     frame_times = None if recording is None else recording.timestamps
-    error = evaluate_trajectory(times, poses, reference_times, reference, frame_times)
+    try:
+        error = evaluate_trajectory(times, poses, reference_times, reference, frame_times)
+    except InputError as wrong:
+        both = f"{estimate_file}, {reference_file}"
+        raise InputError(wrong.problem, where=both, remedy=wrong.remedy) from wrong
     data: dict[str, Any] = error.to_dict()
     if recording is not None:
         poses_here = poses_of_frames(recording.timestamps, times, poses)
