@@ -68,9 +68,7 @@ def test_compensated_amplitude_lost_its_falloff() -> None:
 
 
 def test_terms_add_in_squares_up_to_the_ceiling() -> None:
-    model = NoiseModel(
-        "all", RangeLaw(0.01, 0.0), AmplitudeLaw(0.3, 2.0), floor_m=0.02, ceiling_m=1.0
-    )
+    model = NoiseModel("all", RangeLaw(0.01, 0.0), AmplitudeLaw(0.3, 2.0, 0.02), ceiling_m=1.0)
     sigma = model.sigma(frame(amplitude_image=image(50.0)))
     assert sigma[0, 0] == pytest.approx(math.sqrt(0.02**2 + 0.09 / 50 + (2 / 50) ** 2))
     amplitude = image(50.0)
@@ -158,7 +156,7 @@ def twin(seen: RangeFrame, model: NoiseModel, cosine: np.ndarray) -> np.ndarray:
     assert light is not None
     with np.errstate(all="ignore"):
         counts = seen.amplitude_image / r**2 / length**light.falloff
-        variance = model.floor_m**2 + light.shot**2 / counts + (light.dark / counts) ** 2
+        variance = light.floor**2 + light.shot**2 / counts + (light.dark / counts) ** 2
         bad = (seen.amplitude_image <= 0) | (seen.amplitude_image >= 65535)
         variance = np.minimum(np.where(bad, np.inf, variance), model.ceiling_m**2)
         change = model.footprint / 30.0 * r / length * np.sqrt(1 / np.maximum(cosine, 0.1) ** 2 - 1)
@@ -187,7 +185,7 @@ def test_kernel_against_numpy_with_any_number_of_threads() -> None:
 def test_kernel_writes_only_its_rows() -> None:
     out = np.full((30, 40), -1, np.float32)
     none = np.empty((0, 0), np.float32)
-    parameters = np.array([0, 1, 0, 0, 0, 0.01, 0, 0, 0.29])
+    parameters = np.array([1, 0, 0, 0, 0, 0.01, 0, 0, 0.29])
     kernels.range_sigma(
         image(1.0), True, CAMERA.rays(), kernels.BY_RANGE, none, False,
         np.zeros(1), none, parameters, 5, 9, out,
@@ -216,7 +214,7 @@ def test_json_round_trip(tmp_path: Path) -> None:
         ({"amplitude": {"shot": 0, "dark": 0}}, "both 0"),
         ({"amplitude": {"shot": "loud", "dark": 0}}, "is 'loud'"),
         ({"amplitude": {"shot": float("inf"), "dark": 1}}, "shot is inf"),
-        ({"floor_m": 20.0}, "floor_m is 20.0"),
+        ({"amplitude": {"shot": 1, "dark": 1, "floor": 20.0}}, "floor is 20.0"),
         ({"ceiling_m": 0.0}, "ceiling_m is 0"),
         ({"loudness": 1}, "unknown option 'loudness'"),
         ({"range": None}, "range"),

@@ -51,11 +51,11 @@ def range_sigma(
     cosine
         (H, W) of the incidence, NaN where unknown; (0, 0) if not known at all.
     parameters
-        floor, ceiling, shot, dark, falloff, a, b, power, footprint: fields of the noise model.
+        ceiling, floor, shot, dark, falloff, a, b, power, footprint: fields of the noise model.
     start, stop
         Rows of `out` (H, W) to write: 0 where invalid.
     """
-    floor, ceiling, shot, dark, falloff, a, b, power, footprint = parameters
+    ceiling, floor, shot, dark, falloff, a, b, power, footprint = parameters
     width = depth.shape[1]
     slanted = cosine.shape[0] > 0 and footprint > 0
     for i in range(start, stop):
@@ -68,7 +68,6 @@ def range_sigma(
             length2 = 1 + x * x + y * y
             length = math.sqrt(length2)
             distance = measured if is_range else measured * length
-            variance = floor * floor
             if law == BY_AMPLITUDE:
                 light = float(channel[i, j])
                 if not light < SATURATED:
@@ -78,19 +77,19 @@ def range_sigma(
                     if falloff > 0:
                         light *= length2 ** (-0.5 * falloff)
                 if light > 0:
-                    variance += (shot * shot + dark * dark / light) / light
+                    variance = floor * floor + (shot * shot + dark * dark / light) / light
                 else:
                     variance = ceiling * ceiling
             elif law == BY_CONFIDENCE:
                 level = min(max(int(channel[i, j]), 0), len(levels) - 1)
                 sigma = levels[level] * distance**power
-                variance += sigma * sigma
+                variance = sigma * sigma
             elif law == BY_CAMERA:
                 own = float(channel[i, j])
                 variance = own * own if own > 0 else ceiling * ceiling
             else:
                 sigma = a + b * distance * distance
-                variance += sigma * sigma
+                variance = sigma * sigma
             variance = min(variance, ceiling * ceiling)
             if slanted and cosine[i, j] == cosine[i, j]:
                 other = j + 1 if j + 1 < width else j - 1

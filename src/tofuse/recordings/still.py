@@ -259,9 +259,7 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
     number = np.maximum(kept, 1)
     mean = (depth * near).sum(0, dtype=float) / number
     variance = (sigma.astype(float) ** 2 * near).sum(0) / number
-    # What rounding does isn't sure to average out.
-    floor2 = np.minimum(model.floor_m**2, variance)
-    averaged = np.sqrt((variance - floor2) / number + floor2)
+    averaged = np.sqrt(variance / number)
     return replace(
         middle,
         camera=_mean_camera(frames),

@@ -73,7 +73,7 @@ class NoisyImage(Protocol):
 
 @dataclass(frozen=True)
 class AmplitudeLaw:
-    """``sigma^2 = shot^2 / A + dark^2 / A^2`` over the raw amplitude A in counts.
+    """``sigma^2 = floor^2 + shot^2 / A + dark^2 / A^2`` over the raw amplitude A in counts.
 
     Attributes
     ----------
@@ -81,6 +81,8 @@ class AmplitudeLaw:
         m times the root of a count: shot noise of the signal.
     dark
         m times a count: noise that doesn't depend on the signal.
+    floor
+        m: what no light helps against (rounding, jitter).
     falloff
         A range-compensated amplitude was divided by the cosine of the pixel's angle to the axis to
         this power, besides being multiplied by the squared range.
@@ -88,11 +90,13 @@ class AmplitudeLaw:
 
     shot: float
     dark: float
+    floor: float = 0.0
     falloff: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("shot", "dark", "falloff"):
             _check(name, getattr(self, name), 0, math.inf)
+        _check("floor", self.floor, 0, _LARGEST_M, "give metres")
         if self.shot == 0 and self.dark == 0:
             raise ValueError("shot and dark are both 0: give at least one")
 
@@ -151,8 +155,6 @@ class NoiseModel:
         Always there, for frames with nothing but depth.
     amplitude, confidence
         Or None.
-    floor_m
-        Noise that no light helps against (rounding, jitter); added in squares.
     ceiling_m
         Noise of a pixel that saw nothing: the period's length over the root of 12. Pixels without
         amplitude, and saturated ones, get this.
@@ -166,13 +168,11 @@ class NoiseModel:
     range: RangeLaw
     amplitude: AmplitudeLaw | None = None
     confidence: ConfidenceLaw | None = None
-    floor_m: float = 0.0
     ceiling_m: float = 1.0
     footprint: float = 0.29
 
     def __post_init__(self) -> None:
-        _check("floor_m", self.floor_m, 0, _LARGEST_M, "give metres")
-        _check("ceiling_m", self.ceiling_m, self.floor_m, 100, "give metres, more than floor_m")
+        _check("ceiling_m", self.ceiling_m, 0, 100, "give metres")
         _check("footprint", self.footprint, 0, 1)
         if self.ceiling_m == 0:
             raise ValueError("ceiling_m is 0")
@@ -229,14 +229,11 @@ class NoiseModel:
         return np.where(sigma > 0, sigma / ray_lengths(frame.camera), np.float32(0))
 
     def _parameters(self) -> Float64:
-        light = self.amplitude
-        shot, dark, falloff = (
-            (0, 0, 0) if light is None else (light.shot, light.dark, light.falloff)
-        )
+        light = self.amplitude or AmplitudeLaw(1.0, 0.0)
         power = 0.0 if self.confidence is None else self.confidence.power
         return np.array(
-            [self.floor_m, self.ceiling_m, shot, dark, falloff, self.range.a, self.range.b, power,
-             self.footprint]
+            [self.ceiling_m, light.floor, light.shot, light.dark, light.falloff,
+             self.range.a, self.range.b, power, self.footprint]
         )  # fmt: skip
 
     def _levels(self) -> Float64:
@@ -340,8 +337,7 @@ def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
     return NoiseModel(
         model.name,
         far or RangeLaw(0.5 * shot / math.sqrt(wall), dark / wall + 0.5 * shot / math.sqrt(wall)),
-        AmplitudeLaw(shot, dark, falloff),
-        floor_m=model.depth_unit_m / math.sqrt(12),
+        AmplitudeLaw(shot, dark, model.depth_unit_m / math.sqrt(12), falloff),
         ceiling_m=SPEED_OF_LIGHT / (2 * (model.unwrap_hz or model.modulation_hz)) / math.sqrt(12),
     )
 
@@ -360,7 +356,7 @@ NOISE: dict[str, NoiseModel] = {
         of_camera(CAMERAS["azure-nfov"]),
         of_camera(CAMERAS["pico-flexx"]),
         of_camera(CAMERAS["ifm-o3r"]),
-        NoiseModel("pico-zense", RangeLaw(0.003, 0.0035)),
+        NoiseModel("pico-zense", RangeLaw(0.0, 0.013)),
         NoiseModel(
             "iphone", RangeLaw(0.003, 0.0012), confidence=ConfidenceLaw((0.04, 0.015, 0.005), 1.0)
         ),

@@ -1,0 +1,1 @@
+"""What a camera's own recordings tell about it."""
