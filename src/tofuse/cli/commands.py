@@ -140,6 +140,43 @@ def inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def noise(arguments: argparse.Namespace) -> int:
+    """``tofuse noise``."""
+    from tofuse.calibration.noise import estimate_noise
+    from tofuse.errors import OutputError
+    from tofuse.recordings.open import open_recording
+
+    if arguments.out is not None and arguments.out.exists() and not arguments.overwrite:
+        raise OutputError(
+            "is there already", where=arguments.out, remedy="give --overwrite to replace it"
+        )
+    recording = open_recording(*arguments.inputs, format=arguments.format, camera=arguments.camera)
+    fit = estimate_noise(recording, arguments.name)
+    if arguments.out is not None:
+        fit.model.save(arguments.out)
+    if arguments.json:
+        emit(fit.to_dict())
+        return 0
+    units = {"amplitude": "raw amplitude", "confidence": "confidence", "range": "range (m)"}
+    table = Table(units[fit.law], "pixels", "measured (mm)", "model (mm)", box=None)
+    for item in fit.bins:
+        low_high = f"{item.low:.4g} to {item.high:.4g}"
+        label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
+        measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
+        table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(table)
+    console.print(
+        f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} still "
+        f"stretch{'' if fit.stretches == 1 else 'es'}: the law over {fit.law} errs by "
+        f"{100 * fit.rms_log_error:.0f} % (rms over the rows; without a fit by "
+        f"{100 * fit.before:.0f} %)"
+    )
+    for warning in fit.warnings:
+        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    return 0
+
+
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
     from tofuse.errors import InputError

@@ -43,6 +43,7 @@ def make_parser() -> Parser:
     _demo(commands)
     _simulate(commands)
     _inspect(commands)
+    _noise(commands)
     _evaluate(commands)
     _optimize(commands)
     _experiments(commands)
@@ -157,6 +158,17 @@ def _simulate(commands: Any) -> None:
 def _inspect(commands: Any) -> None:
     p = _command(commands, "inspect", "say what a recording is, and what is wrong with it")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
+    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _noise(commands: Any) -> None:
+    p = _command(commands, "noise", "estimate a camera's noise from a recording that stands still")
+    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    p.add_argument("--out", type=Path, metavar="FILE", help="write the model, e.g. noise.json")
+    p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    p.add_argument("--name", metavar="NAME", help="what to call the camera")
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
     p.add_argument("--json", action="store_true", help="as JSON")
