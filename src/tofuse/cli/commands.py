@@ -15,6 +15,13 @@ from tofuse.results.types import Reconstruction
 _COLORS = {"good": "green", "degraded": "yellow", "failed": "red"}
 
 
+class _Output(Console):
+    """Standard output; a reader that goes away is for `main` to deal with."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
 def run(arguments: argparse.Namespace) -> int:
     """``tofuse run``."""
     from tofuse.pipeline.run import Options, exit_status
@@ -83,7 +90,7 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
             }
         )
         return
-    console = Console(highlight=False, soft_wrap=True)
+    console = _Output(highlight=False, soft_wrap=True)
     console.print(f"[bold {_COLORS[d.verdict]}]{d.verdict}[/]")
     for reason in d.reasons:
         console.print(f"  {reason.text}", markup=False)
@@ -130,7 +137,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit(found.to_dict())
         return 0
-    console = Console(highlight=False, soft_wrap=True)
+    console = _Output(highlight=False, soft_wrap=True)
     table = Table.grid(padding=(0, 2))
     for name, value in found.facts.items():
         table.add_row(f"[bold]{name}[/]", _escape(value))
@@ -222,7 +229,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         if m["rms_m"] is not None:
             value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
-    Console(highlight=False, soft_wrap=True).print(table)
+    _Output(highlight=False, soft_wrap=True).print(table)
     return 0
 
 

@@ -1,0 +1,568 @@
+"""Whole runs at the command line: exit status, output folder, what is printed, interruptions."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.cli import main
+from tofuse.cli.parser import DEMO_SCENES, make_parser
+from tofuse.errors import TofuseError
+from tofuse.files.images import read_image, write_png
+from tofuse.files.ply import read_ply
+from tofuse.files.trajectory import read_tum
+from tofuse.pipeline import run as run_module
+from tofuse.posegraph.g2o import read_g2o
+from tofuse.results.output import STAGING
+from tofuse.results.verdict import REASONS
+
+SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply")
+FILES = {*SAME, "report.html", "run.json"}
+
+
+@pytest.fixture(autouse=True)
+def light_report(request, monkeypatch):
+    """Leave out the report, half of the time of a run, where the test doesn't look at it."""
+    if "full_report" not in request.fixturenames:
+        monkeypatch.setattr(
+            run_module, "_report", lambda *a: (a[-1] / "report.html").write_text("report")
+        )
+
+
+@pytest.fixture
+def full_report() -> None:
+    """Ask for the real report."""
+
+
+@pytest.fixture
+def recording(room_recording, tmp_path) -> Path:
+    return shutil.copytree(room_recording, tmp_path / "rec")
+
+
+def run(*words: object, status: int = 0) -> None:
+    assert main(["run", *(str(w) for w in words)]) == status
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def same(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in SAME}
+
+
+def run_json(folder: Path) -> dict:
+    return json.loads(
+        (folder / "run.json").read_text(), parse_constant=lambda c: pytest.fail(f"{c} in run.json")
+    )
+
+
+@pytest.fixture(scope="module")
+def plain_run(room_recording, tmp_path_factory) -> Path:
+    """The result of a run without options, with its report."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    assert main(["run", str(room_recording), "--out", str(out), "--threads", "2"]) == 0
+    return out
+
+
+def test_the_files_of_the_contract(plain_run, room_recording) -> None:
+    assert {p.name for p in plain_run.iterdir()} == FILES
+    times, poses = read_tum(plain_run / "trajectory.txt")
+    recorded, _ = read_tum(room_recording / "groundtruth.txt")
+    np.testing.assert_allclose(times, recorded, atol=1e-6)
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+    graph = read_g2o(plain_run / "pose_graph.g2o")
+    np.testing.assert_allclose(graph.poses, poses, atol=1e-6)
+    assert len(graph.edges) == 7
+    assert (np.linalg.eigvalsh(graph.information) > 0).all()
+    cloud = read_ply(plain_run / "cloud.ply")
+    assert len(cloud) > 1000
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-4)
+    assert np.ptp(cloud.color) > 100
+    report = (plain_run / "report.html").read_text()
+    assert report.lower().startswith("<!doctype html")
+    assert not re.search(r"(src|href)=[\"']https?:", report)
+
+
+def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
+    data = run_json(plain_run)
+    assert set(data) == {
+        "schema",
+        "version",
+        "input",
+        "seed",
+        "threads",
+        "config",
+        "seconds",
+        "verdict",
+        "reasons",
+        "frames",
+        "loops",
+        "filters",
+    }
+    assert data["schema"] == 1
+    assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}
+    assert (data["seed"], data["threads"]) == (0, 2)
+    assert data["verdict"] in ("good", "degraded", "failed")
+    assert all(isinstance(s, float) and s >= 0 for s in data["seconds"].values())
+    for reason in data["reasons"]:
+        assert set(reason) == {"code", "frames", "text"}
+        assert reason["code"] in REASONS
+        assert len(reason["frames"]) == 2
+    assert [f["index"] for f in data["frames"]] == list(range(8))
+    for frame in data["frames"]:
+        assert set(frame) == {
+            "index",
+            "timestamp",
+            "status",
+            "reason",
+            "valid_share",
+            "inlier_share",
+            "rms_m",
+            "covariance",
+            "unobservable",
+        }
+        assert frame["status"] == "tracked"
+        assert 0 < frame["valid_share"] <= 1
+        if frame["index"]:
+            assert 0 < frame["inlier_share"] <= 1
+            assert 0 < frame["rms_m"] < 0.1
+            covariance = np.array(frame["covariance"]).reshape(6, 6)
+            assert (np.linalg.eigvalsh(covariance) > 0).all()
+    for values in data["filters"].values():
+        assert set(values) == {"removed"}
+        assert 0 <= values["removed"] <= 1
+
+
+def test_one_seed_one_result_whatever_the_threads(plain_run, room_recording, tmp_path) -> None:
+    for name, options in (("one", ["--threads", 1]), ("two", ["--threads", 2])):
+        run(room_recording, "--out", tmp_path / name, *options)
+        assert same(tmp_path / name) == same(plain_run)
+    run(room_recording, "--out", tmp_path / "seed", "--seed", 1)
+    assert (tmp_path / "seed/trajectory.txt").read_bytes() != same(plain_run)["trajectory.txt"]
+
+
+def test_an_earlier_run_json_gives_the_same_bytes(recording, tmp_path) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    (recording / "camera.json").write_text(json.dumps(camera | {"confidence_max": 2}))
+    for file in (recording / "confidence").iterdir():
+        write_png(file, (read_image(file) // 3).astype(np.uint8))
+    options = ["--seed", 3, "--max-depth", 4, "--guess", "identity", "--method", "thesis"]
+    run(recording, "--out", tmp_path / "a", *options)
+    config = run_json(tmp_path / "a")["config"]
+    assert config["filters"][0] == {
+        "part": "distance",
+        "minimum": 0.0,
+        "maximum": 4.0,
+        "measure": "z",
+    }
+    assert config["filters"][1] == {"part": "confidence", "minimum": 2, "highest": 2}
+    run(recording, "--out", tmp_path / "b", "--config", tmp_path / "a/run.json")
+    assert same(tmp_path / "b") == same(tmp_path / "a")
+    again = run_json(tmp_path / "b")
+    assert again["config"] == config
+    assert again["seed"] == 3
+    # What is said at the command line goes before what the file says.
+    run(recording, "--out", tmp_path / "c", "--config", tmp_path / "a/run.json", "--seed", 4)
+    assert run_json(tmp_path / "c")["seed"] == 4
+
+
+def test_options_of_a_toml_file(room_recording, tmp_path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text('method = "thesis"\nfilters = []\n[fusion]\nvoxel_m = 0.1\n')
+    run(room_recording, "--out", tmp_path / "out", "--config", file, "--guess", "identity")
+    config = run_json(tmp_path / "out")["config"]
+    assert (config["method"], config["filters"]) == ("thesis", [])
+    assert (config["fusion"]["voxel_m"], config["odometry"]["guess"]) == (0.1, "identity")
+    assert len(read_ply(tmp_path / "out/cloud.ply")) < 5000
+
+
+def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
+    run(room_recording, "--out", tmp_path / "a", "--min-depth", 1, "--every", 4)
+    names = [f["part"] for f in run_json(tmp_path / "a")["config"]["filters"]]
+    assert names[0] == "distance"
+    assert len(names) > 1
+    run(room_recording, "--out", tmp_path / "b", "--object", "--every", 4)
+    names = [f["part"] for f in run_json(tmp_path / "b")["config"]["filters"]]
+    assert names[0] == "foreground"
+    run(room_recording, "--out", tmp_path / "c", "--object", "--max-depth", 2.5, "--every", 4)
+    filters = run_json(tmp_path / "c")["config"]["filters"]
+    assert filters[0]["maximum"] == 2.5
+    assert run_json(tmp_path / "c")["filters"]["distance"]["removed"] > 0.1
+    # Nothing beyond the limit is in the model: the camera hardly moves from where it began.
+    first = read_ply(tmp_path / "c/cloud.ply").points
+    assert np.linalg.norm(first, axis=1).max() < 4
+
+
+def test_a_bad_frame_in_the_middle_is_skipped_and_counted(recording, tmp_path, capsys) -> None:
+    file = recording / "depth/000004.png"
+    file.write_bytes(file.read_bytes()[:200])
+    run(recording, "--out", tmp_path / "out")
+    assert "7 of 8 frames tracked, 1 unreadable" in capsys.readouterr().out
+    data = run_json(tmp_path / "out")
+    assert [f["status"] for f in data["frames"]] == ["tracked"] * 4 + ["skipped"] + ["tracked"] * 3
+    assert "000004.png" in data["frames"][4]["reason"]
+    assert "unreadable_frames" in [r["code"] for r in data["reasons"]]
+    times, _ = read_tum(tmp_path / "out/trajectory.txt")
+    assert len(times) == 7
+
+
+@pytest.mark.usefixtures("full_report")
+def test_the_report_tells_of_a_bad_frame(recording, tmp_path) -> None:
+    (recording / "depth/000002.png").write_bytes(b"")
+    run(recording, "--out", tmp_path / "out", "--end", 4)
+    report = (tmp_path / "out/report.html").read_text()
+    assert "Frame 2 has not been read." in report
+
+
+def test_a_blank_frame_in_the_middle_is_lost(recording, tmp_path, capsys) -> None:
+    file = recording / "depth/000003.png"
+    write_png(file, np.zeros_like(read_image(file)))
+    run(recording, "--out", tmp_path / "out", status=3)
+    assert "7 of 8 frames tracked, 1 lost" in capsys.readouterr().out
+    data = run_json(tmp_path / "out")
+    assert data["frames"][3]["status"] == "lost"
+    assert data["frames"][3]["covariance"] is None
+    assert data["verdict"] == "degraded"
+    times, _ = read_tum(tmp_path / "out/trajectory.txt")
+    recorded, _ = read_tum(recording / "groundtruth.txt")
+    np.testing.assert_allclose(times, np.delete(recorded, 3), atol=1e-6)
+    assert read_g2o(tmp_path / "out/pose_graph.g2o").ids.tolist() == [0, 1, 2, 4, 5, 6, 7]
+
+
+@pytest.mark.usefixtures("full_report")
+def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--end", 1)
+    data = run_json(tmp_path / "out")
+    assert [r["code"] for r in data["reasons"]] == ["single_frame"]
+    assert data["verdict"] == "good"
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
+    assert len(read_ply(tmp_path / "out/cloud.ply")) > 1000
+
+
+def test_selection(room_recording, tmp_path) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--start", 1, "--end", 7, "--every", 2)
+    data = run_json(tmp_path / "out")
+    assert [f["index"] for f in data["frames"]] == [1, 3, 5]
+    assert data["input"]["frames"] == 3
+    times, poses = read_tum(tmp_path / "out/trajectory.txt")
+    np.testing.assert_allclose(times, [f["timestamp"] for f in data["frames"]], atol=1e-6)
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+
+
+def test_several_inputs_and_a_folder_of_folders_are_joined(recording, tmp_path) -> None:
+    both = tmp_path / "both"
+    both.mkdir()
+    for name in ("b", "a"):
+        shutil.copytree(recording, both / name)
+    run(both / "a", both / "b", "--out", tmp_path / "listed", "--every", 3)
+    run(both, "--out", tmp_path / "folder", "--every", 3)
+    assert same(tmp_path / "listed") == same(tmp_path / "folder")
+    data = run_json(tmp_path / "listed")
+    assert [f["index"] for f in data["frames"]] == [0, 3, 6, 9, 12, 15]
+    times = [f["timestamp"] for f in data["frames"]]
+    assert sorted(times) == times
+    assert data["input"]["path"] == f"{both / 'a'} {both / 'b'}"
+
+
+def test_another_camera(recording, tmp_path) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    wide = tmp_path / "wide.json"
+    wide.write_text(json.dumps(camera | {"fx": camera["fx"] / 2, "fy": camera["fy"] / 2}))
+    run(recording, "--out", tmp_path / "own", "--end", 1)
+    run(recording, "--out", tmp_path / "wide", "--end", 1, "--camera", wide)
+    own, other = (read_ply(tmp_path / n / "cloud.ply").points for n in ("own", "wide"))
+    assert np.ptp(other[:, 0]) > 1.5 * np.ptp(own[:, 0])
+
+
+def test_loops_from_a_file(room_recording, tmp_path) -> None:
+    loops = tmp_path / "loops.txt"
+    T = read_tum(room_recording / "groundtruth.txt")[1][6]
+    loops.write_text(f"# by hand\n0 6 {T[0, 3]} {T[1, 3]} {T[2, 3]} 0 0 0 1\n")
+    run(room_recording, "--out", tmp_path / "out", "--loops", loops)
+    (loop,) = run_json(tmp_path / "out")["loops"]
+    assert (loop["i"], loop["j"], loop["accepted"]) == (0, 6, True)
+    assert set(loop) == {
+        "i",
+        "j",
+        "accepted",
+        "reason",
+        "overlap",
+        "rms_m",
+        "free_space_violation",
+    }
+    assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
+
+
+def test_odometry_beside_the_images(recording, tmp_path) -> None:
+    shutil.copy(recording / "groundtruth.txt", recording / "odometry.txt")
+    run(recording, "--out", tmp_path / "a", "--guess", "odometry")
+    run(recording, "--out", tmp_path / "b")
+    assert run_json(tmp_path / "a")["config"]["odometry"]["guess"] == "odometry"
+    assert same(tmp_path / "a") != same(tmp_path / "b")
+
+
+def test_the_reference_is_never_used(recording, tmp_path, plain_run) -> None:
+    (recording / "groundtruth.txt").write_text("0 5 5 5 0 0 0 1\n0.1 -5 5 5 0 0 0 1\n")
+    run(recording, "--out", tmp_path / "out")
+    assert same(tmp_path / "out") == same(plain_run)
+
+
+def test_json_lines_end_with_the_result(room_recording, tmp_path, capfd) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--json", "--every", 2)
+    done = capfd.readouterr()
+    assert done.err == ""
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    assert {line["event"] for line in lines} == {"stage", "frame", "result"}
+    assert [line["index"] for line in lines if line["event"] == "frame"] == [0, 2, 4, 6]
+    last = lines[-1]
+    assert last["event"] == "result"
+    assert last["frames"] == {"tracked": 4, "predicted": 0, "lost": 0, "skipped": 0}
+    assert last["out"] == str(tmp_path / "out")
+    assert main(["inspect", "--json", str(room_recording)]) == 0
+    assert json.loads(capfd.readouterr().out)["facts"]["frames"] == "8"
+
+
+def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
+    run(recording, "--out", tmp_path / "out", "--every", 4)
+    done = capfd.readouterr()
+    assert done.err.count("\n") == 1
+    assert done.err.startswith("note: ")
+    assert "colour_of_case" in done.err
+    assert len(done.out.splitlines()) <= 3 + len(run_json(tmp_path / "out")["reasons"])
+    assert "\x1b" not in done.out
+
+
+def test_an_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None:
+    words = (room_recording, "--out", tmp_path / "out", "--every", 4)
+    run(*words)
+    before = contents(tmp_path)
+    run(*words, "--seed", 1, status=2)
+    assert "--overwrite" in capfd.readouterr().err
+    assert contents(tmp_path) == before
+    run(*words, "--seed", 1, "--overwrite")
+    assert contents(tmp_path) != before
+
+
+@pytest.mark.parametrize(
+    ("stage", "error"),
+    [
+        ("tracking", KeyboardInterrupt),
+        ("fusing", RuntimeError),
+        ("checking", TofuseError),
+        ("writing", KeyboardInterrupt),
+    ],
+)
+def test_an_interrupted_run_changes_nothing(
+    stage, error, plain_run, room_recording, tmp_path, monkeypatch
+) -> None:
+    words = ["run", str(room_recording), "--out", str(tmp_path / "out"), "--every", "4"]
+    shutil.copytree(plain_run, tmp_path / "out")
+    before = contents(tmp_path)
+
+    def interrupt(_self, name, total=None) -> None:
+        if name == stage:
+            raise error("now")
+
+    monkeypatch.setattr("tofuse.cli.progress.QuietProgress.stage", interrupt)
+    words += ["--overwrite", "--seed", "1"]
+    if error is RuntimeError:
+        with pytest.raises(RuntimeError):
+            main(words)
+    else:
+        assert main(words) == (130 if error is KeyboardInterrupt else 2)
+    assert contents(tmp_path) == before
+    # With nothing there before, nothing is there after, and the command works as it is.
+    words = ["run", str(room_recording), "--out", str(tmp_path / "new/out"), "--every", "4"]
+    with contextlib.suppress(RuntimeError):
+        main(words)
+    assert not (tmp_path / "new").exists()
+    monkeypatch.undo()
+    assert main(words) == 0
+
+
+# Says when it is in the middle of tracking, and waits there.
+_SLOW = """
+import sys, time
+from tofuse.cli import main
+from tofuse.cli.progress import QuietProgress
+def advance(self, record=None):
+    if record is not None and record.index == 2:
+        print("middle", flush=True)
+        time.sleep(60)
+QuietProgress.advance = advance
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
+    out, new = tmp_path / "out", tmp_path / "new"
+    run(room_recording, "--out", out, "--every", 4)
+    before = contents(out)
+    for target, options in ((out, ["--overwrite"]), (new, [])):
+        words = ["run", str(room_recording), "--out", str(target), "--seed", "1", *options]
+        job = subprocess.Popen(
+            [sys.executable, "-c", _SLOW, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert job.stdout is not None
+        assert job.stdout.readline() == "middle\n"
+        job.send_signal(how)
+        _, said = job.communicate(timeout=60)
+        if how == signal.SIGINT:
+            assert job.returncode == 130
+            assert said == "tofuse: interrupted; nothing that was there before has changed\n"
+    found = contents(out)
+    assert {k: v for k, v in found.items() if STAGING not in k} == before
+    left = [p.name for p in new.iterdir()] if new.exists() else []
+    assert left == ([] if how == signal.SIGINT else [STAGING])
+    run(room_recording, "--out", new, "--every", 4)
+    assert {p.name for p in new.iterdir()} == FILES
+    assert same(new) == {name: before[name] for name in SAME}
+    run(room_recording, "--out", out, "--every", 4, status=2)
+    run(room_recording, "--out", out, "--every", 4, "--overwrite")
+    assert {p.name for p in out.iterdir()} == FILES
+
+
+OPTIONS = {
+    "run": "--out --method --camera --config --format --seed --threads --start --end --every "
+    "--min-depth --max-depth --guess --loops --object --overwrite --json",
+    "demo": "--scene --out",
+    "simulate": "--out --camera --seed",
+    "inspect": "",
+    "evaluate": "--recording --json",
+    "optimize": "--out",
+    "experiments": "--out",
+}
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_help_of_each_command(command, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    done = capsys.readouterr()
+    assert done.err == ""
+    for option in OPTIONS[command].split():
+        assert re.search(rf"{option}\b", done.out), option
+    if command in ("run", "demo"):
+        assert "exit status" in done.out
+    assert "None" not in done.out
+
+
+def test_help_and_version(capsys) -> None:
+    for words in (["--help"], ["--version"]):
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 0
+    out = capsys.readouterr().out
+    for command in OPTIONS:
+        assert re.search(rf"^ +{command}\b", out, re.MULTILINE)
+    assert re.search(r"^tofuse \d+\.\d+", out, re.MULTILINE)
+
+
+def test_the_module_runs_too() -> None:
+    words = [sys.executable, "-m", "tofuse", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("tofuse ")
+    done = subprocess.run(words[:-1], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+
+
+def test_defaults_of_the_contract() -> None:
+    arguments = make_parser().parse_args(["demo"])
+    assert arguments.scene == "room"
+    assert set(DEMO_SCENES) == {"room", "empty-room", "rail", "torso", "box", "peaks"}
+    arguments = make_parser().parse_args(["run", "a", "b", "--out", "c"])
+    assert arguments.inputs == ["a", "b"]
+    assert (arguments.start, arguments.end, arguments.every) == (0, None, 1)
+
+
+def test_a_reader_of_the_output_that_goes_away_is_no_error(room_recording) -> None:
+    words = [sys.executable, "-m", "tofuse", "inspect", str(room_recording)]
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(words, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_simulate_writes_what_run_reads(tmp_path, capsys) -> None:
+    words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
+    assert main([*words, "--without", "all", "--seed", "3", "--uniform"]) == 0
+    assert "2 frames" in capsys.readouterr().out
+    run(tmp_path / "rec", "--out", tmp_path / "out", "--object", "--max-depth", 1.2)
+    assert len(run_json(tmp_path / "out")["frames"]) == 2
+
+
+def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None:
+    def interrupt(_self, _record=None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tofuse.cli.progress.QuietProgress.advance", interrupt)
+    words = ["simulate", "box", "--out", str(tmp_path / "rec"), "--frames", "2"]
+    assert main([*words, "--without", "all"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
+    out = tmp_path / "demo"
+    assert main(["demo", "--scene", "peaks", "--out", str(out)]) in (0, 3)
+    assert {p.name for p in out.iterdir()} == FILES | {"recording"}
+    assert run_json(out)["config"]["odometry"]["registration"]["resolution"] == 1.0
+    before = contents(tmp_path)
+    assert main(["demo", "--scene", "peaks", "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+    def interrupt(_self, name, total=None) -> None:
+        if name == "fusing":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tofuse.cli.progress.QuietProgress.stage", interrupt)
+        words = ["demo", "--scene", "peaks", "--seed", "1"]
+        assert main([*words, "--out", str(out), "--overwrite"]) == 130
+        assert contents(tmp_path) == before  # the recording too
+        assert main([*words, "--out", str(tmp_path / "new")]) == 130
+    assert not (tmp_path / "new").exists()
+    assert main([*words, "--out", str(out), "--overwrite"]) in (0, 3)
+    assert run_json(out)["seed"] == 1
+    assert {p.name for p in out.iterdir()} == FILES | {"recording"}
+
+
+def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
+    words = ["evaluate", str(plain_run), str(room_recording), "--recording", str(room_recording)]
+    assert main([*words, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["ate_rms_m"] < 0.1
+    assert data["coverage"] == 1
+    assert data["map_consistency"]["inlier_share"] > 0.5
+    assert main(words) == 0
+    table = capsys.readouterr().out
+    for part in ("ATE rms", "RPE over 1 frame", "RPE over 30 frames", "map consistency"):
+        assert part in table
+
+
+def test_optimize_a_graph(plain_run, tmp_path, capsys) -> None:
+    out = tmp_path / "out.g2o"
+    assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
+    assert "8 poses, 7 edges" in capsys.readouterr().out
+    assert read_g2o(out).ids.tolist() == list(range(8))
+    assert main(["optimize", str(out), "--out", str(out)]) == 2
+    assert main(["optimize", str(out), "--out", str(out), "--overwrite"]) == 0
