@@ -171,13 +171,15 @@ def local_shapes(
     normals: Float64,
     curvature: Float64,
     gap: Float64,
+    roughness: Float64,
 ) -> None:
     """Fit the surface round each of the `centres` (m, 3) to its neighbours ``points[index[i]]``.
 
     `index` (m, k) holds -1 after the last neighbour. Writes unit normals (m, 3) on the side of
     `origin` (3,), NaN where the neighbours lie on a line; the mean curvature (m,) in 1/m, positive
-    where the surface bulges towards `origin`, NaN where it is not fixed; and the widest angle
-    (m,) in rad round the centre that holds no neighbour.
+    where the surface bulges towards `origin`, NaN where it is not fixed; the widest angle (m,) in
+    rad round the centre that holds no neighbour; and the ratio (m,) of the neighbours' rms extents
+    across the plane and along its shorter side.
     """
     mean = np.empty(3)
     C = np.empty((3, 3))
@@ -190,7 +192,9 @@ def local_shapes(
             normals[i, :] = np.nan
             curvature[i] = np.nan
             gap[i] = 2 * math.pi
+            roughness[i] = np.nan
             continue
+        roughness[i] = math.sqrt(max(values[0], 0.0) / values[1])
         side = 0.0
         for a in range(3):
             side += vectors[a, 0] * (origin[a] - centres[i, a])

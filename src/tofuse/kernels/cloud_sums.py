@@ -146,14 +146,13 @@ def symmetric_sums(p: Float64, q: Float64, n: Float64, weight: Float64) -> tuple
 @kernel
 def direction_products(
     p: Float64, a: Float64, b: Float64, weight: Float64, directions: Float64
-) -> tuple[Float64, Float64, Float64]:
-    """For each direction u (k, 6): sums of ``w Ja u Jb u``, ``(w Ja u Jb u)^2``, ``w (Ja u)^2``.
+) -> tuple[Float64, Float64]:
+    """For each direction u (k, 6): sums of ``w Ja u Jb u`` and ``w ((Ja u)^2 + (Jb u)^2) / 2``.
 
     ``Ja = [a, p x a]`` and so for b, as in `plane_sums`.
     """
-    total = np.zeros(len(directions))
-    square = np.zeros(len(directions))
-    own = np.zeros(len(directions))
+    both = np.zeros(len(directions))
+    plain = np.zeros(len(directions))
     Ja = np.empty(6)
     Jb = np.empty(6)
     for k in range(len(p)):
@@ -170,8 +169,6 @@ def direction_products(
             for c in range(6):
                 x += Ja[c] * directions[u, c]
                 y += Jb[c] * directions[u, c]
-            z = weight[k] * x * y
-            total[u] += z
-            square[u] += z * z
-            own[u] += weight[k] * x * x
-    return total, square, own
+            both[u] += weight[k] * x * y
+            plain[u] += weight[k] * (x * x + y * y) / 2
+    return both, plain

@@ -13,6 +13,7 @@ from tofuse.kernels.icp import transform_points
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.hold import Hold
 from tofuse.registration.interfaces import (
     Alignment,
     Float64,
@@ -80,13 +81,18 @@ class Icp(Registrar):
         return self.matcher.takes
 
     def register(
-        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+        self,
+        source: Frame,
+        target: Frame,
+        guess: Float64,
+        rng: np.random.Generator,
+        hold: Hold | None = None,
     ) -> Registration:
         """Register `source` into the frame of `target`, starting from `guess` (T_target_source).
 
         Number of correspondences, E and rms are those of the last matching, just before the last
         motion. If the iterations run out before the stopping rule is met, the result is the
-        estimate so far with `converged` False.
+        estimate so far with `converged` False. Along the directions of `hold` it doesn't move.
 
         Raises
         ------
@@ -99,7 +105,7 @@ class Icp(Registrar):
         search = self.matcher.prepare(model)
         reach = min((r.reach(self.resolution) for r in self.rejectors), default=math.inf)
 
-        T = np.array(guess, np.float64)
+        T = se3.orthonormalise(guess)
         moved = transform_points(T, data.points)
         history = History()
         converged = False
@@ -115,7 +121,11 @@ class Icp(Registrar):
             for rejector in self.rejectors:
                 matches = rejector.reject(matches, alignment)
             before = moved
-            T = self.metric.motion(matches, alignment) @ T
+            motion = self.metric.motion(matches, alignment)
+            T = motion @ T if hold is None else T @ hold.across(se3.inverse(T) @ motion @ T)
+            # Motions are turned from frame to frame by R and R^T: unless these are inverse to each
+            # other, the difference grows with every iteration.
+            T = se3.orthonormalise(T)
             moved = transform_points(T, data.points)
             history.correspondences.append(len(matches))
             history.errors.append(float(matches.distance.sum()) / (len(data) * self.resolution))
@@ -123,7 +133,6 @@ class Icp(Registrar):
             history.steps.append(step / self.resolution)
             converged = self.stopping.met(history)
 
-        T = se3.orthonormalise(T)
         final = Alignment(data, model, self.resolution, T, moved)
         return Registration(
             T_target_source=T,

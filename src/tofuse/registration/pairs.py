@@ -6,7 +6,7 @@ right perturbation is nearly free of coupling between translation and rotation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,8 +32,9 @@ _MAD = 1.4826
 _RANK_TOLERANCE = 1e-10
 # Normals further apart than 60 degrees are of different surfaces.
 _ALIKE = 0.5
-# Standard deviations by which a direction's information must exceed chance.
-_SIGNIFICANT = 4.0
+# Share of a direction's information that must not be noise. Directions that slide have less than
+# 0.15, those that a few points in a hundred hold more than 0.5.
+_SIGNAL = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,27 +201,27 @@ def cross_information(pairs: SurfacePairs, variance: float) -> Float64:
     return (H + H.T) / (2 * variance)
 
 
-def unobservable_directions(pairs: SurfacePairs, variance: float, correlated: float) -> Float64:
+def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
     """Return the directions (k, 6) of the right perturbation that the pairs don't hold.
 
-    Eigenvectors of the cross-information, with lengths in resolutions and angles in those that
-    move points at the rms distance from the centroid by one. One is not held where its sigma is
-    above one, or where its information is no more than chance gives: less than four standard
-    deviations of a sum of products of independent noise.
-
-    `correlated` is how many pairs share the same noise: the points of one plane fit.
+    Looked for are the eigenvectors of the cross-information, with lengths in resolutions and
+    angles in those that move points at the rms distance from the centroid by one. One is not held
+    where its sigma is above one, or where most of its plain information is noise, and not in the
+    cross-information.
     """
+    # Which side a normal is on doesn't matter here.
     together = (pairs.target_normals * pairs.source_normals).sum(1)
-    pairs = pairs.keep(together > _ALIKE)
+    turned = pairs.source_normals * np.sign(together)[:, None]
+    pairs = replace(pairs, source_normals=turned).keep(np.abs(together) > _ALIKE)
     unit = pairs.resolution
     scale = unit * np.array([1, 1, 1, 1 / pairs.size, 1 / pairs.size, 1 / pairs.size])
     C = cross_information(pairs, variance) * scale[:, None] * scale
     values, vectors = np.linalg.eigh(C)
     directions = np.ascontiguousarray((vectors * scale[:, None]).T)
-    total, square, _ = direction_products(
+    both, plain = direction_products(
         pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
     )
-    held = (values > 1) & (total > _SIGNIFICANT * np.sqrt(correlated * square))
+    held = (values > 1) & (both > _SIGNAL * plain)
     shift = np.eye(4)
     shift[:3, 3] = pairs.centre
     free = directions[~held] @ se3.adjoint(shift).T

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.icp import algorithm_1
+from tofuse.registration.coarse_to_fine import CoarseToFine
 
-_SPACING_SAMPLE = 5000
+Float64 = NDArray[np.float64]
+
+_FEWEST_POINTS = 10
 
 
 def register(
@@ -32,45 +35,79 @@ def register(
     guess
         (4, 4) T_target_source to start from; the identity unless given.
     method
-        What registers; Algorithm 1 unless given, on at most 5000 points of each, with twice the
-        spacing of the target's points as its resolution.
+        What registers; unless given, generalised ICP with a robust loss from coarse to fine, at
+        resolutions found from the points: `CoarseToFine`.
     seed
-        Of the random choice of points.
+        Of the random choice of points, for methods that choose.
 
     Returns
     -------
-    The `T_target_source` maps points of the source into the target's frame.
+    The `T_target_source` maps points of the source into the target's frame. Directions along
+    which the views could slide (three on a flat wall) are in `unobservable`, and stay as they are
+    in the guess.
 
     Raises
     ------
     InputError
-        If an array has the wrong shape, or the guess is no rigid motion.
+        If an array has the wrong shape or fewer than ten finite points, or the guess is no rigid
+        motion.
     RegistrationError
-        If there are too few points, or none correspond.
+        If too few points correspond.
     """
-    source_view, target_view = _view(source, "source"), _view(target, "target")
     start = np.eye(4) if guess is None else se3.check_pose(guess, where="guess")
-    if method is None:
-        method = algorithm_1(2 * spacing(target_view), points=_SPACING_SAMPLE)
     rng = np.random.default_rng([seed, 0])
-    return method.register(source_view, target_view, start, rng)
+    method = CoarseToFine() if method is None else method
+    if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
+        views = _view(source, "source"), _view(target, "target")
+        return method.register(*views, start, rng)
+    return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
 
 
-def spacing(view: Frame) -> float:
-    """Median distance in m between neighbours among 5000 evenly chosen points; 0.01 if too few."""
-    points = view.points[:: max(1, len(view) // _SPACING_SAMPLE)].astype(np.float64)
-    if len(points) < 2:
-        return 0.01
-    _, squared = KdTree(points).neighbours(points, 2)
-    distances: NDArray[np.float64] = np.sqrt(squared[:, 1])
-    positive = distances[distances > 0]
-    return float(np.median(positive)) if len(positive) else 0.01
+def _register_arrays(
+    source: Float64, target: Float64, guess: Float64, method: Registrar, rng: np.random.Generator
+) -> Registration:
+    """Register about the middle of the target: map coordinates are too long for float32."""
+    to, back = np.eye(4), np.eye(4)
+    to[:3, 3] = np.median(target, 0)
+    back[:3, 3] = -to[:3, 3]
+    data, model = (
+        CloudFrame(index, 0.0, (points + back[:3, 3]).astype(np.float32), origin=back[:3, 3])
+        for index, points in ((1, source), (0, target))
+    )
+    found = method.register(data, model, back @ guess @ to, rng)
+    inward = se3.adjoint(back)
+    free = found.unobservable @ se3.adjoint(to).T
+    return replace(
+        found,
+        T_target_source=to @ found.T_target_source @ back,
+        information=inward.T @ found.information @ inward,
+        unobservable=free / np.linalg.norm(free, axis=1, keepdims=True),
+    )
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:
     if isinstance(view, RangeFrame | CloudFrame):
         return view
+    return CloudFrame.of(_cloud(view, name))
+
+
+def _cloud(points: ArrayLike, name: str) -> Float64:
+    """Return the finite points of an array (n, 3)."""
     try:
-        return CloudFrame.of(view)
-    except (InputError, ValueError, TypeError) as error:
-        raise InputError(str(error), where=name) from error
+        array = np.asarray(points)
+    except ValueError as error:
+        raise InputError("is not an array", where=name, remedy="give (N, 3) numbers") from error
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"is an array of shape {array.shape} and type {array.dtype}",
+            where=name,
+            remedy="give a frame, or (N, 3) numbers in metres",
+        )
+    good = array[np.isfinite(array).all(1)].astype(np.float64)
+    if len(good) < _FEWEST_POINTS:
+        raise InputError(
+            f"has {len(good)} finite points",
+            where=name,
+            remedy=f"give {_FEWEST_POINTS} or more",
+        )
+    return good

@@ -42,15 +42,24 @@ class Shape:
         it is not fixed.
     boundary
         (n,) True where the surface ends: an empty angle of 135 degrees or more round the point.
+    roughness
+        (n,) extent of the neighbours across the plane, relative to that along it: 0 on a plane,
+        near 1 where the noise is as wide as the neighbourhood; NaN where points lie on a line.
     """
 
     normals: Float64
     curvature: Float64
     boundary: Bool
+    roughness: Float64
 
     def at(self, index: Int64) -> Shape:
         """Return the shape at some of the points."""
-        return Shape(self.normals[index], self.curvature[index], self.boundary[index])
+        return Shape(
+            self.normals[index],
+            self.curvature[index],
+            self.boundary[index],
+            self.roughness[index],
+        )
 
 
 @dataclass(eq=False)
@@ -95,13 +104,21 @@ def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
     centres = points[index]
     near, _ = tree.neighbours(centres, neighbours)
     n = len(index)
-    normals, curvature, gap = np.empty((n, 3)), np.empty(n), np.empty(n)
+    normals = np.empty((n, 3))
+    curvature, gap, roughness = np.empty(n), np.empty(n), np.empty(n)
     origin = np.asarray(view.origin, np.float64)
 
     def work(a: int, b: int) -> None:
         local_shapes(
-            points, near[a:b], centres[a:b], origin, normals[a:b], curvature[a:b], gap[a:b]
+            points,
+            near[a:b],
+            centres[a:b],
+            origin,
+            normals[a:b],
+            curvature[a:b],
+            gap[a:b],
+            roughness[a:b],
         )
 
     run_chunks(work, n)
-    return Shape(normals, curvature, gap >= _BOUNDARY_GAP)
+    return Shape(normals, curvature, gap >= _BOUNDARY_GAP, roughness)

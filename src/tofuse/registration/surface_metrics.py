@@ -57,8 +57,7 @@ class SurfaceMetric(Metric, Protocol):
     def unobservable(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.unobservable`."""
         pairs = _measurements(matches, alignment)
-        correlated = min(alignment.source.neighbours, alignment.target.neighbours)
-        return unobservable_directions(pairs, self.fit(pairs)[1], correlated)
+        return unobservable_directions(pairs, self.fit(pairs)[1])
 
 
 def _measurements(matches: Matches, alignment: Alignment) -> SurfacePairs:

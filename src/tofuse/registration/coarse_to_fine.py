@@ -1,0 +1,194 @@
+"""Registration of two clouds with nothing to set up: from coarse to fine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.kernels.kdtree import KdTree
+from tofuse.parts import part
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.hold import Hold
+from tofuse.registration.icp import Icp
+from tofuse.registration.interfaces import Metric
+from tofuse.registration.reduce import averaged
+from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.selectors import All
+from tofuse.registration.shape import shape_at
+from tofuse.registration.stopping import SmallStep
+from tofuse.registration.surface_metrics import PlaneToPlane
+
+Float64 = NDArray[np.float64]
+
+_SPACING_SAMPLE = 5000
+_SMALLEST_LEVEL = 60
+_EXTENT_SHARE = 20
+# Median roughness of surfaces above which normals say little.
+_ROUGHEST = 0.25
+_COARSER = 1.5
+
+
+@part("registration", "in-turn")
+@dataclass(frozen=True)
+class InTurn(Registrar):
+    """Registrations one after the other, each from where the one before ended.
+
+    Attributes
+    ----------
+    stages
+        At least one.
+    """
+
+    stages: tuple[Registrar, ...]
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("stages is empty")
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view that all stages work on."""
+        return frozenset.intersection(*(stage.takes for stage in self.stages))
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; the result is that of the last stage."""
+        found = self.stages[0].register(source, target, guess, rng)
+        for stage in self.stages[1:]:
+            found = stage.register(source, target, found.T_target_source, rng)
+        return found
+
+
+@part("registration", "coarse-to-fine", label="validated")
+@dataclass(frozen=True)
+class CoarseToFine(Registrar):
+    """ICP on ever finer versions of both views, each starting from the last.
+
+    A version has one mean point in each cube with edges of its resolution, which halves from
+    level to level: coarse levels reach far, and average the noise away. Directions that the
+    finest level doesn't hold are put back to where the guess had them.
+
+    Attributes
+    ----------
+    resolution
+        Of the finest level, m; None: the spacing of 5000 points of each view, more if that leaves
+        more than `points` points, or if the noise makes plane fits as thick as they are wide.
+    points
+        Of the finest level of either view, at most; only where `resolution` is None.
+    metric
+        Of every level.
+    reach
+        Largest distance of a pair, in resolutions of the level.
+    neighbours
+        Points of each plane fit.
+    max_iterations
+        Of each level.
+    """
+
+    resolution: float | None = None
+    points: int = 20000
+    metric: Metric = field(default_factory=lambda: PlaneToPlane(loss="tukey"))
+    reach: float = 3.0
+    neighbours: int = 12
+    max_iterations: int = 40
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if self.resolution is not None and not 0 < self.resolution < math.inf:
+            raise ValueError(f"resolution is {self.resolution}, not a length in metres")
+        if self.points < _SMALLEST_LEVEL:
+            raise ValueError(f"points is {self.points}, not {_SMALLEST_LEVEL} or more")
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; points, errors and rms are those of the finest level.
+
+        Raises
+        ------
+        RegistrationError
+            If there are too few points, or too few correspond.
+        """
+        fine = self._finest(source, target)
+        levels = [fine]
+        while levels[-1][0] * 2 * _EXTENT_SHARE < _extent(fine[2]):
+            resolution = 2 * levels[-1][0]
+            coarser = resolution, averaged(fine[1], resolution), averaged(fine[2], resolution)
+            if min(len(coarser[1]), len(coarser[2])) < _SMALLEST_LEVEL:
+                break
+            levels.append(coarser)
+        T = guess
+        for resolution, data, model in reversed(levels):
+            last = resolution == fine[0]
+            icp = self._icp(resolution, 1e-3 if last else 1e-2)
+            try:
+                found = icp.register(data, model, T, rng)
+            except RegistrationError:
+                if last:
+                    raise
+                continue  # too few pairs at this level: a finer one may have enough
+            T = found.T_target_source
+        if len(found.unobservable) == 0:
+            return found
+        hold = Hold.of(found.unobservable, data.points.astype(np.float64))
+        T = T @ hold.along(se3.inverse(T) @ guess)
+        return icp.register(data, model, T, rng, hold)
+
+    def _icp(self, resolution: float, epsilon: float) -> Icp:
+        return Icp(
+            resolution,
+            source=All(),
+            target=All(),
+            rejectors=(MaxDistance(self.reach),),
+            metric=self.metric,
+            stopping=SmallStep(epsilon, self.max_iterations),
+            neighbours=self.neighbours,
+        )
+
+    def _finest(self, source: Frame, target: Frame) -> tuple[float, CloudFrame, CloudFrame]:
+        if self.resolution is not None:
+            size = self.resolution
+            return size, averaged(source, size), averaged(target, size)
+        size = max(spacing(source), spacing(target))
+        while True:
+            data, model = averaged(source, size), averaged(target, size)
+            most = max(len(data), len(model))
+            if most <= self.points:
+                break
+            # Points lie on surfaces: their number falls with the square of the edge.
+            size *= 1.02 * max(1.05, math.sqrt(most / self.points))
+        while min(len(data), len(model)) > _SMALLEST_LEVEL and (
+            max(self._roughness(data), self._roughness(model)) > _ROUGHEST
+        ):
+            size *= _COARSER
+            data, model = averaged(source, size), averaged(target, size)
+        return size, data, model
+
+    def _roughness(self, view: CloudFrame) -> float:
+        rough = shape_at(view, np.arange(len(view)), self.neighbours).roughness
+        return float(np.nanmedian(rough)) if np.isfinite(rough).any() else 0.0
+
+
+def spacing(view: Frame) -> float:
+    """Median distance in m between neighbours among 5000 evenly chosen points; 0.01 if too few."""
+    points = view.points[:: max(1, len(view) // _SPACING_SAMPLE)].astype(np.float64)
+    if len(points) < 2:
+        return 0.01
+    _, squared = KdTree(points).neighbours(points, 2)
+    distances: NDArray[np.float64] = np.sqrt(squared[:, 1])
+    positive = distances[distances > 0]
+    return float(np.median(positive)) if len(positive) else 0.01
+
+
+def _extent(view: CloudFrame) -> float:
+    """Return the diagonal in m of the middle 90 % of the points along each axis."""
+    low, high = np.percentile(view.points, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))

@@ -1,0 +1,56 @@
+"""Directions that the data doesn't hold come from the guess (Zhang, Kaess and Singh 2016)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """Directions of the right perturbation along which a registration must not move.
+
+    Attributes
+    ----------
+    directions
+        (k, 6) about the source's origin, as in `Registration.unobservable`.
+    centre
+        (3,) middle of the source's points, m.
+    size
+        Their rms distance from it, m, which makes angles comparable with lengths.
+    """
+
+    directions: Float64
+    centre: Float64
+    size: float
+
+    @classmethod
+    def of(cls, directions: Float64, points: Float64) -> Hold:
+        """Hold `directions` of a source with the given points (n, 3)."""
+        centre = points.mean(0)
+        size = float(np.sqrt(((points - centre) ** 2).sum(1).mean()))
+        return cls(directions, centre, size or 1.0)
+
+    def along(self, T: Float64) -> Float64:
+        """Return the part (4, 4) along the directions of a small motion in the source's frame."""
+        return self._project(T, along=True)
+
+    def across(self, T: Float64) -> Float64:
+        """Return the part (4, 4) of a small motion in the source's frame that is free."""
+        return self._project(T, along=False)
+
+    def _project(self, T: Float64, *, along: bool) -> Float64:
+        to, back = np.eye(4), np.eye(4)
+        to[:3, 3], back[:3, 3] = self.centre, -self.centre
+        scale = np.array([1, 1, 1, self.size, self.size, self.size])
+        held = (self.directions @ se3.adjoint(back).T) * scale
+        basis = np.linalg.svd(held, full_matrices=False)[2]
+        xi = se3.log(back @ T @ to) * scale
+        part = sum((b * float((b * xi).sum()) for b in basis), np.zeros(6))
+        return to @ se3.exp((part if along else xi - part) / scale) @ back

@@ -1,0 +1,26 @@
+"""Views with fewer points, for the coarse levels of a registration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.recordings.frames import CloudFrame, Frame
+
+
+def averaged(view: Frame, size: float) -> CloudFrame:
+    """Return a cloud with the mean of the points in each cube with edges of `size` m.
+
+    Its points are in the order of the cubes; amplitude and colour are not kept.
+    """
+    points = view.points.astype(np.float64)
+    if len(points) == 0:
+        return CloudFrame(view.index, view.timestamp, view.points, origin=view.origin)
+    cell = np.floor((points - points.min(0)) / size)
+    order = np.lexsort((cell[:, 2], cell[:, 1], cell[:, 0]))
+    cell = cell[order]
+    starts = np.flatnonzero(np.r_[True, (cell[1:] != cell[:-1]).any(1)])
+    counts = np.diff(np.r_[starts, len(points)])
+    means = np.add.reduceat(points[order], starts, axis=0) / counts[:, None]
+    return CloudFrame(
+        view.index, view.timestamp, means.astype(np.float32), origin=np.asarray(view.origin)
+    )

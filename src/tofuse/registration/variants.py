@@ -1,0 +1,314 @@
+"""Named variants of ICP (section 1.3): each a choice of parts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.coarse_to_fine import InTurn
+from tofuse.registration.icp import Icp
+from tofuse.registration.interfaces import Float64, Metric, Selector
+from tofuse.registration.matchers import ClosestCompatible, ClosestInvariant, Invariant
+from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.rejectors import MaxDistance, Trimmed, Unique
+from tofuse.registration.selectors import All, Random
+from tofuse.registration.stopping import SmallStep
+from tofuse.registration.surface_metrics import PlaneToPlane, PointToPlane, Symmetric
+
+_GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+class Variant(Registrar, Protocol):
+    """A registration that is described by the parts it is made of."""
+
+    def parts(self) -> Registrar:
+        """Return the registration as its parts."""
+        ...
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view it works on."""
+        return self.parts().takes
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`."""
+        return self.parts().register(source, target, guess, rng)
+
+
+def _random(points: int | None) -> Selector:
+    return All() if points is None else Random(points)
+
+
+def _surface_icp(
+    resolution: float, points: int | None, reach: float, max_iterations: int, metric: Metric
+) -> Icp:
+    return Icp(
+        resolution,
+        source=_random(points),
+        target=All(),
+        rejectors=(MaxDistance(reach),),
+        metric=metric,
+        stopping=SmallStep(max_iterations=max_iterations),
+    )
+
+
+@part("registration", "point-to-plane", label="validated")
+@dataclass(frozen=True)
+class PointToPlaneIcp(Variant):
+    """ICP with the distance to tangent planes (Chen and Medioni 1992), of closest points.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    reach
+        Largest distance of a pair, in resolutions.
+    max_iterations
+        Iterations after which it ends in any case.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    reach: float = 5.0
+    max_iterations: int = 50
+
+    def parts(self) -> Icp:
+        """See `Variant.parts`."""
+        return _surface_icp(
+            self.resolution, self.points, self.reach, self.max_iterations, PointToPlane()
+        )
+
+
+@part("registration", "symmetric", label="validated")
+@dataclass(frozen=True)
+class SymmetricIcp(Variant):
+    """ICP with the symmetric objective (Rusinkiewicz 2019), of closest points.
+
+    Attributes
+    ----------
+    resolution, points, reach, max_iterations
+        As of `PointToPlaneIcp`.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    reach: float = 5.0
+    max_iterations: int = 50
+
+    def parts(self) -> Icp:
+        """See `Variant.parts`."""
+        return _surface_icp(
+            self.resolution, self.points, self.reach, self.max_iterations, Symmetric()
+        )
+
+
+@part("registration", "gicp", label="validated")
+@dataclass(frozen=True)
+class GeneralizedIcp(Variant):
+    """Generalised ICP, plane to plane (Segal, Haehnel and Thrun 2009).
+
+    Attributes
+    ----------
+    resolution, points, reach, max_iterations
+        As of `PointToPlaneIcp`.
+    epsilon
+        Variance across a surface relative to that along it.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    reach: float = 5.0
+    max_iterations: int = 50
+    epsilon: float = 1e-3
+
+    def parts(self) -> Icp:
+        """See `Variant.parts`."""
+        metric = PlaneToPlane(self.epsilon)
+        return _surface_icp(self.resolution, self.points, self.reach, self.max_iterations, metric)
+
+
+@part("registration", "tricp", label="validated")
+@dataclass(frozen=True)
+class Tricp(Registrar):
+    """Trimmed ICP (Chetverikov, Stepanov and Krsek 2005).
+
+    Each iteration keeps the share xi of shortest pairs, at any distance. If the overlap xi isn't
+    known, it is that which makes ``psi(xi) = e(xi) xi^-(1 + preference)`` least, with e the mean
+    squared distance of the pairs kept when the registration with xi has ended: looked for on a
+    grid of six, and from the best of these by golden section.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    overlap
+        xi, if it is known.
+    smallest
+        Smallest overlap looked at.
+    preference
+        lambda of the paper (2): how much a large overlap is preferred.
+    tolerance
+        How well the overlap is found.
+    max_iterations
+        Of each registration.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    overlap: float | None = None
+    smallest: float = 0.4
+    preference: float = 2.0
+    tolerance: float = 0.02
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        if self.overlap is not None and not 0 < self.overlap <= 1:
+            raise ValueError(f"overlap is {self.overlap}, not more than 0 and at most 1")
+        if not 0 < self.smallest < 1:
+            raise ValueError(f"smallest is {self.smallest}, not between 0 and 1")
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance is {self.tolerance}, not more than 0")
+
+    @property
+    def takes(self) -> frozenset[str]:
+        """Kinds of view it works on: all."""
+        return frozenset({"range", "cloud"})
+
+    def parts(self, overlap: float) -> Icp:
+        """Return the trimmed ICP for one overlap."""
+        return Icp(
+            self.resolution,
+            source=_random(self.points),
+            target=All(),
+            rejectors=(Trimmed(overlap),),
+            metric=PointToPoint(),
+            stopping=SmallStep(max_iterations=self.max_iterations),
+        )
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; the share of corresponding points is the overlap."""
+        if self.overlap is not None:
+            return self.parts(self.overlap).register(source, target, guess, rng)
+        # The same points for every overlap, or psi would be noisy.
+        seed = int(rng.integers(2**62))
+        tried: dict[float, tuple[float, Registration]] = {}
+
+        def psi(overlap: float) -> float:
+            if overlap not in tried:
+                again = np.random.default_rng([seed])
+                found = self.parts(overlap).register(source, target, guess, again)
+                floor = (1e-6 * self.resolution) ** 2
+                value = max(found.rms_m**2, floor) * overlap ** -(1 + self.preference)
+                tried[overlap] = (value, found)
+            return tried[overlap][0]
+
+        grid = [float(x) for x in np.linspace(self.smallest, 1, 6)]
+        best = min(range(len(grid)), key=lambda k: psi(grid[k]))
+        low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+        while high - low > self.tolerance:
+            a = high - _GOLDEN * (high - low)
+            b = low + _GOLDEN * (high - low)
+            if psi(a) <= psi(b):
+                high = b
+            else:
+                low = a
+        return min(tried.values(), key=lambda each: each[0])[1]
+
+
+@part("registration", "iccp", label="validated")
+@dataclass(frozen=True)
+class Iccp(Variant):
+    """Iterative Closest Compatible Point (Godin, Rioux and Baribeau 1994).
+
+    Only points of like amplitude are paired, so that texture holds what the shape doesn't. Needs
+    amplitude in both views, compensated for range if the range differs.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    ratio
+        Largest ratio of two compatible amplitudes.
+    reach
+        Largest distance of a pair, in resolutions.
+    max_iterations
+        Iterations after which it ends in any case.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    ratio: float = 1.2
+    reach: float = 10.0
+    max_iterations: int = 100
+
+    def parts(self) -> Icp:
+        """See `Variant.parts`."""
+        return Icp(
+            self.resolution,
+            source=_random(self.points),
+            target=All(),
+            matcher=ClosestCompatible(self.ratio),
+            rejectors=(MaxDistance(self.reach),),
+            metric=PointToPoint(),
+            stopping=SmallStep(max_iterations=self.max_iterations),
+        )
+
+
+@part("registration", "icpif", label="validated")
+@dataclass(frozen=True)
+class Icpif(Variant):
+    """ICP using invariant features (Sharp, Lee and Wehe 2002).
+
+    Points are paired by their distance in space and in features that don't change with the pose.
+    Features bring the views together from far; plain ICP, from there, makes them fit.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    features, weight, radius
+        As of `ClosestInvariant`.
+    reach
+        Largest distance of a pair in the plain ICP, in resolutions.
+    max_iterations
+        Of each of the two.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    features: tuple[Invariant, ...] = ("moments",)
+    weight: float = 10.0
+    radius: float = 6.0
+    reach: float = 3.0
+    max_iterations: int = 100
+
+    def parts(self) -> InTurn:
+        """See `Variant.parts`."""
+        plain = Icp(
+            self.resolution,
+            source=_random(self.points),
+            target=All(),
+            rejectors=(MaxDistance(self.reach),),
+            metric=PointToPoint(),
+            stopping=SmallStep(max_iterations=self.max_iterations),
+        )
+        matcher = ClosestInvariant(self.features, self.weight, self.radius)
+        return InTurn((replace(plain, matcher=matcher, rejectors=(Unique(),)), plain))
