@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         start=arguments.start,
         end=arguments.end,
         every=arguments.every,
+        average_still=arguments.average_still,
         min_depth=arguments.min_depth,
         max_depth=arguments.max_depth,
         guess=arguments.guess,
@@ -171,7 +172,7 @@ def noise(arguments: argparse.Namespace) -> int:
         label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
         measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
         table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
-    console = Console(highlight=False, soft_wrap=True)
+    console = _Output(highlight=False, soft_wrap=True)
     console.print(table)
     console.print(
         f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} still "

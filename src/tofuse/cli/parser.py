@@ -84,6 +84,11 @@ def _run(commands: Any) -> None:
     g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
     g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
     g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    g.add_argument(
+        "--average-still",
+        action="store_true",
+        help="make one better frame of each stretch in which nothing moves",
+    )
     g.add_argument("--min-depth", type=_metres, metavar="M", help="drop points nearer than this")
     g.add_argument("--max-depth", type=_metres, metavar="M", help="drop points beyond this")
 

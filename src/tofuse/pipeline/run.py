@@ -24,6 +24,7 @@ from tofuse.posegraph.given import read_loops
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
+from tofuse.recordings.still import average_still
 from tofuse.results.output import OutputFolder, read_run_json, write_result
 from tofuse.results.types import Reconstruction
 
@@ -44,6 +45,7 @@ class Options:
     start: int = 0
     end: int | None = None
     every: int = 1
+    average_still: bool = False
     min_depth: float | None = None
     max_depth: float | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
@@ -67,6 +69,8 @@ def run(
     seed = _seed(options)
     recording = open_recording(*inputs, format=options.format, camera=options.camera)
     recording = recording.select(options.start, options.end, options.every)
+    if options.average_still:
+        recording = average_still(recording)
     _check_guess(options, recording)
     config = fitted(config, recording)
     loops = (
