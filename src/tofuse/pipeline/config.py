@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tofuse import parts
 from tofuse.errors import InputError
@@ -15,7 +15,10 @@ from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import LoopDetector
+from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.results.output import read_run_json
+
+ViewKind = Literal["range", "cloud"]
 
 
 @dataclass(frozen=True)
@@ -58,19 +61,19 @@ class Config:
 _ROOMS = ("tofuse.filters", "tofuse.registration", "tofuse.odometry", "tofuse.posegraph")
 
 
-def methods() -> dict[str, Callable[[], Config]]:
+def methods() -> dict[str, Callable[[ViewKind], Config]]:
     """Return the named configurations, `default` first."""
     from tofuse.pipeline import methods as named
 
     return {"default": named.default, "thesis": named.thesis}
 
 
-def from_method(name: str) -> Config:
-    """Return the configuration of that name; InputError if there is none."""
+def from_method(name: str, kind: ViewKind = "range") -> Config:
+    """Return the configuration of that name for a kind of view; InputError if there is none."""
     known = methods()
     if name not in known:
         raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(known)}")
-    return known[name]()
+    return known[name](kind)
 
 
 def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config:
@@ -128,7 +131,12 @@ def _merge(base: Any, change: Any) -> Any:
     return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
 
 
-def check_views(config: Config, kind: str) -> None:
+def kind_of(frame: Frame) -> ViewKind:
+    """Return "range" for an image of a camera, "cloud" for a bare cloud."""
+    return "range" if isinstance(frame, RangeFrame) else "cloud"
+
+
+def check_views(config: Config, kind: ViewKind) -> None:
     """Raise InputError if a part of the configuration can't work on views of that kind.
 
     Parameters

@@ -15,7 +15,7 @@ from tofuse.filters.base import apply_filters
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
-from tofuse.pipeline.config import Config, check_views, from_method
+from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
@@ -63,15 +63,14 @@ class Mapper:
         progress: Progress | None = None,
     ) -> None:
         self.config = from_method(config) if isinstance(config, str) else config
+        self._method = config if isinstance(config, str) else None
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         self._given_loops = tuple(loops)
         self._progress = progress or Silent()
         self._watch = Stopwatch()
-        self._tracker = self.config.odometry.start(seed)
-        self._loops = self.config.loops.start(seed)
-        self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
-        self._kind = ""
+        self._kind: ViewKind | None = None
+        self._begin()
         self._records: list[FrameRecord] = []
         self._steps: list[Step | None] = []  # None where a frame could not be read
         self._views: dict[int, CloudFrame] = {}  # filtered and thinned, of frames with a pose
@@ -80,6 +79,11 @@ class Mapper:
         self._seen: dict[str, int] = {}
         self._removed: dict[str, int] = {}
         self._finished = False
+
+    def _begin(self) -> None:
+        self._tracker = self.config.odometry.start(self.seed)
+        self._loops = self.config.loops.start(self.seed)
+        self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
 
     def push(
         self,
@@ -137,15 +141,19 @@ class Mapper:
 
     def _check(self, frame: Frame) -> None:
         self._check_order(frame.index)
-        kind = "range" if isinstance(frame, RangeFrame) else "cloud"
+        kind = kind_of(frame)
         if self._kind and kind != self._kind:
             raise InputError(
                 f"is a {kind} view among {self._kind} views",
                 where=f"frame {frame.index}",
                 remedy="give images only, or clouds only",
             )
-        check_views(self.config, kind)
-        self._kind = kind
+        if self._kind is None:
+            if self._method is not None and kind == "cloud":
+                self.config = from_method(self._method, kind)
+                self._begin()
+            check_views(self.config, kind)
+            self._kind = kind
 
     def _check_order(self, index: int) -> None:
         if self._finished:

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
 from tofuse.geometry import se3
-from tofuse.pipeline.config import Config, from_method
+from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.posegraph.loops import GivenLoop
@@ -58,7 +58,7 @@ def reconstruct(
         If no frame can be read, or none has enough valid points for a pose.
     """
     progress = progress or Silent()
-    config = from_method(config) if isinstance(config, str) else config
+    config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
     mapper = Mapper(config, seed=seed, threads=threads, loops=loops, progress=progress)
     progress.stage("tracking", len(recording))
     odometry = recording.odometry
@@ -84,6 +84,16 @@ def reconstruct(
             )
         result = mapper.finish()
     return replace(result, recording=describe(recording))
+
+
+def view_kind(recording: Recording) -> ViewKind:
+    """Return the kind of the recording's views: that of the first one that can be read."""
+    for k in range(len(recording)):
+        try:
+            return kind_of(recording[k])
+        except UnreadableFrameError:
+            continue
+    return "range"
 
 
 def past_frames(

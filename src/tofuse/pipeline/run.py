@@ -12,13 +12,14 @@ import numpy as np
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
 from tofuse.filters.confidence import Confidence
-from tofuse.pipeline.config import Config, changed, from_method, read_changes
+from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import (
     past_frames,
     reconstruct,
     reference_in_world,
     truth_points,
+    view_kind,
 )
 from tofuse.posegraph.given import read_loops
 from tofuse.recordings.frames import Frame
@@ -65,12 +66,12 @@ def run(
         If nothing could be written; see the message for the remedy.
     """
     progress = progress or Silent()
-    config = resolve(options)
     seed = _seed(options)
     recording = open_recording(*inputs, format=options.format, camera=options.camera)
     recording = recording.select(options.start, options.end, options.every)
     if options.average_still:
         recording = average_still(recording)
+    config = resolve(options, view_kind(recording))
     _check_guess(options, recording)
     config = fitted(config, recording)
     loops = (
@@ -95,13 +96,13 @@ def run(
     return result
 
 
-def resolve(options: Options) -> Config:
-    """Return the configuration that the options ask for, before the recording is known."""
+def resolve(options: Options, kind: ViewKind = "range") -> Config:
+    """Return the configuration that the options ask for, for a kind of view."""
     changes: dict[str, Any] = read_changes(options.config) if options.config else {}
     method = options.method or changes.get("method") or "default"
     if not isinstance(method, str):
         raise InputError(f"is {method!r}", where=f"{options.config}: method")
-    config = from_method(method)
+    config = from_method(method, kind)
     config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
     if options.guess:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")

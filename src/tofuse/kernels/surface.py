@@ -1,0 +1,312 @@
+"""Smooth surfaces from noisy range images: local planes, fitted in constant time a pixel.
+
+In a range image a plane is linear in inverse depth: with ray (x, y, 1) and z depth, 1/z = a x +
+b y + c on the plane with normal (a, b, c). Weighted sums over any window come from integral
+images, so windows can be as wide as the noise asks for and the surface allows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+SUMS = 11  # weight, x, y, w, xx, xy, yy, xw, yw, ww, count
+
+
+@kernel
+def halve(z: Float32, value: Float32, jump: float, z_out: Float32, value_out: Float32) -> None:
+    """Halve an image: the mean of those pixels of each 2x2 block that lie on one surface.
+
+    Of four depths those within `jump` (share of the depth) of the second nearest are averaged, as
+    inverse depths; zeros don't count. `value` is averaged over the same pixels.
+    """
+    rows, columns = z_out.shape
+    d = np.empty(4)
+    a = np.empty(4)
+    for i in range(rows):
+        for j in range(columns):
+            n = 0
+            for k in range(4):
+                x = z[2 * i + (k >> 1), 2 * j + (k & 1)]
+                if x > 0:
+                    # Insertion into ascending order.
+                    m = n
+                    while m > 0 and d[m - 1] > x:
+                        d[m] = d[m - 1]
+                        a[m] = a[m - 1]
+                        m -= 1
+                    d[m] = x
+                    a[m] = value[2 * i + (k >> 1), 2 * j + (k & 1)]
+                    n += 1
+            if n == 0:
+                z_out[i, j] = 0
+                value_out[i, j] = 0
+                continue
+            middle = d[1] if n > 1 else d[0]
+            total = 0.0
+            amount = 0.0
+            count = 0
+            for k in range(n):
+                if abs(d[k] - middle) <= jump * middle:
+                    total += 1.0 / d[k]
+                    amount += a[k]
+                    count += 1
+            z_out[i, j] = count / total
+            value_out[i, j] = amount / count
+
+
+@kernel
+def weighted_sums(
+    w: Float32, rays: Float32, weight: Float32, sums: Float64, start: int, stop: int
+) -> None:
+    """Running sums along rows start..stop of the weighted moments of inverse depth.
+
+    sums is (H + 1, W + 1, SUMS); row i + 1 gets the sums of row i alone. `add_rows` then makes an
+    integral image of it.
+    """
+    columns = w.shape[1]
+    t = np.empty(SUMS)
+    for i in range(start, stop):
+        t[:] = 0.0
+        for j in range(columns):
+            g = np.float64(weight[i, j])
+            if g > 0:
+                x = np.float64(rays[i, j, 0])
+                y = np.float64(rays[i, j, 1])
+                v = np.float64(w[i, j])
+                gx = g * x
+                gy = g * y
+                gv = g * v
+                t[0] += g
+                t[1] += gx
+                t[2] += gy
+                t[3] += gv
+                t[4] += gx * x
+                t[5] += gx * y
+                t[6] += gy * y
+                t[7] += gv * x
+                t[8] += gv * y
+                t[9] += gv * v
+                t[10] += 1.0
+            for k in range(SUMS):
+                sums[i + 1, j + 1, k] = t[k]
+
+
+@kernel
+def add_rows(sums: Float64) -> None:
+    """Turn sums along rows into an integral image, in place."""
+    rows, columns, depth = sums.shape
+    for i in range(1, rows):
+        for j in range(columns):
+            for k in range(depth):
+                sums[i, j, k] += sums[i - 1, j, k]
+
+
+@kernel
+def fit_planes(
+    w: Float32,
+    rays: Float32,
+    weight: Float32,
+    sums: Float64,
+    radii: NDArray[np.int64],
+    limit: float,
+    planes: Float32,
+    quality: Float32,
+    start: int,
+    stop: int,
+) -> None:
+    """Fit a plane at each pixel of rows start..stop, over the widest window that is one surface.
+
+    A window is one surface if its mean weighted squared residual is what noise of variance `limit`
+    can give (three standard deviations), the pixel itself is within 5 sigmas, and the pixels are
+    spread around the centre, not all on one side of it as at an outline.
+
+    planes is (H, W, 4): the coefficients a, b, c of 1/z = a x + b y + c, and 1/z at the pixel; all
+    0 where no window fits. quality is (H, W, 2): mean squared weighted residual of the smallest
+    window (NaN if it has too few pixels), and variance of the fitted 1/z at the pixel in units of
+    the noise, that is, with weights 1 / variance.
+    """
+    rows, columns = w.shape
+    s = np.empty(SUMS)
+    for i in range(start, stop):
+        for j in range(columns):
+            planes[i, j, 0] = 0
+            planes[i, j, 1] = 0
+            planes[i, j, 2] = 0
+            planes[i, j, 3] = 0
+            quality[i, j, 0] = np.nan
+            quality[i, j, 1] = 0
+            if weight[i, j] <= 0:
+                continue
+            x0 = np.float64(rays[i, j, 0])
+            y0 = np.float64(rays[i, j, 1])
+            found = False
+            # From the smallest window up: a window that fails ends it, so a wide window never
+            # jumps over a gap that a smaller one has seen.
+            for q in range(len(radii)):
+                r = radii[q]
+                top = max(i - r, 0)
+                bottom = min(i + r + 1, rows)
+                left = max(j - r, 0)
+                right = min(j + r + 1, columns)
+                for k in range(SUMS):
+                    s[k] = (
+                        sums[bottom, right, k]
+                        - sums[top, right, k]
+                        - sums[bottom, left, k]
+                        + sums[top, left, k]
+                    )
+                n = s[10]
+                side = 2 * r + 1
+                if n < 0.5 * side * side or n < 6:
+                    break
+                inverse = 1.0 / s[0]
+                mx = s[1] * inverse
+                my = s[2] * inverse
+                mw = s[3] * inverse
+                cxx = s[4] * inverse - mx * mx
+                cxy = s[5] * inverse - mx * my
+                cyy = s[6] * inverse - my * my
+                cxw = s[7] * inverse - mx * mw
+                cyw = s[8] * inverse - my * mw
+                cww = s[9] * inverse - mw * mw
+                det = cxx * cyy - cxy * cxy
+                if not det > 1e-6 * cxx * cyy:
+                    break
+                dx = x0 - mx
+                dy = y0 - my
+                if dx * dx > 0.5 * cxx or dy * dy > 0.5 * cyy:
+                    break
+                a = (cyy * cxw - cxy * cyw) / det
+                b = (cxx * cyw - cxy * cxw) / det
+                left_over = max(cww - a * cxw - b * cyw, 0.0) * s[0] / (n - 3)
+                if q == 0:
+                    quality[i, j, 0] = left_over
+                value = mw + a * dx + b * dy
+                off = np.float64(w[i, j]) - value
+                # Of n - 3 squared normal deviates the mean has a standard deviation of
+                # sqrt(2 / (n - 3)).
+                misfit = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
+                if left_over > misfit or off * off * weight[i, j] > 25 * limit or value <= 0:
+                    break
+                found = True
+                planes[i, j, 0] = a
+                planes[i, j, 1] = b
+                planes[i, j, 2] = value - a * x0 - b * y0
+                planes[i, j, 3] = value
+                leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) / det
+                quality[i, j, 1] = inverse * (1.0 + leverage)
+            if not found:
+                planes[i, j, 3] = 0
+
+
+@kernel
+def albedo_image(
+    planes: Float32, rays: Float32, light: Float32, power: float, out: Float32
+) -> None:
+    """Logarithm of the albedo, up to a constant: light * range^power / cos(incidence).
+
+    `power` is 2 where the light falls off with the square of the range, 0 where that has been
+    compensated. NaN where there is no plane, no light, or the surface is seen too slantwise.
+    """
+    rows, columns = light.shape
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = np.nan
+            v = planes[i, j, 3]
+            if v <= 0 or not light[i, j] > 0:
+                continue
+            x = rays[i, j, 0]
+            y = rays[i, j, 1]
+            a = planes[i, j, 0]
+            b = planes[i, j, 1]
+            c = planes[i, j, 2]
+            length2 = x * x + y * y + 1
+            # The normal is (a, b, c), and (a, b, c) . (x, y, 1) = 1/z.
+            cosine = v / np.sqrt((a * a + b * b + c * c) * length2)
+            if cosine < 0.15:
+                continue
+            out[i, j] = np.log(light[i, j] / cosine) + 0.5 * power * np.log(length2 / (v * v))
+
+
+@kernel
+def smooth_and_slope(
+    image: Float32,
+    planes: Float32,
+    rays: Float32,
+    radius: int,
+    jump: float,
+    out: Float32,
+    start: int,
+    stop: int,
+) -> None:
+    """Box means of an image with NaN holes and their slopes, never across an edge in depth.
+
+    For rows start..stop, out is (H, W, 3): mean over (2 radius + 1)^2 pixels, and its derivatives
+    by the ray coordinates x and y. NaN where a pixel of the cross that the slopes need is missing
+    or its plane lies off the centre's by more than `jump` (share of the depth).
+    """
+    rows, columns = image.shape
+    h = radius + 1
+    m = np.empty(5)
+    for i in range(start, stop):
+        for j in range(columns):
+            out[i, j, 0] = np.nan
+            out[i, j, 1] = np.nan
+            out[i, j, 2] = np.nan
+            v = planes[i, j, 3]
+            if v <= 0 or i < h or j < h or i >= rows - h or j >= columns - h:
+                continue
+            if np.isnan(image[i, j]):
+                continue
+            good = True
+            for k in range(5):
+                ci = i
+                cj = j
+                if k == 1:
+                    cj = j - h
+                elif k == 2:
+                    cj = j + h
+                elif k == 3:
+                    ci = i - h
+                elif k == 4:
+                    ci = i + h
+                u = planes[ci, cj, 3]
+                expected = (
+                    planes[i, j, 0] * rays[ci, cj, 0]
+                    + planes[i, j, 1] * rays[ci, cj, 1]
+                    + planes[i, j, 2]
+                )
+                if u <= 0 or abs(u - expected) > jump * v:
+                    good = False
+                    break
+                total = 0.0
+                count = 0
+                for a in range(max(ci - radius, 0), min(ci + radius + 1, rows)):
+                    for b in range(max(cj - radius, 0), min(cj + radius + 1, columns)):
+                        value = image[a, b]
+                        if not np.isnan(value):
+                            total += value
+                            count += 1
+                if count == 0:
+                    good = False
+                    break
+                m[k] = total / count
+            if not good:
+                continue
+            out[i, j, 0] = m[0]
+            # Chain rule: slopes by pixel to slopes by ray coordinate, for any lens.
+            xu = rays[i, j + h, 0] - rays[i, j - h, 0]
+            yu = rays[i, j + h, 1] - rays[i, j - h, 1]
+            xv = rays[i + h, j, 0] - rays[i - h, j, 0]
+            yv = rays[i + h, j, 1] - rays[i - h, j, 1]
+            det = xu * yv - yu * xv
+            du = m[2] - m[1]
+            dv = m[4] - m[3]
+            out[i, j, 1] = (yv * du - yu * dv) / det
+            out[i, j, 2] = (xu * dv - xv * du) / det

@@ -1,0 +1,262 @@
+"""A view made ready for tracking: where its surfaces are, how they reflect, how well it knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry.cameras import Camera
+from tofuse.kernels.surface import (
+    SUMS,
+    add_rows,
+    albedo_image,
+    fit_planes,
+    halve,
+    smooth_and_slope,
+    weighted_sums,
+)
+from tofuse.kernels.threads import run_chunks
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Chunks of rows: few, as each costs a hand-over between threads; fixed, so that the number of
+# threads changes nothing.
+_CHUNKS = 4
+# Depths within this share of each other are one surface when an image is halved.
+_HALVING_JUMP = 0.02
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How a view is prepared.
+
+    Attributes
+    ----------
+    columns
+        Images are halved until they have at most this many columns.
+    radii
+        Half widths of the windows of the plane fits, pixels; the widest that is one surface wins.
+    misfit
+        How much larger than the noise shown by small windows the variance in wider ones may be.
+    photo_radius
+        Half width of the box that smooths the albedo, pixels.
+    """
+
+    columns: int = 320
+    radii: tuple[int, ...] = (2, 4, 7)
+    misfit: float = 1.2
+    photo_radius: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Where rays land on a grid of pixels, for any camera: a lookup over ray coordinates.
+
+    Attributes
+    ----------
+    lookup
+        (A, B, 2) float32 pixel (u, v) of each node, far outside the image where it sees nothing.
+    frame
+        (x0, y0, 1/dx, 1/dy) of the nodes.
+    """
+
+    lookup: Float32
+    frame: Float64
+
+    @classmethod
+    def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:
+        """Make the lookup of a camera whose images are halved to every `step`-th pixel."""
+        rays = camera.rays()
+        low = np.nanmin(rays, axis=(0, 1)).astype(float)
+        high = np.nanmax(rays, axis=(0, 1)).astype(float)
+        shape = np.maximum(
+            np.ceil(np.array([camera.width, camera.height]) / spacing).astype(int), 4
+        )
+        margin = (high - low) / shape
+        low, high = low - margin, high + margin
+        x, y = (np.linspace(a, b, n + 3) for a, b, n in zip(low, high, shape, strict=True))
+        nodes = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1)
+        pixels = (camera.project(nodes) + 0.5) / step - 0.5
+        lookup = np.where(np.isfinite(pixels), pixels, -1e6).astype(np.float32)
+        scale = np.array([x[0], y[0], 1 / (x[1] - x[0]), 1 / (y[1] - y[0])])
+        return cls(lookup, scale)
+
+
+_projections: WeakKeyDictionary[Camera, dict[int, Projection]] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMap:
+    """A view on a grid of at most `SurfaceOptions.columns` columns.
+
+    Attributes
+    ----------
+    index
+        Index of the frame.
+    rays
+        (H, W, 2) ray coordinates x/z, y/z.
+    z
+        (H, W) measured z in m, 0 where invalid.
+    sigma
+        (H, W) its standard deviation in m, as the view itself shows it.
+    planes
+        (H, W, 4): a, b, c of the plane a X + b Y + c Z = 1 at the pixel, and 1/z on it; 0 where
+        there is none.
+    plane_variance
+        (H, W) variance of that 1/z, 1/m^2.
+    photo
+        (H, W, 3) logarithm of the albedo, smoothed, and its slopes by x/z and y/z; NaN where
+        unknown.
+    projection
+        Where points of this view's frame land.
+    """
+
+    index: int
+    rays: Float32
+    z: Float32
+    sigma: Float32
+    planes: Float32
+    plane_variance: Float32
+    photo: Float32
+    projection: Projection
+    has_photo: bool = field(default=False)
+
+    @cached_property
+    def normals(self) -> Float32:
+        """(H, W, 3) unit normals away from the camera, 0 where unknown."""
+        abc = self.planes[..., :3]
+        length = np.sqrt((abc * abc).sum(-1, keepdims=True))
+        return np.where(self.planes[..., 3:] > 0, abc / np.maximum(length, 1e-12), 0).astype(
+            np.float32
+        )
+
+    @cached_property
+    def planar_share(self) -> float:
+        """Share of the pixels at which a plane was fitted."""
+        return float(np.count_nonzero(self.planes[..., 3] > 0)) / self.z.size
+
+
+def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
+    """Prepare a view.
+
+    The noise is taken from the frame's own `sigma_image` where it has one, else from a law of the
+    sensor family (one over the amplitude, or the square of the depth); its scale is measured on
+    the view itself, as the median misfit of small planes.
+    """
+    rays, z, light, step = _reduced(frame, options.columns)
+    w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
+    sigma = _noise_law(frame, z, light, rays, step)
+    # d(1/z) = dz / z^2
+    weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
+    rows, columns = z.shape
+    sums = np.zeros((rows + 1, columns + 1, SUMS))
+    run_chunks(lambda a, b: weighted_sums(w, rays, weight, sums, a, b), rows, _CHUNKS)
+    add_rows(sums)
+    planes = np.empty((rows, columns, 4), np.float32)
+    quality = np.empty((rows, columns, 2), np.float32)
+    scale = _noise_scale(w, rays, weight, sums, options.radii[0])
+    radii = np.array(options.radii, np.int64)
+    limit = options.misfit * scale
+    run_chunks(
+        lambda a, b: fit_planes(w, rays, weight, sums, radii, limit, planes, quality, a, b),
+        rows,
+        _CHUNKS,
+    )
+    photo = np.full((rows, columns, 3), np.nan, np.float32)
+    has_photo = light is not None
+    if light is not None:
+        albedo = np.empty((rows, columns), np.float32)
+        power = 2.0 if frame.amplitude_kind == "raw" else 0.0
+        albedo_image(planes, rays, light, power, albedo)
+        run_chunks(
+            lambda a, b: smooth_and_slope(
+                albedo, planes, rays, options.photo_radius, 0.05, photo, a, b
+            ),
+            rows,
+            _CHUNKS,
+        )
+    return SurfaceMap(
+        frame.index,
+        rays,
+        z,
+        sigma * np.float32(np.sqrt(scale)),
+        planes,
+        quality[..., 1] * np.float32(scale),
+        photo,
+        _projection(frame.camera, step),
+        has_photo,
+    )
+
+
+def _projection(camera: Camera, step: int) -> Projection:
+    try:
+        known = _projections.setdefault(camera, {})
+    except TypeError:  # a ray table, which has no hash
+        return Projection.of(camera, step)
+    if step not in known:
+        known[step] = Projection.of(camera, step)
+    return known[step]
+
+
+def _reduced(frame: RangeFrame, columns: int) -> tuple[Float32, Float32, Float32 | None, int]:
+    """Rays, z and amplitude at the working resolution, and the step in pixels."""
+    rays = frame.camera.rays()
+    z = np.where(frame.valid, frame.z, np.float32(0))
+    light = frame.amplitude_image
+    if light is not None:
+        light = np.where(light < SATURATED_AMPLITUDE, light, np.float32(0)).astype(np.float32)
+    step = 1
+    while z.shape[1] > columns:
+        rows, cols = z.shape[0] // 2, z.shape[1] // 2
+        z_half = np.empty((rows, cols), np.float32)
+        light_half = np.empty((rows, cols), np.float32)
+        halve(z, light if light is not None else z, _HALVING_JUMP, z_half, light_half)
+        blocks = rays[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 2)
+        rays = blocks.mean((1, 3))
+        z, light = z_half, light_half if light is not None else None
+        step *= 2
+    return np.ascontiguousarray(rays), z, light, step
+
+
+def _noise_law(
+    frame: RangeFrame, z: Float32, light: Float32 | None, rays: Float32, step: int
+) -> Float32:
+    """Sigma of z in m up to a factor."""
+    if frame.sigma_image is not None and step == 1:
+        return frame.sigma_image
+    if light is None or frame.amplitude_kind == "ir":
+        return np.float32(0.001) + np.float32(0.003) * z * z
+    if frame.amplitude_kind == "raw":
+        raw = light
+    else:
+        r2 = z * z * (1 + (rays * rays).sum(-1))
+        raw = np.divide(light, r2, out=np.zeros_like(z), where=r2 > 0)
+    lit = raw[raw > 0]
+    if len(lit) == 0:
+        return np.float32(0.001) + np.float32(0.003) * z * z
+    typical = np.float32(np.median(lit))
+    law = np.divide(typical, raw, out=np.full_like(z, 20), where=raw > 0)
+    return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
+
+
+def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radius: int) -> float:
+    """Median misfit of the smallest windows on a sparse set of rows: the variance's true scale."""
+    rows, columns = w.shape
+    planes = np.empty((rows, columns, 4), np.float32)
+    quality = np.empty((rows, columns, 2), np.float32)
+    values = []
+    radii = np.array([radius], np.int64)
+    for i in range(radius, rows - radius, max(1, rows // 16)):
+        fit_planes(w, rays, weight, sums, radii, np.inf, planes, quality, i, i + 1)
+        values.append(quality[i, :, 0])
+    found = np.concatenate(values) if values else np.zeros(0)
+    found = found[np.isfinite(found)]
+    if len(found) == 0:
+        return 1.0
+    return float(np.clip(np.median(found), 1e-6, 1e6))

@@ -1,0 +1,245 @@
+"""Odometry against keyframes: projective, photometric, and aware of what it can't see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
+from tofuse.odometry.base import Odometry, Step, Tracker
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.base import Registration
+from tofuse.registration.projective import (
+    UNITS,
+    Aligned,
+    Level,
+    ProjectiveOptions,
+    Target,
+    align,
+)
+
+Float64 = NDArray[np.float64]
+Guess = Literal["identity", "previous", "odometry"]
+
+# A relocalisation starts far off: coarser, and with more patience, than tracking.
+_WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """When an alignment is believed.
+
+    Attributes
+    ----------
+    inlier_share
+        Least share of the compared points that fit.
+    overlap
+        Least share of the points that land in the target.
+    in_front
+        Largest share of the compared points that lie where the target saw through.
+    inliers
+        Fewest points that fit, of those the finest level used.
+    scale
+        Largest rms of the residuals in sigmas of the noise.
+    """
+
+    inlier_share: float = 0.5
+    overlap: float = 0.15
+    in_front: float = 0.25
+    inliers: int = 150
+    scale: float = 8.0
+
+    def objection(self, a: Aligned) -> str:
+        """Return why an alignment is not believed, or nothing if it is."""
+        if a.overlap < self.overlap:
+            return f"only {a.overlap:.0%} of the points land in the view of the keyframe"
+        if a.inliers < self.inliers:
+            return f"only {a.inliers} points fit, {self.inliers} are needed"
+        if a.inlier_share < self.inlier_share:
+            return f"only {a.inlier_share:.0%} of the points fit, not {self.inlier_share:.0%}"
+        if a.in_front > self.in_front * a.compared:
+            return f"{a.in_front / a.compared:.0%} of the points lie where the keyframe saw through"
+        if a.scale > self.scale:
+            return f"the points lie {a.scale:.1f} times further apart than the noise allows"
+        return ""
+
+
+@part("odometry", "keyframes")
+@dataclass(frozen=True)
+class Keyframes(Odometry):
+    """Aligns each frame with the newest keyframes, coarse to fine.
+
+    A frame that leaves the keyframe becomes the next one. Directions that the data does not hold
+    keep the prediction, and are reported. A frame that fits nothing is lost: it and its
+    successors are looked for among the keyframes until one fits again.
+
+    Attributes
+    ----------
+    surface
+        How views are prepared.
+    alignment
+        How they are aligned.
+    acceptance
+        When an alignment is believed; `relocated` when it was found again.
+    guess
+        Where an alignment starts: "previous" (the last motion goes on), "identity" (the camera
+        stands still), "odometry" (the motion between the poses of an odometry file).
+    keyframe_angle, keyframe_distance
+        Motion after which a frame becomes a keyframe: rad, and as a share of the median depth.
+    targets
+        With how many keyframes a frame is aligned at once.
+    minimum_points
+        Valid points that a frame must have.
+    """
+
+    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
+    alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
+    acceptance: Acceptance = Acceptance()
+    relocated: Acceptance = Acceptance(0.75, 0.3, 0.1, 300, 4.0)
+    guess: Guess = "previous"
+    keyframe_angle: float = 0.2
+    keyframe_distance: float = 0.1
+    targets: int = 1
+    minimum_points: int = 300
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        if self.targets < 1:
+            raise ValueError(f"targets is {self.targets}, not 1 or more")
+        if not (self.keyframe_angle > 0 and self.keyframe_distance > 0):
+            raise ValueError("keyframe_angle and keyframe_distance must be above 0")
+
+    def start(self, seed: int) -> Tracker:
+        """See `Odometry.start`. There is nothing random in it."""
+        return _KeyframeTracker(self)
+
+
+@dataclass(frozen=True, eq=False)
+class _Keyframe:
+    view: SurfaceMap
+    T_world_camera: Float64
+    depth: float  # median, m
+
+
+class _KeyframeTracker(Tracker):
+    def __init__(self, options: Keyframes) -> None:
+        self._options = options
+        self._keyframes: list[_Keyframe] = []
+        self._T: Float64 | None = None  # of the last frame with a pose
+        self._T_odometry: Float64 | None = None
+        self._motion = np.eye(4)
+        self._lost = False
+
+    def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
+        """See `Tracker.push`."""
+        options = self._options
+        if not isinstance(frame, RangeFrame):
+            raise InputError("is a cloud; this tracker needs images", where=f"frame {frame.index}")
+        if len(frame) < options.minimum_points:
+            reason = f"{len(frame)} valid points, {options.minimum_points} are needed"
+            return self._lose(reason)
+        view = surface_map(frame, options.surface)
+        if np.count_nonzero(view.planes[..., 3]) < options.minimum_points:
+            return self._lose("nearly no surface in what is left of the image")
+        if self._T is None:
+            self._keep(view, np.eye(4))
+            self._T, self._T_odometry = np.eye(4), T_odometry
+            return Step("tracked", "", np.eye(4))
+
+        reasons: list[str] = []
+        found = self._track(view, T_odometry, reasons) or self._relocate(view)
+        if found is None:
+            return self._lose(reasons[0])
+        aligned, reference = found
+        T = aligned.T_world_source
+        self._motion = np.eye(4) if self._lost else se3.inverse(self._T) @ T
+        self._T, self._T_odometry, self._lost = T, T_odometry, False
+        if self._is_new(T, reference):
+            self._keep(view, T)
+        registration = _registration(aligned, reference.T_world_camera)
+        status: Literal["tracked", "predicted"] = "tracked"
+        reason = ""
+        if len(aligned.unobservable) == 6:
+            status, reason = "predicted", "nothing in view holds the camera in any direction"
+        return Step(status, reason, T, reference.view.index, registration)
+
+    def _lose(self, reason: str) -> Step:
+        self._lost = True
+        self._motion = np.eye(4)
+        return Step("lost", reason, None)
+
+    def _track(
+        self, view: SurfaceMap, T_odometry: Float64 | None, reasons: list[str]
+    ) -> tuple[Aligned, _Keyframe] | None:
+        """Align with the newest keyframes, from the guess and then from where the camera was."""
+        options = self._options
+        newest = self._keyframes[-options.targets :]
+        targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
+        for predicted in self._predictions(T_odometry):
+            aligned = align(view, targets, predicted, options.alignment)
+            objection = options.acceptance.objection(aligned)
+            if not objection:
+                return aligned, newest[-1]
+            reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
+        return None
+
+    def _predictions(self, T_odometry: Float64 | None) -> Iterator[Float64]:
+        assert self._T is not None
+        guess = self._options.guess
+        before = self._T_odometry
+        if guess == "odometry" and T_odometry is not None and before is not None:
+            yield self._T @ se3.inverse(before) @ T_odometry
+        elif guess == "previous" and not self._lost:
+            yield se3.orthonormalise(self._T @ self._motion)
+        yield self._T
+
+    def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe] | None:
+        """Look for the view among the keyframes, the newest first."""
+        options = self._options
+        wide = replace(options.alignment, levels=_WIDE, prior_m=3.0, prior_rad=3.0)
+        for keyframe in reversed(self._keyframes[-40:]):
+            target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+            coarse = align(view, target, keyframe.T_world_camera, wide)
+            if options.relocated.objection(coarse):
+                continue
+            aligned = align(view, target, coarse.T_world_source, options.alignment)
+            # A flat wall fits anywhere: only a view that is held in every direction is found again.
+            if not options.relocated.objection(aligned) and not len(aligned.unobservable):
+                return aligned, keyframe
+        return None
+
+    def _is_new(self, T: Float64, reference: _Keyframe) -> bool:
+        motion = se3.inverse(reference.T_world_camera) @ T
+        options = self._options
+        return bool(
+            se3.angle(motion) > options.keyframe_angle
+            or np.linalg.norm(motion[:3, 3]) > options.keyframe_distance * reference.depth
+        )
+
+    def _keep(self, view: SurfaceMap, T: Float64) -> None:
+        depth = float(np.median(view.z[view.z > 0]))
+        self._keyframes.append(_Keyframe(view, T, depth))
+
+
+def _registration(aligned: Aligned, T_world_reference: Float64) -> Registration:
+    directions = aligned.unobservable * UNITS
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    return Registration(
+        T_target_source=se3.inverse(T_world_reference) @ aligned.T_world_source,
+        converged=aligned.converged,
+        iterations=aligned.iterations,
+        correspondences=aligned.inliers,
+        points=max(aligned.compared, 1),
+        error=aligned.scale,
+        rms_m=aligned.rms_m,
+        information=aligned.information,
+        unobservable=directions / np.maximum(lengths, 1e-12),
+    )
