@@ -213,6 +213,7 @@ def test_no_space_or_permission_for_the_output(code, recording, tmp_path, capfd,
     out = tmp_path / "out"
     said = refuses(capfd, "run", recording, "--out", out, says=(str(out), "can't be written"))
     assert os.strerror(code).lower() in said.lower()
+    assert ".tofuse" not in said
     assert listing(tmp_path) == before
 
 
@@ -332,9 +333,10 @@ def test_bad_configurations(name, recording, tmp_path, capfd) -> None:
     text, says = CONFIGS[name]
     config = tmp_path / "my.toml"
     config.write_text(text, encoding="latin-1")
-    said = refuses(
-        capfd, "run", recording, "--out", tmp_path / "out", "--config", config, says=says
-    )
+    words = ("run", recording, "--out", tmp_path / "out", "--config", config)
+    if "method" not in text:
+        words += ("--method", "thesis")
+    said = refuses(capfd, *words, says=says)
     assert "my.toml" in said or "--method" in said
     assert not (tmp_path / "out").exists()
 

@@ -15,12 +15,17 @@ from tofuse.filters.base import Filter
 from tofuse.filters.temporal import TemporalDeviation
 from tofuse.kernels.threads import thread_count
 from tofuse.parts import part
-from tofuse.pipeline.config import from_method
+from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.mapper import Mapper, covariance_of
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
+
+# Fine enough for few frames, and quick.
+CONFIG = changed(
+    from_method("thesis"), {"odometry": {"registration": {"resolution": 0.03}}}, where="tests"
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +40,7 @@ def frames(recording):
 
 @pytest.fixture(scope="module")
 def whole(recording):
-    return reconstruct(recording)
+    return reconstruct(recording, CONFIG)
 
 
 def in_memory(frames, **options) -> Recording:
@@ -47,7 +52,7 @@ def blank(frame: RangeFrame) -> RangeFrame:
 
 
 def test_frames_pushed_one_by_one_give_the_same_bytes(frames, whole) -> None:
-    mapper = Mapper()
+    mapper = Mapper(CONFIG)
     poses = [mapper.push(frame) for frame in frames]
     result = mapper.finish()
     np.testing.assert_array_equal(poses, whole.diagnostics.sequential)
@@ -73,10 +78,10 @@ def test_result_of_a_whole_run(whole, recording) -> None:
 
 
 def test_seed_and_threads(recording, whole) -> None:
-    same = reconstruct(recording, threads=1)
+    same = reconstruct(recording, CONFIG, threads=1)
     assert same.trajectory.tobytes() == whole.trajectory.tobytes()
     assert same.threads == 1
-    other = reconstruct(recording, seed=1)
+    other = reconstruct(recording, CONFIG, seed=1)
     assert other.trajectory.tobytes() != whole.trajectory.tobytes()
     np.testing.assert_allclose(other.trajectory, whole.trajectory, atol=0.1)
 
@@ -117,7 +122,7 @@ def test_nothing_pushed_or_nothing_usable(frames) -> None:
 
 
 def test_a_filter_for_images_refuses_clouds_before_work_starts(frames) -> None:
-    config = replace(from_method("default"), filters=(TemporalDeviation(),))
+    config = replace(CONFIG, filters=(TemporalDeviation(),))
     mapper = Mapper(config)
     with pytest.raises(InputError, match=r"filter 'temporal' takes .'range'. views"):
         mapper.push(CloudFrame.of(frames[0].points))
@@ -126,7 +131,7 @@ def test_a_filter_for_images_refuses_clouds_before_work_starts(frames) -> None:
 
 def test_a_lost_frame_has_no_pose_and_the_next_goes_on(frames) -> None:
     lost = [blank(f) if f.index == 3 else f for f in frames]
-    result = reconstruct(in_memory(lost))
+    result = reconstruct(in_memory(lost), CONFIG)
     assert result.has_pose.tolist() == [k != 3 for k in range(8)]
     assert [f.status for f in result.diagnostics.frames].count("lost") == 1
     assert "0 valid points" in result.diagnostics.frames[3].reason
@@ -145,7 +150,7 @@ def test_loops_given_by_hand(frames, whole) -> None:
     measured = np.linalg.inv(whole.trajectory[0]) @ whole.trajectory[7]
     given = [GivenLoop(0, 7, measured), GivenLoop(1, 3, np.eye(4))]
     lost = [blank(f) if f.index == 3 else f for f in frames]
-    result = reconstruct(in_memory(lost), loops=given)
+    result = reconstruct(in_memory(lost), CONFIG, loops=given)
     used, refused = result.diagnostics.loops[1], result.diagnostics.loops[0]
     assert (used.i, used.j, used.accepted) == (0, 7, True)
     assert (refused.i, refused.j, refused.accepted) == (1, 3, False)
@@ -196,7 +201,7 @@ class SeesHistory(Filter):
 
 def test_temporal_filters_see_raw_neighbours_whatever_was_selected(recording, frames) -> None:
     SeesHistory.seen.clear()
-    config = replace(from_method("default"), filters=(SeesHistory(),))
+    config = replace(CONFIG, filters=(SeesHistory(),))
     result = reconstruct(recording.select(0, None, 3), config)
     assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1, 2]), (6, [4, 5])]
     for _, past, counts in SeesHistory.seen:
@@ -208,7 +213,7 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
     copy = shutil.copytree(room_recording, tmp_path / "copy")
     (copy / "depth" / "000002.png").write_bytes(b"no image")
     SeesHistory.seen.clear()
-    config = replace(from_method("default"), filters=(SeesHistory(),))
+    config = replace(CONFIG, filters=(SeesHistory(),))
     result = reconstruct(tofuse.open(copy).select(0, None, 3), config)
     assert [(i, past) for i, past, _ in SeesHistory.seen] == [(0, []), (3, [1]), (6, [4, 5])]
     assert result.has_pose.all()
@@ -216,7 +221,7 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
 
 def test_pushed_frames_are_each_others_history(frames) -> None:
     SeesHistory.seen.clear()
-    mapper = Mapper(replace(from_method("default"), filters=(SeesHistory(),)))
+    mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))
     for frame in frames[:4]:
         mapper.push(frame)
     assert [past for _, past, _ in SeesHistory.seen] == [[], [0], [0, 1], [1, 2]]
@@ -224,8 +229,7 @@ def test_pushed_frames_are_each_others_history(frames) -> None:
 
 
 def test_odometry_is_used_where_it_is_asked_for(frames, recording) -> None:
-    base = from_method("default")
-    config = replace(base, odometry=replace(base.odometry, guess="odometry"))
+    config = replace(CONFIG, odometry=replace(CONFIG.odometry, guess="odometry"))
     odometry = recording.reference.copy()
     with_odometry = reconstruct(in_memory(frames, odometry=odometry), config)
     without = reconstruct(in_memory(frames), config)

@@ -139,10 +139,9 @@ def inspect(arguments: argparse.Namespace) -> int:
         emit(found.to_dict())
         return 0
     console = _Output(highlight=False, soft_wrap=True)
-    table = Table.grid(padding=(0, 2))
+    width = max(map(len, found.facts))
     for name, value in found.facts.items():
-        table.add_row(f"[bold]{name}[/]", _escape(value))
-    console.print(table)
+        console.print(f"[bold]{name:<{width}}[/]  {_escape(value)}")
     for warning in found.warnings:
         console.print(f"[yellow]warning:[/] {_escape(warning)}")
     return 0

@@ -32,8 +32,23 @@ class OutputFolder:
     ours or empty, and that it can be written.
     """
 
-    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        overwrite: bool = False,
+        marker: str = "run.json",
+        ours: Callable[[Path], bool] | None = None,
+    ) -> None:
         """Check and create the folder.
+
+        Parameters
+        ----------
+        marker
+            The file that is moved into place last: where it is, everything else is.
+        ours
+            Says whether a folder holds an earlier result of the kind that will be written;
+            `is_result` unless given.
 
         Raises
         ------
@@ -43,6 +58,8 @@ class OutputFolder:
         """
         self.path = Path(path)
         self._staging = self.path / STAGING
+        self._marker = marker
+        self._ours = ours or is_result
         self._made: list[Path] = []
         try:
             self._check(overwrite)
@@ -61,9 +78,9 @@ class OutputFolder:
         entries -= {name for name in entries if name.startswith(UNFINISHED)}
         if not entries:
             return
-        if not is_result(self.path) and entries - {RECORDING}:
+        if not self._ours(self.path) and entries - {RECORDING}:
             raise OutputError(
-                "is not empty and holds no earlier result of tofuse",
+                "is not empty and holds no earlier result of this command",
                 where=self.path,
                 remedy="give --out a new or empty folder",
             )
@@ -76,14 +93,15 @@ class OutputFolder:
 
     @contextmanager
     def staging(self) -> Iterator[Path]:
-        """Give a folder to write files into; on success all are moved into place, else none.
-
-        `run.json` is moved last: where it is, everything else is.
-        """
+        """Give a folder to write files into; on success all are moved into place, else none."""
         try:
             yield self._staging
-            files = sorted(self._staging.iterdir(), key=lambda p: (p.name == "run.json", p.name))
+            files = sorted(self._staging.iterdir(), key=lambda p: (p.name == self._marker, p.name))
             _move_all(files, self.path, self._staging / "replaced")
+        except OutputError as error:
+            # Named as it would have been called in the end.
+            where = self.path / Path(error.where or "").name
+            raise OutputError(error.problem, where=where, remedy=error.remedy) from error
         except OSError as error:
             raise _output_error(self.path, error) from error
         finally:
