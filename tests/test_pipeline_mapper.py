@@ -219,6 +219,14 @@ def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path)
     assert result.has_pose.all()
 
 
+def test_joined_recordings_are_not_each_others_history(room_recording) -> None:
+    SeesHistory.seen.clear()
+    joined = tofuse.open(room_recording, room_recording).select(6, 11)
+    reconstruct(joined, replace(CONFIG, filters=(SeesHistory(),)))
+    found = [(i, past) for i, past, _ in SeesHistory.seen]
+    assert found == [(6, [4, 5]), (7, [5, 6]), (8, []), (9, [8]), (10, [8, 9])]
+
+
 def test_pushed_frames_are_each_others_history(frames) -> None:
     SeesHistory.seen.clear()
     mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -101,11 +102,14 @@ def past_frames(
 ) -> list[Frame]:
     """Return the `count` readable frames of the source just before frame `index`, oldest first.
 
-    They are the recording's own neighbours, whatever was selected of it; `known` are frames that
-    need not be read again.
+    They are the recording's own neighbours, whatever was selected of it, and of several joined
+    recordings those of the same one; `known` are frames that need not be read again.
     """
+    joined = recording.metadata.get("parts", ())
+    starts = accumulate((part["frames"] for part in joined), initial=0)
+    first = max(start for start in starts if start <= index)
     past = []
-    for k in range(max(0, index - count), index):
+    for k in range(max(first, index - count), index):
         try:
             past.append(known[k] if k in known else recording.source.read(k))
         except UnreadableFrameError:
