@@ -1,0 +1,369 @@
+"""Light that visible surfaces reflect onto each other, on a coarse grid of an image.
+
+A grid node stands for a block of pixels. Nodes are rows of `nodes` (N, 8): x and y of the mean
+ray, mean inverse depth w, light per pixel, area of the block in the plane z = 1, and the slopes a,
+b, c of the plane 1/z = a x + b y + c through it (all 0 where no plane fits).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+X, Y, W, LIGHT, AREA, A, B, C, COLUMNS = range(9)
+
+# Of cos(2 pi t) in powers of t^2 and of sin(2 pi t) in odd powers of t, for |t| <= 1/2; good to
+# 1e-6.
+_C0, _C1, _C2, _C3, _C4, _C5 = (
+    np.float32(c)
+    for c in (0.99999921, -19.73898031, 64.92865571, -85.27159959, 58.79037925, -21.07090497)
+)
+_S0, _S1, _S2, _S3, _S4, _S5 = (
+    np.float32(c)
+    for c in (6.28318279, -41.34141933, 81.59613741, -76.579674, 41.20368208, -12.26876145)
+)
+
+
+@kernel
+def block_means(
+    z: Float32, rays: Float32, light: Float32, step: int, jump: float, nodes: Float64
+) -> None:
+    """Means over blocks of step x step pixels, of those pixels that lie on one surface.
+
+    That is, of those whose depth is within `jump` (share of the depth) of the block's median. Sets
+    the first five columns of nodes (Hn, Wn, COLUMNS); w is 0 where less than a quarter is valid.
+    """
+    rows, columns = z.shape
+    d = np.empty(step * step)
+    for bi in range(nodes.shape[0]):
+        for bj in range(nodes.shape[1]):
+            top, left = bi * step, bj * step
+            bottom, right = min(top + step, rows), min(left + step, columns)
+            n = 0
+            for i in range(top, bottom):
+                for j in range(left, right):
+                    if z[i, j] > 0:
+                        d[n] = z[i, j]
+                        n += 1
+            for c in range(COLUMNS):
+                nodes[bi, bj, c] = 0.0
+            if 4 * n < (bottom - top) * (right - left):
+                continue
+            middle = np.sort(d[:n])[n // 2]
+            count = 0
+            lit = 0
+            mapped = 0
+            x = y = w = amount = area = 0.0
+            for i in range(top, bottom):
+                for j in range(left, right):
+                    if z[i, j] > 0 and abs(z[i, j] - middle) <= jump * middle:
+                        count += 1
+                        x += rays[i, j, 0]
+                        y += rays[i, j, 1]
+                        w += 1.0 / z[i, j]
+                        if light[i, j] > 0:
+                            lit += 1
+                            amount += light[i, j]
+                        i2 = i + 1 if i + 1 < rows else i - 1
+                        j2 = j + 1 if j + 1 < columns else j - 1
+                        ux = rays[i, j2, 0] - rays[i, j, 0]
+                        uy = rays[i, j2, 1] - rays[i, j, 1]
+                        vx = rays[i2, j, 0] - rays[i, j, 0]
+                        vy = rays[i2, j, 1] - rays[i, j, 1]
+                        pixel = abs(ux * vy - uy * vx)
+                        if np.isfinite(pixel):
+                            mapped += 1
+                            area += pixel
+            if mapped == 0:
+                continue
+            nodes[bi, bj, X] = x / count
+            nodes[bi, bj, Y] = y / count
+            nodes[bi, bj, W] = w / count
+            nodes[bi, bj, LIGHT] = amount / lit if lit > 0 else 0.0
+            nodes[bi, bj, AREA] = area / mapped * count
+
+
+@kernel
+def window_planes(nodes: Float64, radius: int, planes: Float64) -> None:
+    """Fit 1/z = a x + b y + c to each window of nodes; planes (Hn, Wn, 4) with the relative misfit.
+
+    The misfit (root mean square over 1/z) is infinite where the window has less than two thirds of
+    its nodes.
+    """
+    rows, columns = nodes.shape[:2]
+    for i in range(rows):
+        for j in range(columns):
+            planes[i, j, 3] = np.inf
+            n = 0
+            mx = my = mw = 0.0
+            top, bottom = max(i - radius, 0), min(i + radius + 1, rows)
+            left, right = max(j - radius, 0), min(j + radius + 1, columns)
+            for p in range(top, bottom):
+                for q in range(left, right):
+                    if nodes[p, q, W] > 0:
+                        n += 1
+                        mx += nodes[p, q, X]
+                        my += nodes[p, q, Y]
+                        mw += nodes[p, q, W]
+            if n < 6 or 3 * n < 2 * (2 * radius + 1) ** 2:
+                continue
+            mx, my, mw = mx / n, my / n, mw / n
+            xx = xy = yy = xw = yw = ww = 0.0
+            for p in range(top, bottom):
+                for q in range(left, right):
+                    if nodes[p, q, W] > 0:
+                        x = nodes[p, q, X] - mx
+                        y = nodes[p, q, Y] - my
+                        w = nodes[p, q, W] - mw
+                        xx += x * x
+                        xy += x * y
+                        yy += y * y
+                        xw += x * w
+                        yw += y * w
+                        ww += w * w
+            det = xx * yy - xy * xy
+            if not det > 1e-6 * xx * yy:
+                continue
+            a = (yy * xw - xy * yw) / det
+            b = (xx * yw - xy * xw) / det
+            planes[i, j, 0] = a
+            planes[i, j, 1] = b
+            planes[i, j, 2] = mw - a * mx - b * my
+            planes[i, j, 3] = np.sqrt(max(ww - a * xw - b * yw, 0.0) / (n - 3)) / mw
+
+
+@kernel
+def choose_planes(nodes: Float64, planes: Float64, radius: int, limit: float) -> None:
+    """Give each node without a plane the best of the windows that it lies in (Kuwahara 1976).
+
+    So that planes reach up to an edge and do not cut it off. Only planes that fit their window and
+    the node to within `limit` (relative) are taken; of equal ones, that of the nearest window.
+    """
+    rows, columns = nodes.shape[:2]
+    for i in range(rows):
+        for j in range(columns):
+            w = nodes[i, j, W]
+            if w <= 0 or nodes[i, j, C] != 0.0 or nodes[i, j, A] != 0.0:
+                continue
+            best = np.inf
+            for p in range(max(i - radius, 0), min(i + radius + 1, rows)):
+                for q in range(max(j - radius, 0), min(j + radius + 1, columns)):
+                    misfit = planes[p, q, 3]
+                    if not misfit < limit:
+                        continue
+                    fitted = (
+                        planes[p, q, 0] * nodes[i, j, X]
+                        + planes[p, q, 1] * nodes[i, j, Y]
+                        + planes[p, q, 2]
+                    )
+                    off = abs(fitted - w) / w
+                    if off > 2 * limit:
+                        continue
+                    away = (p - i) ** 2 + (q - j) ** 2
+                    cost = misfit + off + 0.1 * limit * away
+                    if cost < best:
+                        best = cost
+                        nodes[i, j, A] = planes[p, q, 0]
+                        nodes[i, j, B] = planes[p, q, 1]
+                        nodes[i, j, C] = planes[p, q, 2]
+
+
+@kernel
+def exchange(
+    sources: Float32, start: int, stop: int, receivers: Float32, wavelength: float, out: Float32
+) -> None:
+    """Light of sources start to stop that reaches receivers, added to out (2, R).
+
+    Parameters
+    ----------
+    sources
+        (S, 9): point, unit normal, area in m^2, and real and imaginary part of its radiosity.
+    receivers
+        (6, R): point and unit normal.
+    wavelength
+        Of the modulation in m: path over which the phase goes through one turn.
+    out
+        Real and imaginary part of the irradiance, with the phase of the path up to the receiver.
+
+    Notes
+    -----
+    Form factor of a disc to a point, cos cos area / (pi d^2 + area), which stays below 1 however
+    near they are. Shadows are ignored. The inner loop runs over independent receivers, so it
+    is vectorised without reordering a sum.
+    """
+    per_turn = np.float32(1.0 / wavelength)
+    pi = np.float32(np.pi)
+    half, zero = np.float32(0.5), np.float32(0.0)
+    x, y, z = receivers[0], receivers[1], receivers[2]
+    u, v, w = receivers[3], receivers[4], receivers[5]
+    real, imaginary = out[0], out[1]
+    for s in range(start, stop):
+        sx, sy, sz = sources[s, 0], sources[s, 1], sources[s, 2]
+        su, sv, sw = sources[s, 3], sources[s, 4], sources[s, 5]
+        area = sources[s, 6]
+        a = sources[s, 7] * area
+        b = sources[s, 8] * area
+        for r in range(x.size):
+            dx = x[r] - sx
+            dy = y[r] - sy
+            dz = z[r] - sz
+            d2 = dx * dx + dy * dy + dz * dz + np.float32(1e-12)
+            leaving = su * dx + sv * dy + sw * dz
+            arriving = -(u[r] * dx + v[r] * dy + w[r] * dz)
+            leaving = leaving if leaving > zero else zero
+            arriving = arriving if arriving > zero else zero
+            factor = leaving * arriving / (d2 * (pi * d2 + area))
+            t = np.sqrt(d2) * per_turn
+            t = t - np.floor(t + half)
+            q = t * t
+            c = _C0 + q * (_C1 + q * (_C2 + q * (_C3 + q * (_C4 + q * _C5))))
+            e = t * (_S0 + q * (_S1 + q * (_S2 + q * (_S3 + q * (_S4 + q * _S5)))))
+            real[r] += factor * (a * c - b * e)
+            imaginary[r] += factor * (a * e + b * c)
+
+
+@kernel
+def spread(
+    nodes: Float64,
+    shift: Float64,
+    factor: Float64,
+    z: Float32,
+    rays: Float32,
+    step: int,
+    tolerance: float,
+    start: int,
+    stop: int,
+    z_out: Float32,
+    factor_out: Float32,
+) -> None:
+    """Carry the nodes' correction to the pixels of rows start to stop.
+
+    A pixel takes the mean of the four nodes around it, by their distance in the image and by how
+    far the pixel lies off each node's plane (relative to `tolerance`, a share of the depth): so
+    nothing leaks over edges.
+
+    Parameters
+    ----------
+    nodes, shift, factor
+        (Hn, Wn, COLUMNS); (Hn, Wn) bias of the radial range in m; factor by which light is too
+        strong. Nodes without a plane count little.
+    z_out, factor_out
+        (H, W) z less the bias along the ray, 0 stays 0; and factor.
+    """
+    rows, columns = nodes.shape[:2]
+    for i in range(start, stop):
+        fi = (i + 0.5) / step - 0.5
+        for j in range(z.shape[1]):
+            d = z[i, j]
+            z_out[i, j] = d
+            factor_out[i, j] = 1.0
+            if not d > 0:
+                continue
+            fj = (j + 0.5) / step - 0.5
+            i0 = int(np.floor(fi))
+            j0 = int(np.floor(fj))
+            x = np.float64(rays[i, j, 0])
+            y = np.float64(rays[i, j, 1])
+            v = 1.0 / np.float64(d)
+            total = move = gain = 0.0
+            for p in range(max(i0, 0), min(i0 + 2, rows)):
+                for q in range(max(j0, 0), min(j0 + 2, columns)):
+                    if nodes[p, q, W] <= 0:
+                        continue
+                    off = nodes[p, q, A] * x + nodes[p, q, B] * y + nodes[p, q, C] - v
+                    off = off / (v * tolerance)
+                    like = 1.0 / (1.0 + off * off)
+                    near = (1.0 - abs(p - fi)) * (1.0 - abs(q - fj)) + 1e-3
+                    weight = near * like * like
+                    total += weight
+                    move += weight * shift[p, q]
+                    gain += weight * factor[p, q]
+            if total > 0:
+                z_out[i, j] = d - move / total / np.sqrt(1.0 + x * x + y * y)
+                factor_out[i, j] = gain / total
+
+
+@kernel
+def bends(
+    nodes: Float64, change: Float64, radius: int, stride: int, limit: float, out: Float64
+) -> int:
+    """Compare how surfaces bend with how a change would unbend them.
+
+    In windows around every `stride`-th node a plane is fitted to the nodes on the same surface
+    (normal within 25 degrees, off the centre's plane by less than `limit` of the depth); to their
+    inverse depths as measured, and to the change.
+
+    Parameters
+    ----------
+    change
+        (Hn, Wn) what a full correction adds to the inverse depth.
+    out
+        (M, 2) is filled with the residuals of each node in each window, relative to the inverse
+        depth: of the measurement, and of the change.
+
+    Returns
+    -------
+    How many rows were filled.
+    """
+    rows, columns = nodes.shape[:2]
+    size = (2 * radius + 1) ** 2
+    pick = np.empty((size, 2), np.int64)
+    filled = 0
+    for i in range(stride // 2, rows, stride):
+        for j in range(stride // 2, columns, stride):
+            a, b, c = nodes[i, j, A], nodes[i, j, B], nodes[i, j, C]
+            length2 = a * a + b * b + c * c
+            if length2 == 0.0 or filled + size > out.shape[0]:
+                continue
+            n = 0
+            mx = my = mw = mf = 0.0
+            for p in range(max(i - radius, 0), min(i + radius + 1, rows)):
+                for q in range(max(j - radius, 0), min(j + radius + 1, columns)):
+                    e, f, g = nodes[p, q, A], nodes[p, q, B], nodes[p, q, C]
+                    other2 = e * e + f * f + g * g
+                    if other2 == 0.0:
+                        continue
+                    along = a * e + b * f + c * g
+                    if along <= 0 or along * along < 0.82 * length2 * other2:
+                        continue
+                    w = nodes[p, q, W]
+                    if abs(a * nodes[p, q, X] + b * nodes[p, q, Y] + c - w) > limit * w:
+                        continue
+                    pick[n, 0], pick[n, 1] = p, q
+                    n += 1
+                    mx += nodes[p, q, X]
+                    my += nodes[p, q, Y]
+                    mw += w
+                    mf += change[p, q]
+            if 3 * n < size:
+                continue
+            mx, my, mw, mf = mx / n, my / n, mw / n, mf / n
+            xx = xy = yy = xw = yw = xf = yf = 0.0
+            for m in range(n):
+                p, q = pick[m, 0], pick[m, 1]
+                x, y = nodes[p, q, X] - mx, nodes[p, q, Y] - my
+                w, f = nodes[p, q, W] - mw, change[p, q] - mf
+                xx += x * x
+                xy += x * y
+                yy += y * y
+                xw += x * w
+                yw += y * w
+                xf += x * f
+                yf += y * f
+            det = xx * yy - xy * xy
+            if not det > 1e-6 * xx * yy:
+                continue
+            aw, bw = (yy * xw - xy * yw) / det, (xx * yw - xy * xw) / det
+            af, bf = (yy * xf - xy * yf) / det, (xx * yf - xy * xf) / det
+            for m in range(n):
+                p, q = pick[m, 0], pick[m, 1]
+                x, y = nodes[p, q, X] - mx, nodes[p, q, Y] - my
+                out[filled, 0] = (nodes[p, q, W] - mw - aw * x - bw * y) / mw
+                out[filled, 1] = (change[p, q] - mf - af * x - bf * y) / mw
+                filled += 1
+    return filled
