@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,13 +59,19 @@ class PoseErrors:
 
 @dataclass(frozen=True, eq=False)
 class PeaksRun:
-    """One sequence at one level of noise: errors of the 20 cameras, before and after."""
+    """One sequence at one level of noise: the 20 cameras before and after, and their errors.
+
+    `poses_sequential`, `poses_optimised` and `truth` are (20, 4, 4) T_world_camera.
+    """
 
     sigma: float
     seed: int
     sequential: PoseErrors
     optimised: PoseErrors
     objective: tuple[float, ...]
+    poses_sequential: Float64
+    poses_optimised: Float64
+    truth: Float64
 
 
 def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> PeaksRun:
@@ -89,6 +95,9 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
         PoseErrors.of(graph.poses, truth),
         PoseErrors.of(optimisation.graph.poses, truth),
         optimisation.objective,
+        graph.poses,
+        optimisation.graph.poses,
+        truth,
     )
 
 
@@ -106,6 +115,8 @@ class PeaksSweep:
         (S, 2) mean angle, rad.
     axes
         (S, 2, 6) mean absolute error for each of `AXES`, m and rad: the panels of figure 5.12.
+    axes_spread
+        (S, 2, 6) standard deviation over the seeds of what `axes` is the mean of.
     runs
         Every run.
     """
@@ -114,28 +125,40 @@ class PeaksSweep:
     position: Float64
     rotation: Float64
     axes: Float64
+    axes_spread: Float64
     runs: tuple[PeaksRun, ...]
 
 
-def sweep_peaks(seeds: Sequence[int], sigmas: Sequence[float] = SIGMAS_M) -> PeaksSweep:
-    """Run every sigma with every seed, and take means."""
-    runs = [[run_peaks(sigma, seed) for seed in seeds] for sigma in sigmas]
-
-    def mean(name: str) -> Float64:
-        return np.array(
-            [
-                [
-                    np.mean([np.abs(getattr(getattr(run, which), name)) for run in row], (0, 1))
-                    for which in ("sequential", "optimised")
-                ]
-                for row in runs
-            ]
-        )
-
+def sweep_peaks(
+    seeds: Sequence[int],
+    sigmas: Sequence[float] = SIGMAS_M,
+    told: Callable[[], None] = lambda: None,
+) -> PeaksSweep:
+    """Run every sigma with every seed, and take means; calls `told` after every run."""
+    runs = []
+    for sigma in sigmas:
+        for seed in seeds:
+            runs.append(run_peaks(sigma, seed))
+            told()
+    position, rotation, axes = (
+        _by_seed(runs, len(sigmas), name) for name in ("position", "rotation", "axes")
+    )
     return PeaksSweep(
         np.array(sigmas, float),
-        mean("position"),
-        mean("rotation"),
-        mean("axes"),
-        tuple(run for row in runs for run in row),
+        position.mean(1),
+        rotation.mean(1),
+        axes.mean(1),
+        axes.std(1),
+        tuple(runs),
     )
+
+
+def _by_seed(runs: Sequence[PeaksRun], sigmas: int, name: str) -> Float64:
+    """Mean absolute error over the cameras, (sigmas, seeds, 2, ...)."""
+    means = np.array(
+        [
+            [np.abs(getattr(errors, name)).mean(0) for errors in (run.sequential, run.optimised)]
+            for run in runs
+        ]
+    )
+    return means.reshape(sigmas, -1, *means.shape[1:])

@@ -1,0 +1,233 @@
+"""What is measured on trajectories and on models: sizes, angles, girth, distances from the truth.
+
+Models are points in the frame of the true surface, which has z up; see `Recorded.T_truth_world`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.evaluation.trajectory import evaluate_trajectory
+from tofuse.geometry import se3
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class PathScore:
+    """How far a trajectory is from the truth; lost frames do not count.
+
+    Attributes
+    ----------
+    ate_m, rotation_deg
+        Root mean square errors of positions and orientations after alignment.
+    end_m, end_deg
+        Error of the last pose in the frame of the first camera, which nothing aligns.
+    drift
+        (N, 3) error of the position along x, y, z of the first camera, m, which nothing aligns:
+        the cumulative error of figures 5.2 and 5.6. NaN where lost.
+    step_m, step_deg
+        (N,) error of the motion since the frame before; NaN for the first and where lost.
+    """
+
+    ate_m: float
+    rotation_deg: float
+    end_m: float
+    end_deg: float
+    drift: Float64
+    step_m: Float64
+    step_deg: Float64
+
+    @property
+    def axes_rms_m(self) -> Float64:
+        """(3,) root mean square of the drift along each axis, m."""
+        return np.sqrt(np.nanmean(self.drift**2, axis=0))
+
+
+def score_path(poses: Float64, truth: Float64) -> PathScore:
+    """Compare poses (N, 4, 4), NaN where lost, with true ones; both begin with the identity."""
+    times = np.arange(len(poses), dtype=float)
+    error = evaluate_trajectory(times, poses, times, truth)
+    last = int(np.flatnonzero(np.isfinite(poses[:, 0, 0]))[-1])
+    end = se3.inverse(truth[last]) @ poses[last]
+    step_m, step_deg = np.full((2, len(poses)), np.nan)
+    if len(poses) > 1:
+        wrong = se3.inverse(motions(truth)) @ motions(poses)
+        step_m[1:] = np.linalg.norm(wrong[:, :3, 3], axis=1)
+        known = np.flatnonzero(np.isfinite(wrong[:, 0, 0]))
+        step_deg[1 + known] = np.degrees(se3.angle(wrong[known]))
+    return PathScore(
+        error.ate_rms_m,
+        float(np.degrees(error.rotation_rms_rad)),
+        float(np.linalg.norm(end[:3, 3])),
+        float(np.degrees(se3.angle(end))),
+        poses[:, :3, 3] - truth[:, :3, 3],
+        step_m,
+        step_deg,
+    )
+
+
+def motions(poses: Float64) -> Float64:
+    """(N - 1, 4, 4) motions between neighbours of poses (N, 4, 4); NaN next to a lost one."""
+    return se3.inverse(poses[:-1]) @ poses[1:]
+
+
+def turned_deg(poses: Float64, axis: Float64) -> Float64:
+    """(N,) angle in degrees turned since the first pose about an axis (3,) of the camera.
+
+    Whole turns are counted; a lost frame counts as not turned.
+    """
+    steps = motions(poses)
+    known = np.isfinite(steps[:, 0, 0])
+    angle = np.zeros(len(poses))
+    angle[1:][known] = se3.so3_log(steps[known, :3, :3]) @ axis
+    return np.degrees(np.cumsum(angle))
+
+
+def straightness_m(positions: Float64) -> float:
+    """Root mean square distance of positions (N, 3) from the straight line that fits them best."""
+    known = positions[np.isfinite(positions[:, 0])]
+    centred = known - known.mean(0)
+    across = np.linalg.svd(centred, compute_uv=False)[1:]
+    return float(np.sqrt((across**2).sum() / len(known)))
+
+
+def circle_radius_m(positions: Float64) -> float:
+    """Radius of the circle that fits positions (N, 3) best, in the plane that does (Kasa 1976)."""
+    known = positions[np.isfinite(positions[:, 0])]
+    centred = known - known.mean(0)
+    flat = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
+    A = np.column_stack([2 * flat, np.ones(len(flat))])
+    (a, b, c), *_ = np.linalg.lstsq(A, (flat**2).sum(1), rcond=None)
+    return float(np.sqrt(c + a * a + b * b))
+
+
+def extent_m(points: Float64, outer: float = 1.0) -> Float64:
+    """(3,) size of a model along its axes, without `outer` percent of the points at each end."""
+    low, high = np.percentile(points, [outer, 100 - outer], axis=0)
+    return high - low
+
+
+def surface_error_m(points: Float64, surface: Float64, most: int = 20_000) -> float:
+    """Median distance of a model's points from points (K, 3) on the true surface, m."""
+    from scipy.spatial import cKDTree
+
+    some = points[:: max(1, len(points) // most)]
+    return float(np.median(cKDTree(surface).query(some)[0]))
+
+
+def girth_m(points: Float64, low: float, high: float, sectors: int = 36) -> float:
+    """Length around a body between two heights, m; NaN if a sector is empty.
+
+    The median distance from the middle is taken in each sector, so that double walls of a poor
+    model count with their mean place.
+    """
+    flat = points[(points[:, 2] >= low) & (points[:, 2] <= high), :2]
+    if len(flat) == 0:
+        return float("nan")
+    # The middle of the outline, not of the points, which may be denser on one side.
+    low_xy, high_xy = np.percentile(flat, [2, 98], axis=0)
+    arm = flat - (low_xy + high_xy) / 2
+    sector = ((np.arctan2(arm[:, 1], arm[:, 0]) / (2 * np.pi) % 1) * sectors).astype(int) % sectors
+    radius = np.linalg.norm(arm, axis=1)
+    median = np.array(
+        [np.median(radius[sector == k]) if (sector == k).any() else np.nan for k in range(sectors)]
+    )
+    angle = 2 * np.pi * (np.arange(sectors) + 0.5) / sectors
+    outline = median[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return float(np.linalg.norm(outline - np.roll(outline, -1, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class BoxFit:
+    """Four upright walls and a top fitted to a model of a box.
+
+    Attributes
+    ----------
+    corners
+        (4, 2) plan of the walls' corners, m.
+    widths_m
+        (2,) distances between opposite walls.
+    angles_deg
+        (4,) angles between neighbouring walls, inside the box.
+    height_m
+        From the lower rim of the walls to the top face.
+    """
+
+    corners: Float64
+    widths_m: Float64
+    angles_deg: Float64
+    height_m: float
+
+
+def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxFit:
+    """Fit the walls and the top of a box that stands roughly where it should.
+
+    Parameters
+    ----------
+    points
+        (N, 3) model.
+    bottom, height, width
+        True heights above the floor and about the true width, m: where to look.
+    """
+    z = points[:, 2]
+    sides = points[(z > bottom + 0.15 * height) & (z < bottom + 0.85 * height), :2]
+    # The middle of the outline: the side that is seen best must not draw it to itself.
+    middle = (np.percentile(sides, 3, axis=0) + np.percentile(sides, 97, axis=0)) / 2
+    fits = [_walls(sides, middle, turn, width) for turn in np.radians(np.arange(-45, 45, 7.5))]
+    normals, offsets, _ = min(fits, key=lambda fit: fit[2])
+    following = np.roll(np.arange(4), -1)
+    pairs = np.stack([np.arange(4), following], 1)
+    corners = np.linalg.solve(normals[pairs], offsets[pairs][..., None])[..., 0].astype(np.float64)
+    centre = corners.mean(0)
+    reach = offsets - normals @ centre
+    cosines = (normals * normals[following]).sum(1)
+    inside = 180 - np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    near = np.abs(points[:, :2] - centre).max(1)
+    top = z[(near < 0.35 * width) & (z > bottom + 0.8 * height)]
+    walls = z[(near > 0.4 * width) & (near < 0.75 * width) & (z > bottom - 0.1)]
+    rise = float(np.median(top) - np.percentile(walls, 0.5)) if len(top) and len(walls) else np.nan
+    return BoxFit(corners, reach[:2] + reach[2:], inside, rise)
+
+
+def _walls(
+    flat: Float64, middle: Float64, turn: float, width: float
+) -> tuple[Float64, Float64, float]:
+    """Fit four lines, n . p = d, from a square turned by an angle; returns n, d, and the misfit.
+
+    Points belong to the nearest line; those further off than a fifth of the width count as that
+    far, so that a model with double walls keeps four lines.
+    """
+    angle = turn + np.pi / 2 * np.arange(4)
+    normals = np.stack([np.cos(angle), np.sin(angle)], 1)
+    offsets = normals @ middle + width / 2
+    reach = width / 5
+    for _ in range(15):
+        distance = np.abs(flat @ normals.T - offsets)
+        nearest = distance.argmin(1)
+        good = distance.min(1) < reach
+        for k in range(4):
+            own = flat[good & (nearest == k)]
+            if len(own) < 10:
+                continue
+            mean = own.mean(0)
+            n = np.linalg.svd(own - mean, full_matrices=False)[2][1]
+            n *= np.sign(n @ (mean - middle)) or 1.0
+            # A wall of the box, not one that runs across it.
+            if n @ normals[k] > 0.8:
+                normals[k], offsets[k] = n, n @ mean
+    misfit = np.minimum(np.abs(flat @ normals.T - offsets).min(1), reach)
+    return normals, offsets, float(np.mean(misfit**2))
+
+
+def displacement_m(a: Float64, b: Float64, ahead: float = 2.0) -> Float64:
+    """(N,) distance between where two poses (N, 4, 4) put a point `ahead` m in front of a camera.
+
+    Position and orientation in one length: how far the model moves. NaN where a pose is.
+    """
+    point = np.array([0.0, 0.0, ahead, 1.0])
+    return np.linalg.norm(((a - b) @ point)[:, :3], axis=1)
