@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,10 +59,11 @@ def test_noise_of_one_albedo_grows_with_the_squared_range(kind: str) -> None:
     np.testing.assert_allclose(DARK.sigma(seen)[0] / ranges**2, 2.0 / 500.0, rtol=1e-5)
 
 
-def test_compensated_amplitude_lost_its_falloff() -> None:
-    model = replace(DARK, amplitude=AmplitudeLaw(0.0, 2.0, falloff=4.0))
+@pytest.mark.parametrize("power", [0.0, 3.0, 4.0])
+def test_compensated_amplitude_lost_its_falloff(power: float) -> None:
+    model = replace(DARK, amplitude=AmplitudeLaw(0.0, 2.0, falloff=power))
     seen = frame(amplitude_image=image(500.0), amplitude_kind="range_compensated")
-    expected = 2.0 * 4.0 / 500.0 * ray_lengths(CAMERA) ** 4
+    expected = 2.0 * 4.0 / 500.0 * ray_lengths(CAMERA) ** power
     np.testing.assert_allclose(model.sigma(seen), expected, rtol=1e-5)
     raw = frame(amplitude_image=image(500.0))
     np.testing.assert_allclose(model.sigma(raw), 2.0 / 500.0, rtol=1e-5)
@@ -240,3 +242,9 @@ def test_families_by_name() -> None:
     assert noise_model("kinect2").name == "kinect2"
     with pytest.raises(InputError, match="no camera called 'leica'"):
         noise_model("leica")
+
+
+def test_the_documented_file_is_one() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "noise.md").read_text()
+    (block,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    assert NoiseModel.from_dict(json.loads(block)).name == "mine"

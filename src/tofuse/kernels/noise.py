@@ -66,29 +66,32 @@ def range_sigma(
             if not (measured > 0 and x == x and y == y):
                 continue
             length2 = 1 + x * x + y * y
-            length = math.sqrt(length2)
-            distance = measured if is_range else measured * length
+            distance2 = measured * measured if is_range else measured * measured * length2
             if law == BY_AMPLITUDE:
                 light = float(channel[i, j])
                 if not light < SATURATED:
                     light = 0.0
                 elif compensated:
-                    light /= distance * distance
-                    if falloff > 0:
+                    light /= distance2
+                    if falloff == 4:
+                        light /= length2 * length2
+                    elif falloff > 0:
                         light *= length2 ** (-0.5 * falloff)
                 if light > 0:
-                    variance = floor * floor + (shot * shot + dark * dark / light) / light
+                    dimness = 1 / light
+                    variance = floor * floor + (shot * shot + dark * dark * dimness) * dimness
                 else:
                     variance = ceiling * ceiling
             elif law == BY_CONFIDENCE:
                 level = min(max(int(channel[i, j]), 0), len(levels) - 1)
-                sigma = levels[level] * distance**power
-                variance = sigma * sigma
+                variance = levels[level] ** 2
+                if power > 0:
+                    variance *= distance2**power
             elif law == BY_CAMERA:
                 own = float(channel[i, j])
                 variance = own * own if own > 0 else ceiling * ceiling
             else:
-                sigma = a + b * distance * distance
+                sigma = a + b * distance2
                 variance = sigma * sigma
             variance = min(variance, ceiling * ceiling)
             if slanted and cosine[i, j] == cosine[i, j]:
@@ -96,6 +99,6 @@ def range_sigma(
                 step = math.hypot(rays[i, other, 0] - x, rays[i, other, 1] - y)
                 if step == step:
                     c = min(max(abs(float(cosine[i, j])), 0.1), 1.0)
-                    change = footprint * step * (distance / length) * math.sqrt(1 - c * c) / c
+                    change = footprint * step * math.sqrt(distance2 / length2 * (1 - c * c)) / c
                     variance += change * change
             out[i, j] = math.sqrt(variance)
