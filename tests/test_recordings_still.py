@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tofuse.cli import main
 from tofuse.errors import UnreadableFrameError
 from tofuse.geometry.cameras import Pinhole
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
+from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -232,8 +235,24 @@ def test_long_stretches_cost_bounded_memory() -> None:
 
 
 def test_simulated_turn_is_not_still() -> None:
-    frames = simulate_recording("room", every=3, frames=4)
-    assert len(still_stretches(frames)) == 4
+    frames = simulate_recording("corridor", every=20, frames=2)
+    assert len(still_stretches(frames)) == 2
+
+
+def test_run_averages_when_asked(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "rec", CAMERA, depth_unit_m=0.0001)
+    for k, shift in enumerate([0, 0, 0, 0.03, 0.03, 0.03]):
+        writer.add(shot(k, scene(shift), 0.003))
+    writer.finish()
+    options = ["run", str(tmp_path / "rec"), "--method", "thesis", "--threads", "1"]
+    main([*options, "--out", str(tmp_path / "plain")])
+    main([*options, "--out", str(tmp_path / "averaged"), "--average-still"])
+    plain, averaged = (
+        json.loads((tmp_path / name / "run.json").read_text()) for name in ("plain", "averaged")
+    )
+    assert len(plain["frames"]) == 6
+    assert [f["timestamp"] for f in averaged["frames"]] == [0.1, 0.4]
+    assert all(f["status"] == "tracked" for f in averaged["frames"])
 
 
 def test_sr4000_corridor(shared_data: Path) -> None:
