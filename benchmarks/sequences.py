@@ -1,0 +1,189 @@
+"""The sequences that the benchmarks run on: recorded ones if they are there, and simulated ones.
+
+Recorded sequences are looked for in a folder of data that is not part of the project. Simulated
+ones are made once, with every error of the camera and its factory correction, and kept.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.evaluation.consistency import poses_of_frames
+from tofuse.files.images import read_image
+from tofuse.files.trajectory import read_tum
+from tofuse.filters.base import apply_filters
+from tofuse.filters.foreground import Foreground
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole, scaled
+from tofuse.pipeline.methods import default
+from tofuse.pipeline.run import fitted
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.simulation.record import simulate
+
+Float64 = NDArray[np.float64]
+
+HERE = Path(__file__).resolve().parent
+OUT = HERE / "out"
+DATA = HERE.parents[1] / "shared" / "data"
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Frames as every method gets them, and what to compare with.
+
+    Attributes
+    ----------
+    title
+        What it is, with the camera.
+    frames
+        Decoded and filtered as the default method filters them.
+    checked
+        The recording that map consistency looks at: unfiltered, but for an object, which is
+        cut out.
+    reference
+        (N, 4, 4) T_world_camera.
+    exact
+        Whether the reference is the truth.
+    """
+
+    title: str
+    frames: tuple[RangeFrame, ...]
+    checked: Recording
+    reference: Float64
+    exact: bool
+
+
+@dataclass(frozen=True)
+class _Kind:
+    title: str
+    open: Callable[[Path], Recording]
+    exact: bool
+    object: bool = False
+
+
+def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = False) -> Sequence:
+    """Read a sequence into memory; FileNotFoundError where its data is not there."""
+    kind = KINDS[name]
+    if fresh:
+        shutil.rmtree(OUT / "recordings" / name, ignore_errors=True)
+    recording = kind.open(data).select(end=frames)
+    config = fitted(default("range"), recording)
+    chosen = (Foreground(), *config.filters) if kind.object else config.filters
+    past: deque[Frame] = deque(maxlen=config.window - 1)
+    filtered, bare = [], []
+    for frame in recording:
+        assert isinstance(frame, RangeFrame)
+        filtered.append(apply_filters(chosen, frame, past)[0])
+        past.append(frame)
+        bare.append(apply_filters((Foreground(),), frame)[0] if kind.object else frame)
+    reference = recording.reference
+    assert reference is not None
+    source = ArraySource(bare, reference, metadata=recording.metadata)
+    return Sequence(
+        f"{kind.title}, {len(filtered)} frames",
+        tuple(replace(frame) for frame in filtered),
+        Recording.of(source, name, "benchmark"),
+        reference,
+        kind.exact,
+    )
+
+
+def _recorded(*parts: str) -> Callable[[Path], Recording]:
+    def opened(data: Path) -> Recording:
+        path = data.joinpath(*parts)
+        if not path.is_dir():
+            raise FileNotFoundError(path)
+        return open_recording(path)
+
+    return opened
+
+
+def _kinect_loop(data: Path) -> Recording:
+    """Stop-and-go views; beside them are the poses of the robot that carried the camera."""
+    recording = _recorded("kinectv2_loop", "recording")(data)
+    times, poses = read_tum(Path(recording.path) / "reference_poses.txt")
+    recording.source.reference = poses_of_frames(recording.timestamps, times, poses)
+    return recording
+
+
+def _scanner_app(data: Path) -> Recording:
+    """3d Scanner App, "all data": depth, confidence and a JSON file with a pose for each frame."""
+    folder = data / "iphone_chair_3dscannerapp"
+    if not folder.is_dir():
+        raise FileNotFoundError(folder)
+    frames, poses = [], []
+    for index, file in enumerate(sorted(folder.glob("frame_*.json"))):
+        facts = json.loads(file.read_text())
+        number = file.stem.removeprefix("frame_")
+        depth = read_image(folder / f"depth_{number}.png").astype(np.float32) / 1000
+        fx, _, cx, _, fy, cy = facts["intrinsics"][:6]
+        camera = scaled(Pinhole(1920, 1440, fx, fy, cx, cy), depth.shape[1], depth.shape[0])
+        confidence = read_image(folder / f"conf_{number}.png")
+        frames.append(RangeFrame(index, facts["time"], camera, depth, confidence_image=confidence))
+        # ARKit looks along -z with y up.
+        T = np.array(facts["cameraPoseARFrame"]).reshape(4, 4) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        poses.append(se3.orthonormalise(T))
+    metadata = {"depth_unit_m": 0.001, "confidence_max": 2}
+    return Recording.of(
+        ArraySource(frames, np.stack(poses), metadata=metadata), folder, "3d Scanner App"
+    )
+
+
+def _simulated(name: str, scene: str, *, texture: bool = True) -> Callable[[Path], Recording]:
+    def opened(_data: Path) -> Recording:
+        path = OUT / "recordings" / name
+        if not path.is_dir():
+            unfinished = path.with_suffix(".part")
+            shutil.rmtree(unfinished, ignore_errors=True)
+            simulate(scene, unfinished, texture=texture)
+            os.replace(unfinished, path)
+        return open_recording(path)
+
+    return opened
+
+
+_SR4000 = "simulated SR4000, 176 x 144"
+
+KINDS = {
+    "kitchen": _Kind(
+        "7-Scenes kitchen, Kinect v1, 640 x 480", _recorded("sevenscenes_kitchen"), False
+    ),
+    "iphone": _Kind("Chair, iPhone LiDAR, 256 x 192", _scanner_app, False),
+    "kinect": _Kind("Loop round boxes, Kinect v2, 512 x 424", _kinect_loop, False),
+    "room": _Kind(f"Furnished room, {_SR4000}", _simulated("room", "room"), True),
+    "empty-room": _Kind(
+        f"Empty room, textured, {_SR4000}", _simulated("empty-room", "empty-room"), True
+    ),
+    "empty-room-uniform": _Kind(
+        f"Empty room, uniform albedo, {_SR4000}",
+        _simulated("empty-room-uniform", "empty-room", texture=False),
+        True,
+    ),
+    "rail": _Kind(f"Rail, {_SR4000}", _simulated("rail", "rail"), True),
+    "torso": _Kind(f"Torso, turned, {_SR4000}", _simulated("torso", "torso"), True, object=True),
+    "box": _Kind(f"Box, turned, {_SR4000}", _simulated("box", "box"), True, object=True),
+}
+
+
+def names() -> list[str]:
+    """Return the names of the sequences."""
+    return list(KINDS)
+
+
+def check(name: str) -> str:
+    """Return the name if there is such a sequence; InputError if not."""
+    if name not in KINDS:
+        raise InputError(f"is {name!r}", where="--sequences", remedy=f"use some of {names()}")
+    return name

@@ -1,0 +1,363 @@
+"""tofuse's tracker beside its peers on the same frames: speed, accuracy, map consistency.
+
+Every method gets the same frames, decoded and filtered beforehand. What a method does from there
+to a pose is timed, and only that: bringing the frame into the type that the method takes is not.
+Each row is warm: a pass over the first frames went before, and the first frame is not counted.
+Peers with a choice of tunings run the first frames with each, and go on with the one of the least
+ATE; tofuse has one tuning for all sequences. Rows of one run can be compared with each other, not
+with those of another machine. A peer that is not installed is named as such: `pip install
+tofuse[bench]`.
+
+    python benchmarks/tracking.py [--sequences kitchen room] [--methods tofuse KISS] [--frames 50]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator, Sequence as Items
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import peers
+import sequences
+
+from tofuse.errors import InputError
+from tofuse.evaluation.consistency import map_consistency
+from tofuse.evaluation.trajectory import evaluate_trajectory
+from tofuse.files.atomic import write_text
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads as using_threads
+from tofuse.odometry.keyframes import Keyframes
+from tofuse.recordings.frames import RangeFrame
+
+Float64 = NDArray[np.float64]
+
+WARM_UP = 5
+TUNING_FRAMES = 100
+CONSISTENCY_FRAMES = 60
+
+
+@dataclass(frozen=True)
+class Tofuse:
+    """The default tracker."""
+
+    label: str = "tofuse"
+    photometric: bool = True
+
+    @property
+    def tuning(self) -> str:
+        return "defaults" if self.photometric else "defaults, without the photometric term"
+
+    def resolution(self, frame: RangeFrame) -> str:
+        columns = frame.camera.width
+        while columns > Keyframes().surface.columns:
+            columns //= 2
+        return f"{columns} columns of {peers.grid(frame)}"
+
+    def start(self, frame: RangeFrame, threads: int) -> TofuseSession:
+        return TofuseSession(self.photometric)
+
+
+class TofuseSession:
+    def __init__(self, photometric: bool) -> None:
+        options = Keyframes()
+        alignment = replace(options.alignment, photometric=photometric)
+        self._tracker = replace(options, alignment=alignment).start(0)
+        self.statuses: list[str] = []
+        self.unheld: list[int] = []
+        self.reasons: list[str] = []
+
+    def prepare(self, frame: RangeFrame) -> RangeFrame:
+        # A new frame: nothing that another method derived from it is kept.
+        return replace(frame)
+
+    def push(self, prepared: RangeFrame) -> Float64 | None:
+        step = self._tracker.push(prepared)
+        self.statuses.append(step.status)
+        self.reasons.append(step.reason)
+        self.unheld.append(len(step.registration.unobservable) if step.registration else 0)
+        return step.T_world_camera
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a method made of a sequence: poses (N, 4, 4), NaN where lost, and seconds (N,)."""
+
+    poses: Float64
+    seconds: Float64
+    details: dict[str, Any]
+
+
+def run(method: peers.Method, frames: Items[RangeFrame], threads: int) -> Run:
+    """Run a method over frames."""
+    session = method.start(frames[0], threads)
+    poses = np.full((len(frames), 4, 4), np.nan)
+    seconds = np.empty(len(frames))
+    with using_threads(threads):
+        for k, frame in enumerate(frames):
+            prepared = session.prepare(frame)
+            start = time.perf_counter()
+            T = session.push(prepared)
+            seconds[k] = time.perf_counter() - start
+            if T is not None:
+                poses[k] = T
+    details = {}
+    if isinstance(session, TofuseSession):
+        details = {
+            "statuses": session.statuses,
+            "unheld": session.unheld,
+            "reasons": session.reasons,
+        }
+    return Run(poses, seconds, details)
+
+
+def best(
+    candidates: Items[peers.Method], sequence: sequences.Sequence, threads: int
+) -> tuple[peers.Method, str]:
+    """Return the tuning with the least ATE over the first frames, and how it was chosen."""
+    if len(candidates) == 1:
+        return candidates[0], ""
+    first = sequence.frames[:TUNING_FRAMES]
+    reference = sequence.reference[: len(first)]
+    errors = [ate(run(c, first, threads).poses, reference) for c in candidates]
+    chosen = candidates[int(np.nanargmin(errors))]
+    return chosen, f"best of {len(candidates)} on {len(first)} frames"
+
+
+def ate(poses: Float64, reference: Float64) -> float:
+    times = np.arange(len(poses), dtype=float)
+    if np.isfinite(poses).all((1, 2)).sum() < 2:
+        return np.inf
+    return evaluate_trajectory(times, poses, times, reference).ate_rms_m
+
+
+def row(
+    method: peers.Method, chosen_how: str, sequence: sequences.Sequence, result: Run, threads: int
+) -> dict[str, Any]:
+    """Return every figure of one method on one sequence: m, degrees, ms."""
+    ms = 1e3 * result.seconds[1:]
+    return {
+        "method": method.label,
+        "resolution": method.resolution(sequence.frames[0]),
+        "tuning": f"{method.tuning}{'; ' if chosen_how else ''}{chosen_how}",
+        "threads": threads,
+        "ms_median": float(np.median(ms)) if len(ms) else None,
+        "ms_p95": float(np.percentile(ms, 95)) if len(ms) else None,
+        **accuracy(sequence, result.poses),
+        **result.details,
+    }
+
+
+def accuracy(sequence: sequences.Sequence, poses: Float64) -> dict[str, Any]:
+    """Return how far poses are from the reference, and how well the images agree under them."""
+    times = np.arange(len(poses), dtype=float)
+    error = evaluate_trajectory(times, poses, times, sequence.reference, times)
+    agreement = map_consistency(sequence.checked, poses, CONSISTENCY_FRAMES)
+    # From the first frame on, with no alignment: where one comes out after a turn.
+    true = se3.inverse(sequence.reference[0]) @ sequence.reference
+    has = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+    off = se3.inverse(true[has]) @ se3.inverse(poses[has[0]]) @ poses[has]
+    metres, degrees = np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(se3.angle(off))
+    per_frame = np.full((len(poses), 2), np.nan)
+    per_frame[has] = np.stack([metres, degrees], 1)
+    short, long = error.relative
+    return {
+        "ate_m": error.ate_rms_m,
+        "rotation_deg": float(np.degrees(error.rotation_rms_rad)),
+        "rpe1_m": short.translation_rms_m,
+        "rpe1_deg": float(np.degrees(short.rotation_rms_rad)),
+        "rpe30_m": long.translation_rms_m,
+        "rpe30_deg": float(np.degrees(long.rotation_rms_rad)),
+        "end_m": float(metres[-1]),
+        "end_deg": float(degrees[-1]),
+        "mean_m": float(metres.mean()),
+        "mean_deg": float(degrees.mean()),
+        "coverage": error.coverage,
+        "map_rms_m": agreement.rms_m,
+        "map_inliers": agreement.inlier_share,
+        "per_frame": per_frame.tolist(),
+    }
+
+
+def compare(
+    sequence: sequences.Sequence, wanted: Items[str], threads: int
+) -> Iterator[dict[str, Any]]:
+    """Run the methods on a sequence, one after the other, and give their rows."""
+    frames = sequence.frames
+    ours: list[list[peers.Method]] = [[Tofuse()]]
+    if frames[0].amplitude_image is not None:
+        ours.append([Tofuse("tofuse, geometry only", photometric=False)])
+    for candidates in [*ours, *peers.all_methods(frames[0])]:
+        label = candidates[0].label
+        if wanted and not any(label.lower().startswith(w.lower()) for w in wanted):
+            continue
+        try:
+            run(candidates[0], frames[:WARM_UP], threads)
+            chosen, how = best(candidates, sequence, threads)
+            result = run(chosen, frames, threads)
+        except ImportError as error:
+            yield {"method": label, "problem": f"not installed ({error})"}
+            continue
+        except RuntimeError as error:
+            yield {"method": label, "problem": f"failed: {str(error).strip().splitlines()[-1]}"}
+            continue
+        yield row(chosen, how, sequence, result, threads)
+    yield {"method": "reference poses", **accuracy(sequence, sequence.reference)}
+
+
+_COLUMNS = {
+    "method": "method",
+    "resolution": "resolution",
+    "ms": "ms a frame: median (95 %)",
+    "ratio": "of tofuse",
+    "ate": "ATE m",
+    "rotation": "rotation deg",
+    "rpe1": "RPE 1: m, deg",
+    "rpe30": "RPE 30: m, deg",
+    "end": "at the end: m, deg",
+    "mean": "mean: m, deg",
+    "coverage": "coverage",
+    "map": "map mm, inliers",
+    "tuning": "tuning",
+}
+
+
+def cells(r: dict[str, Any], ours_ms: float | None) -> list[str]:
+    """Return a row of the table."""
+    if "problem" in r:
+        return [r["method"], r["problem"], *[""] * (len(_COLUMNS) - 2)]
+    ms = r.get("ms_median")
+    pairs = {
+        key: f"{r[f'{key}_m']:.3f}, {r[f'{key}_deg']:.2f}"
+        for key in ("rpe1", "rpe30", "end", "mean")
+    }
+    texts = {
+        "method": r["method"],
+        "resolution": r.get("resolution", ""),
+        "ms": "" if ms is None else f"{ms:.1f} ({r['ms_p95']:.1f})",
+        "ratio": f"x {ms / ours_ms:.1f}" if ms is not None and ours_ms else "",
+        "ate": f"{r['ate_m']:.4f}",
+        "rotation": f"{r['rotation_deg']:.2f}",
+        **pairs,
+        "coverage": f"{r['coverage']:.0%}",
+        "map": f"{1e3 * r['map_rms_m']:.1f}, {100 * r['map_inliers']:.1f} %",
+        "tuning": r.get("tuning", ""),
+    }
+    return [texts[key].replace("nan, nan", "-") for key in _COLUMNS]
+
+
+def table(rows: Items[dict[str, Any]]) -> str:
+    """Return rows as a Markdown table with aligned columns."""
+    ours = next((r.get("ms_median") for r in rows if r["method"] == "tofuse"), None)
+    lines = [list(_COLUMNS.values()), *[cells(r, ours) for r in rows]]
+    # A long last column need not be padded.
+    widths = [*[max(len(line[k]) for line in lines) for k in range(len(_COLUMNS) - 1)], 6]
+    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths)) + " |" for line in lines]
+    text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    return "\n".join(text)
+
+
+def figure(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
+    """Draw the time a frame against the ATE, a panel for each sequence."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    columns = min(3, len(found))
+    lines = -(-len(found) // columns)
+    fig, axes = plt.subplots(lines, columns, figsize=(5 * columns, 4 * lines), squeeze=False)
+    for axis in axes.flat[len(found) :]:
+        axis.set_axis_off()
+    labels = sorted({r["method"] for rows in found.values() for r in rows if "ms_median" in r})
+    for axis, (title, rows) in zip(axes.flat, found.items(), strict=False):
+        for r in rows:
+            if r.get("ms_median") is None:
+                continue
+            k = labels.index(r["method"])
+            marker = "*" if r["method"].startswith("tofuse") else "o^svDPX"[k % 7]
+            axis.plot(
+                r["ms_median"], r["ate_m"], marker, color=f"C{k % 10}", label=r["method"], ms=9
+            )
+        axis.set(xscale="log", yscale="log", title=title, xlabel="ms a frame", ylabel="ATE, m")
+        axis.title.set_fontsize(8)
+        axis.grid(which="both", alpha=0.3)
+        axis.legend(fontsize=6)
+    fig.tight_layout()
+    fig.savefig(path, dpi=110)
+    plt.close(fig)
+
+
+def machine(threads: int) -> str:
+    """Say what it ran on."""
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    return (
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
+        f"{threads} threads{load}"
+    )
+
+
+def limit_threads(count: int) -> None:
+    """Hold every method to so many threads, and to so many cores where that can be asked for."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(count)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+def main(arguments: Items[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sequences", nargs="+", default=sequences.names(), metavar="NAME")
+    parser.add_argument("--methods", nargs="+", default=[], help="beginnings of their names")
+    parser.add_argument("--frames", type=int, help="use only the first so many")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--data", type=Path, default=sequences.DATA, help="recorded sequences")
+    parser.add_argument("--out", type=Path, default=sequences.OUT)
+    parser.add_argument("--fresh", action="store_true", help="simulate again")
+    options = parser.parse_args(arguments)
+    try:
+        chosen = [sequences.check(name) for name in options.sequences]
+    except InputError as error:
+        parser.error(str(error))
+    limit_threads(options.threads)
+
+    about = machine(options.threads)
+    print(about, flush=True)
+    found: dict[str, list[dict[str, Any]]] = {}
+    text = [f"{about}; warm, images decoded and filtered beforehand"]
+    for name in chosen:
+        try:
+            sequence = sequences.load(name, options.data, options.frames, fresh=options.fresh)
+        except FileNotFoundError as error:
+            print(f"\n{name}: left out, there is no {error}", flush=True)
+            continue
+        rows = []
+        for r in compare(sequence, options.methods, options.threads):
+            rows.append(r)
+            if "problem" in r:
+                print(f"  {r['method']}: {r['problem']}", flush=True)
+        found[sequence.title] = rows
+        against = "the truth" if sequence.exact else "reference poses that are not exact"
+        text.append(f"### {sequence.title}\n\nAgainst {against}.\n\n{table(rows)}")
+        print(f"\n{text[-1]}", flush=True)
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_text(options.out / "tracking.md", "\n\n".join(text) + "\n")
+    write_text(options.out / "tracking.json", json.dumps({"machine": about, "sequences": found}))
+    if found:
+        figure(found, options.out / "tracking.png")
+        print(f"\nwritten: {options.out / 'tracking'}.md, .json, .png")
+
+
+if __name__ == "__main__":
+    main()
