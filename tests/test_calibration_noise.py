@@ -105,6 +105,26 @@ def test_depth_alone_gives_the_law_over_range() -> None:
     assert fit.model.range.b == pytest.approx(0.003, rel=0.1)
 
 
+def test_depth_in_coarse_units() -> None:
+    frames = [
+        replace(f, depth=np.round(f.depth, 3)) for f in plain_frames(np.full((60, 80), 0.0004), 20)
+    ]
+    model = estimate_noise(recording_of(frames)).model
+    # Rounding to 1 mm adds 0.29 mm, in squares.
+    assert model.range.a + model.range.b * 4 == pytest.approx(0.00049, rel=0.15)
+
+
+def test_one_range_tells_no_growth_and_the_careful_law_is_taken() -> None:
+    frames = [
+        replace(f, depth=np.float32(2) + (f.depth - np.linspace(0.5, 4, 80, dtype=np.float32)))
+        for f in plain_frames(np.full((60, 80), 0.01))
+    ]
+    fit = estimate_noise(recording_of(frames))
+    assert fit.model.range.a == 0
+    assert fit.model.range.b * 4 == pytest.approx(0.01, rel=0.05)
+    assert "extrapolated" in " ".join(fit.warnings)
+
+
 def test_confidence_is_used_where_it_tells_and_only_there() -> None:
     levels = (np.arange(60)[:, None] // 15 + np.zeros(80, int)).astype(np.uint8)
     table = np.array([0.1, 0.05, 0.02, 0.01])

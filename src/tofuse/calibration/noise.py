@@ -32,6 +32,7 @@ _FARTHEST_M = 200.0
 _LARGEST_M = 5.0
 _WORSE = 1.03  # than the best law: still as good
 _GOOD = 0.2
+_MOST = (0.02, 0.98)
 
 
 @dataclass(frozen=True)
@@ -296,7 +297,7 @@ def _binned(key: Float64, samples: _Samples, edges: Float64) -> _Binned:
         if inside.sum() < _LEAST_PIXELS:
             continue
         variance = float(np.median(typical[inside]))
-        if variance <= 0:  # depth so coarse that most pixels never change
+        if (typical[inside] > 0).mean() < 0.9:  # depth so coarse that many pixels never change
             variance = float(samples.variance[inside].mean())
         if variance > 0:
             centre, before = np.median(key[inside]), np.median(samples.before[inside])
@@ -319,7 +320,7 @@ def _nonnegative(columns: Float64, target: Float64, pixels: Float64) -> Float64:
     none more than twenty times the smallest that is allowed.
     """
     base = np.sqrt(np.minimum(pixels, 20 * _LEAST_PIXELS))
-    scale = np.abs(columns).max(0)
+    scale = np.maximum(np.abs(columns).max(0), 1e-300)
     weights = np.ones(len(target))
     x = np.zeros(columns.shape[1])
     for _ in range(12):
@@ -362,7 +363,7 @@ def _fit_confidence(samples: _Samples) -> tuple[ConfidenceLaw, _Binned] | None:
     key = np.where(known, samples.level, -1)
     best: tuple[float, ConfidenceLaw] | None = None
     bins = _binned(key, samples, edges)
-    if len(bins.centre) == 0:
+    if len(bins.centre) < 2:
         return None
     for power in (0.0, 1.0, 2.0):
         at_one = replace(samples, variance=samples.variance / samples.range_m ** (2 * power))
@@ -385,6 +386,9 @@ def _fit_range(samples: _Samples) -> tuple[RangeLaw, _Binned]:
         everything = np.array([samples.range_m.min(), np.nextafter(samples.range_m.max(), np.inf)])
         bins = _binned(samples.range_m, samples, everything)
     columns = np.stack([np.ones_like(bins.centre), bins.centre**2], 1)
+    if not _spread(samples):
+        # Nothing tells a from b; that of surfaces alike is the more careful for those beyond.
+        columns[:, 0] = 0
     a, b = _nonnegative(columns, np.sqrt(bins.variance), bins.pixels)
     return RangeLaw(min(float(a), _LARGEST_M), min(float(b), 1.0)), bins
 
@@ -493,6 +497,12 @@ def _of_light(law: AmplitudeLaw, counts: Float64) -> Float64:
     return law.floor**2 + law.shot**2 / counts + (law.dark / counts) ** 2
 
 
+def _spread(samples: _Samples) -> bool:
+    """Whether the pixels' ranges differ enough to tell how noise grows with range."""
+    low, high = np.quantile(samples.range_m, _MOST)
+    return bool(high >= 1.5 * low)
+
+
 def _log_error(predicted: Float64, bins: _Binned) -> float:
     return float(np.sqrt((np.log(predicted / bins.variance) ** 2).mean()) / 2)
 
@@ -501,8 +511,8 @@ def _warnings(recording: Recording, samples: _Samples, frames: int, error: float
     out = []
     if frames < len(recording):
         out.append(f"{frames} of {len(recording)} frames are in still stretches")
-    low, high = np.quantile(samples.range_m, [0.02, 0.98])
-    if high < 1.5 * low:
+    if not _spread(samples):
+        low, high = np.quantile(samples.range_m, _MOST)
         out.append(
             f"ranges of {low:.2f} to {high:.2f} m only: what is said of others is extrapolated"
         )

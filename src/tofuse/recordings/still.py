@@ -103,7 +103,7 @@ def _coherence(change: NDArray[Any], ok: Bool) -> Motion:
     if not values.any():
         return Motion(0.0, 0.0, identical=True)
     typical = float(np.median(values)) / _NORMAL_MEDIAN
-    limit = 4 * typical if typical > 0 else float(values.max())
+    limit = 2.5 * typical if typical > 0 else float(values.max())
     clipped = np.where(ok, np.clip(change, -limit, limit), 0).astype(float)
     noise = float(np.sqrt((clipped[ok] ** 2).mean()))
     small = max(2, min(8, min(ok.shape) // (6 * _RATIO)))
@@ -111,7 +111,7 @@ def _coherence(change: NDArray[Any], ok: Bool) -> Motion:
     coarse = _block_means(clipped, ok, small * _RATIO)
     if len(coarse) < 4:
         return Motion(1.0, 1.0)
-    of_fine, of_coarse = (float(np.median(x**2)) / _NORMAL_MEDIAN**2 for x in (fine, coarse))
+    of_fine, of_coarse = (float((x**2).mean()) for x in (fine, coarse))
     area = _RATIO * _RATIO
     common = max(area * of_coarse - of_fine, 0.0) / (area - 1)
     # A block at an edge that flickers is noisier than others, and its mean with it.
