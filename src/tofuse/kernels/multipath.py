@@ -289,45 +289,29 @@ def spread(
 
 
 @kernel
-def bends(
-    nodes: Float64, change: Float64, radius: int, stride: int, limit: float, out: Float64
-) -> int:
-    """Compare how surfaces bend with how a change would unbend them.
+def flat_nodes(nodes: Float64, radius: int, limit: float, tolerance: float) -> float:
+    """Count the nodes that lie on the plane of the surface around every other node.
 
-    In windows around every `stride`-th node a plane is fitted to the nodes on the same surface
-    (normal within 25 degrees, off the centre's plane by less than `limit` of the depth); to their
-    inverse depths as measured, and to the change.
-
-    Parameters
-    ----------
-    change
-        (Hn, Wn) what a full correction adds to the inverse depth.
-    out
-        (M, 2) is filled with the residuals of each node in each window, relative to the inverse
-        depth: of the measurement, and of the change.
-
-    Returns
-    -------
-    How many rows were filled.
+    The surface around a node are the nodes in the window whose normal is within 25 degrees of its
+    own, and that lie off its plane by less than `limit` of the depth. A node off the plane through
+    all of them by x counts ``1 / (1 + x^2)``, x in `tolerance`s (shares of the depth).
     """
     rows, columns = nodes.shape[:2]
     size = (2 * radius + 1) ** 2
     pick = np.empty((size, 2), np.int64)
-    filled = 0
-    for i in range(stride // 2, rows, stride):
-        for j in range(stride // 2, columns, stride):
+    count = 0.0
+    for i in range(0, rows, 2):
+        for j in range(0, columns, 2):
             a, b, c = nodes[i, j, A], nodes[i, j, B], nodes[i, j, C]
             length2 = a * a + b * b + c * c
-            if length2 == 0.0 or filled + size > out.shape[0]:
+            if length2 == 0.0:
                 continue
             n = 0
-            mx = my = mw = mf = 0.0
+            mx = my = mw = 0.0
             for p in range(max(i - radius, 0), min(i + radius + 1, rows)):
                 for q in range(max(j - radius, 0), min(j + radius + 1, columns)):
                     e, f, g = nodes[p, q, A], nodes[p, q, B], nodes[p, q, C]
                     other2 = e * e + f * f + g * g
-                    if other2 == 0.0:
-                        continue
                     along = a * e + b * f + c * g
                     if along <= 0 or along * along < 0.82 * length2 * other2:
                         continue
@@ -339,31 +323,25 @@ def bends(
                     mx += nodes[p, q, X]
                     my += nodes[p, q, Y]
                     mw += w
-                    mf += change[p, q]
             if 3 * n < size:
                 continue
-            mx, my, mw, mf = mx / n, my / n, mw / n, mf / n
-            xx = xy = yy = xw = yw = xf = yf = 0.0
+            mx, my, mw = mx / n, my / n, mw / n
+            xx = xy = yy = xw = yw = 0.0
             for m in range(n):
                 p, q = pick[m, 0], pick[m, 1]
-                x, y = nodes[p, q, X] - mx, nodes[p, q, Y] - my
-                w, f = nodes[p, q, W] - mw, change[p, q] - mf
+                x, y, w = nodes[p, q, X] - mx, nodes[p, q, Y] - my, nodes[p, q, W] - mw
                 xx += x * x
                 xy += x * y
                 yy += y * y
                 xw += x * w
                 yw += y * w
-                xf += x * f
-                yf += y * f
             det = xx * yy - xy * xy
             if not det > 1e-6 * xx * yy:
                 continue
             aw, bw = (yy * xw - xy * yw) / det, (xx * yw - xy * xw) / det
-            af, bf = (yy * xf - xy * yf) / det, (xx * yf - xy * xf) / det
             for m in range(n):
                 p, q = pick[m, 0], pick[m, 1]
-                x, y = nodes[p, q, X] - mx, nodes[p, q, Y] - my
-                out[filled, 0] = (nodes[p, q, W] - mw - aw * x - bw * y) / mw
-                out[filled, 1] = (change[p, q] - mf - af * x - bf * y) / mw
-                filled += 1
-    return filled
+                x, y, w = nodes[p, q, X] - mx, nodes[p, q, Y] - my, nodes[p, q, W] - mw
+                off = (w - aw * x - bw * y) / (mw * tolerance)
+                count += 1.0 / (1.0 + off * off)
+    return count

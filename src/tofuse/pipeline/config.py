@@ -11,6 +11,7 @@ from typing import Any, Literal
 from tofuse import parts
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
+from tofuse.filters.correction import Correction
 from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
@@ -39,6 +40,8 @@ class Config:
         Spreads the error of the loops.
     fusion
         Makes the cloud.
+    corrections
+        Applied in this order to every frame, before the filters.
     """
 
     method: str
@@ -47,6 +50,7 @@ class Config:
     loops: LoopDetector
     optimiser: Optimiser
     fusion: CloudFusion
+    corrections: tuple[Correction, ...] = ()
 
     @property
     def window(self) -> int:
@@ -144,7 +148,11 @@ def check_views(config: Config, kind: ViewKind) -> None:
     kind
         "range" for images of a camera, "cloud" for bare clouds.
     """
-    chosen: tuple[Filter | Odometry, ...] = (*config.filters, config.odometry)
+    chosen: tuple[Correction | Filter | Odometry, ...] = (
+        *config.corrections,
+        *config.filters,
+        config.odometry,
+    )
     for part in chosen:
         if kind not in part.takes:
             raise InputError(

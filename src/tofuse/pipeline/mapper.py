@@ -81,6 +81,7 @@ class Mapper:
         self._finished = False
 
     def _begin(self) -> None:
+        self._correctors = [correction.start() for correction in self.config.corrections]
         self._tracker = self.config.odometry.start(self.seed)
         self._loops = self.config.loops.start(self.seed)
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
@@ -117,7 +118,9 @@ class Mapper:
         self._check(frame)
         with threads(self.threads):
             with self._watch.timing("filters"):
-                past = tuple(self._history) if history is None else history
+                before = self._history if history is None else history
+                past = tuple(self._corrected(f) for f in before)
+                frame = self._corrected(frame)
                 filtered, removals = apply_filters(self.config.filters, frame, past)
                 self._history.append(frame)
             for removal in removals:
@@ -138,6 +141,15 @@ class Mapper:
         self._records.append(FrameRecord(index, timestamp, "skipped", reason))
         self._steps.append(None)
         self._progress.advance(self._records[-1])
+
+    def _corrected(self, frame: Frame) -> Frame:
+        """Correct a frame, unless it is among those that were corrected last."""
+        for before in self._history:
+            if before.index == frame.index:
+                return before
+        for corrector in self._correctors:
+            frame = corrector.apply(frame)
+        return frame
 
     def _check(self, frame: Frame) -> None:
         self._check_order(frame.index)

@@ -12,6 +12,7 @@ import numpy as np
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
 from tofuse.filters.confidence import Confidence
+from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import (
@@ -195,6 +196,11 @@ def _filter_steps(
     index = int(recording.indices[k])
     history = past_frames(recording, index, config.window - 1)
     steps: list[tuple[str, Frame]] = [("raw", frame)]
+    for correction in config.corrections:
+        corrector = correction.start()
+        frame = corrector.apply(frame)
+        history = [corrector.apply(past) for past in history]
+        steps.append((name_of(correction), frame))
     for item in config.filters:
         frame, removals = apply_filters([item], frame, history)
         steps.append((removals[0].name, frame))

@@ -106,6 +106,8 @@ class RangeFrame:
         square of the range; "range_compensated", that times the square of the range (and divided
         by the falloff of lens and lamp), which is the surface's albedo but for its slope; "ir",
         active brightness by a map of the maker's own, to be taken as raw.
+    ambiguity_m
+        Range in m after which the measurement repeats; None where not known.
     """
 
     index: int
@@ -119,6 +121,7 @@ class RangeFrame:
     sigma_image: Float32 | None = None
     normal_image: Float32 | None = None
     amplitude_kind: AmplitudeKind = "raw"
+    ambiguity_m: float | None = None
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)

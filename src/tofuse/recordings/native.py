@@ -124,6 +124,7 @@ class NativeSource(FileSource):
             confidence,
             color,
             amplitude_kind=self.description.amplitude_kind or "raw",
+            ambiguity_m=self.description.ambiguity_m,
         )
 
     def _read_camera(self, given: Path | None) -> tuple[CameraFile, Camera | None]:

@@ -304,4 +304,5 @@ def _frame(
         sensor.reported_confidence(model, measured),
         sigma_image=sensor.reported_sigma(model, measured),
         amplitude_kind=model.amplitude_kind,
+        ambiguity_m=model.ambiguity_m,
     )

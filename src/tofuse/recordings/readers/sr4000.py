@@ -21,6 +21,8 @@ from tofuse.recordings.sources import FileSource
 Float64 = NDArray[np.float64]
 
 FRAME_RATE_HZ = 32.0
+# Modulated at 30 MHz, as the maker ships it.
+AMBIGUITY_M = 5.0
 # The export counts Z from about 1 cm before the optical centre; nothing so near can be measured,
 # and no ray can be told from it.
 NEAREST_M = 0.01
@@ -86,6 +88,7 @@ class Sr4000Source(FileSource):
             "frame_rate_hz": FRAME_RATE_HZ,
             "depth_kind": "z",
             "amplitude_kind": "range_compensated",
+            "ambiguity_m": AMBIGUITY_M,
         }
 
     def _read_timestamps(self) -> None:
@@ -130,6 +133,7 @@ class Sr4000Source(FileSource):
             if confidence is None
             else np.clip(np.nan_to_num(confidence), 0, 255).astype(np.uint8),
             amplitude_kind="range_compensated",
+            ambiguity_m=AMBIGUITY_M,
         )
 
 

@@ -1,0 +1,36 @@
+"""The interface of a correction: what changes a view before it is filtered."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+from tofuse.recordings.frames import Frame
+
+
+class Corrector(Protocol):
+    """A correction at work on one recording."""
+
+    def apply(self, frame: Frame) -> Frame:
+        """Return the corrected view; the same one where there is nothing to correct it by.
+
+        Points stay where they are in the image: what is valid stays valid, and nothing else
+        becomes so.
+        """
+        ...
+
+
+class Correction(Protocol):
+    """One way of making measurements better.
+
+    Attributes
+    ----------
+    takes
+        Kinds of view it works on, or passes through: "range", "cloud".
+    """
+
+    part_kind: ClassVar[str] = "correction"
+    takes: ClassVar[frozenset[str]]
+
+    def start(self) -> Corrector:
+        """Begin a recording, about which the correction may learn from its frames, in order."""
+        ...

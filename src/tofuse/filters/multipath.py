@@ -1,0 +1,138 @@
+"""Take the light out of a view that came by way of other surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.filters._options import above, at_least, whole
+from tofuse.filters.correction import Correction
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.parts import part
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.sensor.multipath import Bounces, GainEstimator, Interference, LightImage, Reflections
+from tofuse.sensor.multipath_surfaces import FALLOFF
+
+Float32 = NDArray[np.float32]
+
+# Cameras of one frequency measure with periods up to this. A longer ambiguity is a beat of several
+# frequencies, which says nothing about the phase that was measured.
+_LONGEST_PERIOD_M = 6.0
+
+
+@part("correction", "multipath")
+@dataclass(frozen=True)
+class Multipath(Correction):
+    """Compensate the light that surfaces reflect onto each other (Fuchs 2010), see `sensor`.
+
+    Corners are no longer rounded, and floors and walls lie where they are. Works on cameras of
+    one modulation frequency that record amplitude; other views are passed on as they are.
+
+    Attributes
+    ----------
+    gain
+        Counts of raw amplitude of a white wall (albedo 1) at 1 m in the image's centre; for
+        range-compensated amplitude, of a white wall anywhere. None: found from the recording.
+    period_m
+        Range after which the phase repeats; None: as the frame says.
+    bounces
+        "one": light by way of one other surface; "all": by way of any number.
+    iterations
+        Times that the light is computed, from surfaces corrected by the time before.
+    columns
+        Blocks of pixels along the image's width for which the light is computed.
+    lamp
+        Angle up to which the lamp lights, relative to that of the image's corner. Around the image
+        surfaces are taken to go on.
+    """
+
+    gain: float | None = None
+    period_m: float | None = None
+    bounces: Bounces = "one"
+    iterations: int = 3
+    columns: int = 44
+    lamp: float = 1.2
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if self.gain is not None:
+            above("gain", self.gain, 0)
+        if self.period_m is not None:
+            above("period_m", self.period_m, 0)
+        whole("iterations", self.iterations, 1, 10)
+        whole("columns", self.columns, 8, 200)
+        at_least("lamp", self.lamp, 1)
+
+    def start(self) -> MultipathCorrector:
+        """See `Correction.start`."""
+        return MultipathCorrector(self)
+
+
+class MultipathCorrector:
+    """Corrects the frames of one recording, with a gain that it learns from them unless given.
+
+    Attributes
+    ----------
+    gain
+        As given, or as known so far; None before the first frame.
+    """
+
+    def __init__(self, options: Multipath) -> None:
+        self.gain = options.gain
+        self._options = options
+        self._reflections = Reflections(
+            options.columns, options.iterations, options.lamp, options.bounces
+        )
+        self._estimator = GainEstimator(self._reflections)
+
+    def apply(self, frame: Frame) -> Frame:
+        """See `Corrector.apply`. The amplitude loses its indirect share as well."""
+        if not isinstance(frame, RangeFrame):
+            return frame
+        image = light_image(frame, self._options.period_m)
+        if image is None:
+            return frame
+        if self._options.gain is None:
+            self._estimator.add(image)
+            self.gain = self._estimator.gain
+        found = None if self.gain is None else self._reflections.solve(image, self.gain)
+        return frame if found is None else _corrected(frame, image, found)
+
+
+def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage | None:
+    """Return the frame's depth and raw light; None if its light or its period is not known."""
+    if period_m is None:
+        period_m = frame.ambiguity_m
+        if period_m is None or period_m > _LONGEST_PERIOD_M or frame.amplitude_kind == "ir":
+            return None
+    if frame.amplitude_image is None or not len(frame):
+        return None
+    z = np.where(frame.valid, frame.z, np.float32(0))
+    amplitude = frame.amplitude_image
+    fine = frame.valid & np.isfinite(amplitude) & (amplitude > 0)
+    fine &= amplitude < SATURATED_AMPLITUDE
+    light = np.where(fine, amplitude, np.float32(0))
+    if frame.amplitude_kind == "range_compensated":
+        length = np.where(fine, ray_lengths(frame.camera), 1)
+        r = np.where(fine, frame.radial_range, 1)
+        light = light / (r * r * length**FALLOFF)
+    return LightImage(z, frame.camera.rays(), light.astype(np.float32), period_m)
+
+
+def _corrected(frame: RangeFrame, image: LightImage, found: Interference) -> RangeFrame:
+    assert frame.amplitude_image is not None
+    nearer = np.where(image.z > 0, found.z / np.where(image.z > 0, image.z, 1), 1)
+    factor = 1 / found.factor
+    if frame.amplitude_kind == "range_compensated":
+        factor = factor * nearer**2
+    plain = (image.z <= 0) | (frame.amplitude_image >= SATURATED_AMPLITUDE)
+    amplitude = np.where(plain, frame.amplitude_image, frame.amplitude_image * factor)
+    return replace(
+        frame,
+        depth=(frame.depth * nearer).astype(np.float32),
+        amplitude_image=amplitude.astype(np.float32),
+    )
