@@ -19,7 +19,8 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterator, Sequence as Items
+from collections.abc import Iterator
+from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import peers
 import sequences
-
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import map_consistency
 from tofuse.evaluation.trajectory import evaluate_trajectory
@@ -92,10 +92,14 @@ class TofuseSession:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a method made of a sequence: poses (N, 4, 4), NaN where lost, and seconds (N,)."""
+    """What a method made of a sequence: poses (N, 4, 4), NaN where lost, and seconds (N,).
+
+    `cpu` are seconds of all threads together, which other programs at work hardly change.
+    """
 
     poses: Float64
     seconds: Float64
+    cpu: Float64
     details: dict[str, Any]
 
 
@@ -103,13 +107,13 @@ def run(method: peers.Method, frames: Items[RangeFrame], threads: int) -> Run:
     """Run a method over frames."""
     session = method.start(frames[0], threads)
     poses = np.full((len(frames), 4, 4), np.nan)
-    seconds = np.empty(len(frames))
+    seconds, cpu = np.empty((2, len(frames)))
     with using_threads(threads):
         for k, frame in enumerate(frames):
             prepared = session.prepare(frame)
-            start = time.perf_counter()
+            start, cpu_start = time.perf_counter(), time.process_time()
             T = session.push(prepared)
-            seconds[k] = time.perf_counter() - start
+            seconds[k], cpu[k] = time.perf_counter() - start, time.process_time() - cpu_start
             if T is not None:
                 poses[k] = T
     details = {}
@@ -119,7 +123,7 @@ def run(method: peers.Method, frames: Items[RangeFrame], threads: int) -> Run:
             "unheld": session.unheld,
             "reasons": session.reasons,
         }
-    return Run(poses, seconds, details)
+    return Run(poses, seconds, cpu, details)
 
 
 def best(
@@ -154,6 +158,7 @@ def row(
         "threads": threads,
         "ms_median": float(np.median(ms)) if len(ms) else None,
         "ms_p95": float(np.percentile(ms, 95)) if len(ms) else None,
+        "cpu_ms_median": float(np.median(1e3 * result.cpu[1:])) if len(ms) else None,
         **accuracy(sequence, result.poses),
         **result.details,
     }
@@ -221,6 +226,7 @@ _COLUMNS = {
     "resolution": "resolution",
     "ms": "ms a frame: median (95 %)",
     "ratio": "of tofuse",
+    "cpu": "CPU ms",
     "ate": "ATE m",
     "rotation": "rotation deg",
     "rpe1": "RPE 1: m, deg",
@@ -247,6 +253,7 @@ def cells(r: dict[str, Any], ours_ms: float | None) -> list[str]:
         "resolution": r.get("resolution", ""),
         "ms": "" if ms is None else f"{ms:.1f} ({r['ms_p95']:.1f})",
         "ratio": f"x {ms / ours_ms:.1f}" if ms is not None and ours_ms else "",
+        "cpu": "" if ms is None else f"{r['cpu_ms_median']:.1f}",
         "ate": f"{r['ate_m']:.4f}",
         "rotation": f"{r['rotation_deg']:.2f}",
         **pairs,
@@ -263,7 +270,10 @@ def table(rows: Items[dict[str, Any]]) -> str:
     lines = [list(_COLUMNS.values()), *[cells(r, ours) for r in rows]]
     # A long last column need not be padded.
     widths = [*[max(len(line[k]) for line in lines) for k in range(len(_COLUMNS) - 1)], 6]
-    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths)) + " |" for line in lines]
+    text = [
+        "| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |"
+        for line in lines
+    ]
     text.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
     return "\n".join(text)
 

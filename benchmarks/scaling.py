@@ -1,0 +1,337 @@
+"""How the tracker's time and memory grow, and how far its kernels are from the memory's speed.
+
+Four tables: time a frame over resolution; time and memory over the number of frames, the sequence
+going forth and back; the first-ever compilation, in a process of its own with an empty cache; and
+each kernel's own time on one thread, beside the time that the machine needs to move the bytes that
+the kernel must touch (CPU time, each array once). The frames are those of a made room, or of a recording. All but the
+compilation is warm.
+
+    python benchmarks/scaling.py [RECORDING] [--columns 160 320 640] [--counts 500 1000 5000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole, scaled
+from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.threads import threads as using_threads
+from tofuse.odometry.keyframes import Keyframes
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.open import open_recording
+
+Float64 = NDArray[np.float64]
+
+LENGTH = 60  # frames of the sequence that goes forth and back
+BANDWIDTH_BYTES = 1 << 28
+
+
+def made_frames(columns: int, count: int) -> list[RangeFrame]:
+    """Look round a room of 5 x 4 x 3 m with two boxes in it, with 2 mm of noise at 1 m."""
+    rows = columns * 3 // 4
+    camera = Pinhole(columns, rows, 0.9 * columns, 0.9 * columns, columns / 2 - 0.5, rows / 2 - 0.5)
+    rays = camera.rays().astype(float)
+    directions = np.concatenate([rays, np.ones((rows, columns, 1))], -1).reshape(-1, 3)
+    frames = []
+    for k in range(count):
+        T = se3.exp([0.5 * np.sin(0.02 * k), 0, 0.004 * k, 0.1 * np.sin(0.05 * k), 0.012 * k, 0])
+        z = _room(T[:3, 3], directions @ T[:3, :3].T).reshape(rows, columns)
+        rng = np.random.default_rng([0, columns, k])
+        z = z + 0.002 * z * z * rng.standard_normal(z.shape)
+        light = np.full(z.shape, 1000.0) / np.maximum(z, 0.1) ** 2
+        frames.append(
+            RangeFrame(
+                k,
+                k / 30,
+                camera,
+                z.astype(np.float32),
+                amplitude_image=(light * (1 + 0.3 * np.sin(9 * z))).astype(np.float32),
+            )
+        )
+    return frames
+
+
+def _room(origin: Float64, directions: Float64) -> Float64:
+    """z of what rays of unit z hit, from inside a box and from outside two smaller ones."""
+    with np.errstate(divide="ignore"):
+        inverse = 1 / directions
+    low, high = np.array([-2.5, -1.5, -1.0]), np.array([2.5, 1.5, 3.0])
+    nearest = (np.where(directions > 0, high - origin, low - origin) * inverse).min(1)
+    for low, high in (
+        ((-1.2, 0.5, 1.2), (-0.4, 1.5, 2.0)),
+        ((0.6, 0.2, 1.8), (1.3, 1.5, 2.4)),
+    ):
+        a, b = (np.array(low) - origin) * inverse, (np.array(high) - origin) * inverse
+        enter, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+        nearest = np.where((enter < leave) & (enter > 0), np.minimum(nearest, enter), nearest)
+    return nearest
+
+
+def recorded_frames(path: str, count: int) -> list[RangeFrame]:
+    """Read the first frames of a recording."""
+    frames = list(open_recording(path).select(end=count))
+    return [f for f in frames if isinstance(f, RangeFrame)]
+
+
+def reduced(frames: Sequence[RangeFrame], columns: int) -> list[RangeFrame]:
+    """Return the frames with every so manieth pixel, so that they have that many columns."""
+    step = max(1, frames[0].camera.width // columns)
+    part = (slice(step // 2, None, step), slice(step // 2, None, step))
+    found = []
+    for frame in frames:
+        depth = np.ascontiguousarray(frame.depth[part])
+        light = frame.amplitude_image
+        assert isinstance(frame.camera, Pinhole)
+        found.append(
+            RangeFrame(
+                frame.index,
+                frame.timestamp,
+                scaled(frame.camera, depth.shape[1], depth.shape[0]),
+                depth,
+                frame.depth_kind,
+                amplitude_image=None if light is None else np.ascontiguousarray(light[part]),
+                amplitude_kind=frame.amplitude_kind,
+            )
+        )
+    return found
+
+
+def tracker(columns: int) -> Any:
+    """Return the default tracker, working on so many columns."""
+    options = Keyframes()
+    return replace(options, surface=replace(options.surface, columns=columns)).start(0)
+
+
+def forth_and_back(frames: Sequence[RangeFrame], count: int) -> Iterator[RangeFrame]:
+    """Give `count` frames: the sequence, then back, and so on."""
+    period = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
+    for k in range(count):
+        yield replace(frames[period[k % len(period)]], index=k, timestamp=k / 30)
+
+
+def timed(tracker: Any, frames: Iterator[RangeFrame]) -> tuple[Float64, int]:
+    """Return the seconds of each push, and how many frames have a pose."""
+    seconds, posed = [], 0
+    for frame in frames:
+        start = time.perf_counter()
+        step = tracker.push(frame)
+        seconds.append(time.perf_counter() - start)
+        posed += step.T_world_camera is not None
+    return np.array(seconds), posed
+
+
+def over_resolution(frames: Sequence[RangeFrame], columns: Sequence[int]) -> Iterator[str]:
+    yield f"{'columns':>8}{'rows':>6}{'worked on':>11}{'ms: median':>12}{'95 %':>8}{'posed':>7}"
+    default = Keyframes().surface.columns
+    for wanted in columns:
+        images = reduced(frames, wanted)
+        width, height = images[0].camera.width, images[0].camera.height
+        for worked in sorted({min(default, width), width}):
+            timed(tracker(worked), iter(images[:3]))
+            seconds, posed = timed(tracker(worked), forth_and_back(images, 2 * len(images)))
+            ms = 1e3 * seconds[1:]
+            yield (
+                f"{width:>8}{height:>6}{worked:>11}{np.median(ms):>12.1f}"
+                f"{np.percentile(ms, 95):>8.1f}{posed / len(seconds):>7.0%}"
+            )
+
+
+def over_count(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[str]:
+    columns = Keyframes().surface.columns
+    at_work = tracker(columns)
+    source = forth_and_back(frames, max(counts))
+    yield f"{'frames':>8}{'ms: median':>12}{'95 %':>8}{'posed':>7}{'memory, MB':>12}"
+    done = 0
+    for count in sorted(counts):
+        seconds, posed = timed(at_work, (next(source) for _ in range(count - done)))
+        ms = 1e3 * seconds[1:]
+        share = posed / max(1, len(seconds))
+        done = count
+        yield (
+            f"{count:>8}{np.median(ms):>12.1f}{np.percentile(ms, 95):>8.1f}"
+            f"{share:>7.0%}{resident_bytes() / 1e6:>12.0f}"
+        )
+
+
+def resident_bytes() -> int:
+    """Memory that the process holds now; at its peak where the system only tells that."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else 1024 * peak
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def compilation() -> Iterator[str]:
+    """Track two small frames in a new process: with an empty cache, and again with a full one."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
+        for name in ("first ever", "from the cache"):
+            start = time.perf_counter()
+            command = [sys.executable, __file__, "--compile-only"]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True)
+            if done.returncode:
+                yield f"{name}: failed: {done.stderr.strip().splitlines()[-1]}"
+                return
+            whole = time.perf_counter() - start
+            yield f"{name:<16}{float(done.stdout):>8.1f} s for two frames,{whole:>7.1f} s in all"
+
+
+@dataclass
+class Spent:
+    """What a kernel took: calls, seconds, and the bytes of its arrays, each touched once."""
+
+    calls: int = 0
+    seconds: float = 0.0
+    bytes: float = 0.0
+
+
+@contextmanager
+def watched_kernels() -> Iterator[dict[str, Spent]]:
+    """Measure every call of a kernel from Python, in CPU time. They must be compiled already."""
+    spent: dict[str, Spent] = {}
+    dispatcher = type(numba.njit(lambda: None))
+    places = [
+        (module, name, value)
+        for key, module in list(sys.modules.items())
+        if key.startswith("tofuse")
+        for name, value in vars(module).items()
+        if isinstance(value, dispatcher)
+    ]
+    for module, name, value in places:
+        setattr(module, name, _watched(value, spent))
+    try:
+        yield spent
+    finally:
+        for module, name, value in places:
+            setattr(module, name, value)
+
+
+def _watched(function: Any, spent: dict[str, Spent]) -> Callable[..., Any]:
+    def called(*arguments: Any) -> Any:
+        start = time.thread_time()
+        result = function(*arguments)
+        seconds = time.thread_time() - start
+        found = spent.setdefault(function.__name__, Spent())
+        found.calls += 1
+        found.seconds += seconds
+        arrays = [a for a in arguments if isinstance(a, np.ndarray)]
+        found.bytes += _share(arguments, arrays) * sum(a.nbytes for a in arrays)
+        return result
+
+    return called
+
+
+def _share(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float:
+    """The part of the rows that a call works on: kernels end with (start, stop)."""
+    ends = arguments[-2:]
+    if len(ends) < 2 or not all(isinstance(e, int) for e in ends) or not arrays:
+        return 1.0
+    return float((ends[1] - ends[0]) / max(1, len(arrays[0])))
+
+
+def bandwidth(count: int) -> float:
+    """Bytes a second, read and written, of the fastest of ten copies of 256 MB."""
+
+    @numba.njit(nogil=True)
+    def copy(source: Float64, target: Float64, start: int, stop: int) -> None:
+        for i in range(start, stop):
+            target[i] = source[i]
+
+    source = np.ones(BANDWIDTH_BYTES // 8)
+    target = np.zeros_like(source)
+    copy(source, target, 0, 8)
+    best = np.inf
+    with using_threads(count):
+        for _ in range(10):
+            start = time.perf_counter()
+            run_chunks(lambda a, b: copy(source, target, a, b), len(source), chunks=count)
+            best = min(best, time.perf_counter() - start)
+    return 2 * BANDWIDTH_BYTES / best
+
+
+def over_kernels(frames: Sequence[RangeFrame]) -> Iterator[str]:
+    speed = bandwidth(1)
+    yield f"copying moves {speed / 1e9:.1f} GB/s on one thread, {bandwidth(2) / 1e9:.1f} on two"
+    columns = Keyframes().surface.columns
+    with using_threads(1):
+        timed(tracker(columns), iter(frames[:3]))
+        at_work = tracker(columns)
+        with watched_kernels() as spent:
+            start = time.thread_time()
+            for frame in forth_and_back(frames, len(frames)):
+                at_work.push(frame)
+            whole = time.thread_time() - start
+    n = len(frames)
+    yield f"{'a frame':<20}{'calls':>7}{'ms':>8}{'MB':>8}{'bound, ms':>11}{'of the bound':>14}"
+    for name, s in sorted(spent.items(), key=lambda item: -item[1].seconds):
+        bound = s.bytes / speed
+        yield (
+            f"{name:<20}{s.calls / n:>7.1f}{1e3 * s.seconds / n:>8.2f}{s.bytes / n / 1e6:>8.2f}"
+            f"{1e3 * bound / n:>11.2f}{s.seconds / bound:>13.1f}x"
+        )
+    inside = sum(s.seconds for s in spent.values())
+    yield f"{'outside of kernels':<20}{'':>7}{1e3 * (whole - inside) / n:>8.2f}"
+    yield f"{'in all':<20}{'':>7}{1e3 * whole / n:>8.2f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recording", nargs="?", help="instead of the made room")
+    parser.add_argument("--columns", type=int, nargs="+", default=[160, 320, 640])
+    parser.add_argument("--counts", type=int, nargs="+", default=[500, 1000, 5000])
+    parser.add_argument("--length", type=int, default=LENGTH, help="frames of the sequence")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--compile-only", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.compile_only:
+        start = time.perf_counter()
+        timed(Keyframes().start(0), iter(made_frames(160, 2)))
+        print(time.perf_counter() - start)
+        return
+
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
+        f"{options.threads} threads{load}; {options.recording or 'made room'}"
+    )
+    widest = max(options.columns)
+    frames = (
+        recorded_frames(options.recording, options.length)
+        if options.recording
+        else made_frames(widest, options.length)
+    )
+    with using_threads(options.threads):
+        _print("Resolution", over_resolution(frames, options.columns))
+        _print("Number of frames", over_count(frames, options.counts))
+    _print("Compilation", compilation())
+    _print("Kernels, on one thread", over_kernels(frames))
+
+
+def _print(title: str, lines: Iterator[str]) -> None:
+    print(f"\n{title}", flush=True)
+    for line in lines:
+        print(f"  {line}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
