@@ -81,7 +81,8 @@ def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
             mean[a] += points[index[k], a]
     if count == 0:
         return 0
-    mean /= count
+    for a in range(3):
+        mean[a] /= count
     for k in range(count):
         for a in range(3):
             x = points[index[k], a] - mean[a]
@@ -98,9 +99,9 @@ def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
 def _mean_curvature(
     points: Float64, index: Int64, count: int, centre: Float64, u: Float64, v: Float64, n: Float64
 ) -> float:
-    """Mean curvature of the paraboloid ``h = (a x^2 + 2 b x y + c y^2) / 2 + d`` fitted there."""
-    M = np.zeros((4, 5))
-    f = np.ones(4)
+    """Mean curvature of ``h = (a x^2 + 2 b x y + c y^2) / 2 + d x + e y + f``, fitted there."""
+    M = np.zeros((6, 7))
+    f = np.ones(6)
     for k in range(count):
         x = 0.0
         y = 0.0
@@ -113,27 +114,32 @@ def _mean_curvature(
         f[0] = x * x / 2
         f[1] = x * y
         f[2] = y * y / 2
-        for a in range(4):
-            for b in range(4):
+        f[3] = x
+        f[4] = y
+        for a in range(6):
+            for b in range(6):
                 M[a, b] += f[a] * f[b]
-            M[a, 4] += f[a] * h
-    # Gaussian elimination with pivots; units of length differ, so each pivot has its own scale.
-    scale = np.empty(4)
-    for a in range(4):
+            M[a, 6] += f[a] * h
+    # Gaussian elimination; units of length differ, so each pivot has its own scale.
+    scale = np.empty(6)
+    for a in range(6):
         scale[a] = M[a, a]
-    for a in range(4):
+    for a in range(6):
         if not M[a, a] > 1e-9 * scale[a]:
             return np.nan
-        for b in range(a + 1, 4):
+        for b in range(a + 1, 6):
             w = M[b, a] / M[a, a]
-            for c in range(a, 5):
+            for c in range(a, 7):
                 M[b, c] -= w * M[a, c]
-    for a in range(3, -1, -1):
-        for b in range(a + 1, 4):
-            M[a, 4] -= M[a, b] * M[b, 4]
-        M[a, 4] /= M[a, a]
+    for a in range(5, -1, -1):
+        for b in range(a + 1, 6):
+            M[a, 6] -= M[a, b] * M[b, 6]
+        M[a, 6] /= M[a, a]
+    p = M[3, 6]
+    q = M[4, 6]
+    bend = (1 + q * q) * M[0, 6] - 2 * p * q * M[1, 6] + (1 + p * p) * M[2, 6]
     # Bulging towards the side that the normal points to counts as positive.
-    return -(M[0, 4] + M[2, 4]) / 2
+    return -bend / (2 * (1 + p * p + q * q) ** 1.5)
 
 
 @kernel
@@ -151,11 +157,16 @@ def _widest_gap(
             x += gap * u[a]
             y += gap * v[a]
         if x != 0 or y != 0:
-            angles[m] = math.atan2(y, x)
+            angle = math.atan2(y, x)
+            # Insertion: there are few, and NumPy's sort takes long to compile.
+            j = m
+            while j > 0 and angles[j - 1] > angle:
+                angles[j] = angles[j - 1]
+                j -= 1
+            angles[j] = angle
             m += 1
     if m == 0:
         return 2 * math.pi
-    angles = np.sort(angles[:m])
     widest = angles[0] + 2 * math.pi - angles[m - 1]
     for k in range(1, m):
         widest = max(widest, angles[k] - angles[k - 1])
@@ -253,6 +264,8 @@ def ball_moments(
                                 arranged[i, b] - centres[q, b]
                             )
         if found > 0:
-            M /= found
+            for a in range(3):
+                for b in range(3):
+                    M[a, b] /= found
             symmetric_eigen(M, out[q], vectors)
     return out

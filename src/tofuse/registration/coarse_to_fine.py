@@ -18,6 +18,7 @@ from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
+from tofuse.registration.pairs import FEWEST_PAIRS
 from tofuse.registration.reduce import averaged
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All
@@ -117,6 +118,12 @@ class CoarseToFine(Registrar):
         RegistrationError
             If there are too few points, or too few correspond.
         """
+        for view in (source, target):
+            if len(view) < FEWEST_PAIRS:
+                raise RegistrationError(
+                    f"has {len(view)} points, {FEWEST_PAIRS} are needed",
+                    where=f"frame {view.index}",
+                )
         fine = self._finest(source, target)
         levels = [fine]
         while levels[-1][0] * 2 * _EXTENT_SHARE < _extent(fine[2]):

@@ -236,7 +236,7 @@ class ClosestInvariant(Matcher):
     Least is ``|p - q|^2 + sum (a_k (f_k - g_k))^2``. The features don't change when a view is
     moved: mean curvature, or the three eigenvalues of the second moments of the surface in a ball
     (whose symmetric functions are the paper's moment invariants J1 to J3). They are scaled by
-    their median absolute deviation over the target, and their weight is in resolutions.
+    their mean absolute deviation over the target, and their weight is in resolutions.
 
     Attributes
     ----------
@@ -249,7 +249,7 @@ class ClosestInvariant(Matcher):
     """
 
     features: tuple[Invariant, ...] = ("moments",)
-    weight: float = 10.0
+    weight: float = 20.0
     radius: float = 6.0
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -274,9 +274,7 @@ class _InvariantSearch:
     def match(self, alignment: Alignment, reach: float) -> Matches:
         of_target = self._features("target", alignment.target, alignment.resolution)
         of_source = self._features("source", alignment.source, alignment.resolution)
-        middle = np.nanmedian(of_target, 0) if len(of_target) else np.zeros(of_target.shape[1])
-        spread = np.nanmedian(np.abs(of_target - middle), 0) if len(of_target) else middle
-        spread = np.where(spread > 0, spread, 1.0)
+        spread = np.array([_mean_deviation(column) for column in of_target.T])
         by = self.options.weight * alignment.resolution / (spread * np.sqrt(of_target.shape[1]))
         index, squared = self.tree.nearest_featured(
             alignment.moved, of_target * by, of_source * by, np.inf, reach
@@ -297,3 +295,10 @@ class _InvariantSearch:
                 columns.append(moments / radius**2)
         self.known[which] = (points, np.concatenate(columns, 1))
         return self.known[which][1]
+
+
+def _mean_deviation(column: Float64) -> float:
+    """Mean absolute deviation from the median of the values that aren't NaN; 1 if it is nil."""
+    column = column[np.isfinite(column)]
+    deviation = float(np.abs(column - np.median(column)).mean()) if len(column) else 0.0
+    return deviation or 1.0

@@ -16,6 +16,7 @@ from tofuse.registration.coarse_to_fine import CoarseToFine
 Float64 = NDArray[np.float64]
 
 _FEWEST_POINTS = 10
+_FURTHEST_M = 1e9
 
 
 def register(
@@ -109,5 +110,9 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
             f"has {len(good)} finite points",
             where=name,
             remedy=f"give {_FEWEST_POINTS} or more",
+        )
+    if np.abs(good).max() > _FURTHEST_M:
+        raise InputError(
+            f"has coordinates up to {np.abs(good).max():.0e} m", where=name, remedy="give metres"
         )
     return good

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from tofuse.parts import part
 from tofuse.registration.interfaces import History, Stopping
 
+_REPEATED = 1e-6
+
 
 @part("stopping", "two-loops", label="validated")
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class TwoLoops(Stopping):
 class SmallStep(Stopping):
     """Ends when a motion takes the points less far than a share of the resolution.
 
+    Or when the iterations repeat: near the end they can go to and fro between two matchings.
+
     Attributes
     ----------
     epsilon
@@ -77,4 +81,12 @@ class SmallStep(Stopping):
 
     def met(self, history: History) -> bool:
         """See `Stopping.met`."""
-        return history.steps[-1] < self.epsilon
+        counts, errors = history.correspondences, history.errors
+        if history.steps[-1] < self.epsilon:
+            return True
+        return (
+            len(errors) >= 5
+            and counts[-1] == counts[-3] == counts[-5]
+            and abs(errors[-1] - errors[-3]) <= _REPEATED * errors[-1]
+            and abs(errors[-3] - errors[-5]) <= _REPEATED * errors[-1]
+        )

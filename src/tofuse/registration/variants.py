@@ -295,7 +295,7 @@ class Icpif(Variant):
     resolution: float = 0.01
     points: int | None = 1000
     features: tuple[Invariant, ...] = ("moments",)
-    weight: float = 10.0
+    weight: float = 20.0
     radius: float = 6.0
     reach: float = 3.0
     max_iterations: int = 100
