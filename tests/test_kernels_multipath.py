@@ -1,0 +1,155 @@
+"""The kernels of multipath compensation against slow NumPy twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.kernels import multipath as kernels
+from tofuse.kernels.multipath import AREA, COLUMNS, LIGHT, A, B, C, W, X, Y
+
+
+def grid_rays(height: int, width: int, pitch: float = 0.01) -> np.ndarray:
+    x, y = np.meshgrid(
+        (np.arange(width) - width / 2) * pitch, (np.arange(height) - height / 2) * pitch
+    )
+    return np.stack([x, y], -1).astype(np.float32)
+
+
+def means(z: np.ndarray, rays: np.ndarray, light: np.ndarray, step: int) -> np.ndarray:
+    nodes = np.empty((-(-z.shape[0] // step), -(-z.shape[1] // step), COLUMNS))
+    kernels.block_means(
+        z.astype(np.float32), rays, np.asarray(light, np.float32), step, 0.03, nodes
+    )
+    return nodes
+
+
+def fitted(nodes: np.ndarray, limit: float = 0.006) -> np.ndarray:
+    planes = np.zeros((*nodes.shape[:2], 4))
+    for radius in (2, 1):
+        kernels.window_planes(nodes, radius, planes)
+        kernels.choose_planes(nodes, planes, radius, limit)
+    return nodes
+
+
+def test_exchange_is_the_sum_over_sources_of_disc_form_factors_and_delays() -> None:
+    rng = np.random.default_rng(1)
+    sources = rng.normal(size=(30, 9))
+    sources[:, 2] += 4
+    sources[:, 3:6] /= np.linalg.norm(sources[:, 3:6], axis=1, keepdims=True)
+    sources[:, 6] = rng.uniform(0.001, 0.05, 30)
+    receivers = rng.normal(size=(6, 200))
+    receivers[2] += 4
+    receivers[3:] /= np.linalg.norm(receivers[3:], axis=0)
+    out = np.zeros((2, 200), np.float32)
+    for a, b in ((0, 7), (7, 30)):
+        kernels.exchange(sources.astype(np.float32), a, b, receivers.astype(np.float32), 10.0, out)
+
+    step = receivers[:3].T[None] - sources[:, None, :3]
+    d = np.linalg.norm(step, axis=-1)
+    leaving = np.einsum("src,sc->sr", step, sources[:, 3:6]) / d
+    arriving = -np.einsum("src,rc->sr", step, receivers[3:].T) / d
+    area = sources[:, 6:7]
+    factor = np.clip(leaving, 0, None) * np.clip(arriving, 0, None) * area / (np.pi * d**2 + area)
+    light = (sources[:, 7] + 1j * sources[:, 8])[:, None]
+    wanted = (factor * light * np.exp(2j * np.pi * d / 10.0)).sum(0)
+    np.testing.assert_allclose(out[0] + 1j * out[1], wanted, rtol=2e-4, atol=2e-6)
+    assert (np.abs(wanted) > 0).sum() > 100
+
+
+def test_a_disc_that_touches_sends_no_more_than_all_its_light() -> None:
+    sources = np.float32([[0, 0, 1, 0, 0, -1, 0.1, 1, 0]])
+    receivers = np.float32([[0], [0], [1 - 1e-4], [0], [0], [1]])
+    out = np.zeros((2, 1), np.float32)
+    kernels.exchange(sources, 0, 1, receivers, 10.0, out)
+    assert 0.99 < out[0, 0] <= 1.0
+
+
+def test_block_means_are_those_of_the_surface_in_the_middle() -> None:
+    rays = grid_rays(8, 8)
+    z = np.full((8, 8), 2.0, np.float32)
+    z[0, :2] = 5.0
+    z[1, 0] = 0.0
+    light = np.full((8, 8), 10.0)
+    light[0, :2] = 900.0
+    light[3, 3] = 0.0
+    nodes = means(z, rays, light, 4)
+    assert nodes.shape == (2, 2, COLUMNS)
+    chosen = (z[:4, :4] == 2.0).ravel()
+    assert nodes[0, 0, X] == pytest.approx(rays[:4, :4, 0].ravel()[chosen].mean())
+    assert nodes[0, 0, Y] == pytest.approx(rays[:4, :4, 1].ravel()[chosen].mean())
+    assert nodes[..., W] == pytest.approx(0.5)
+    assert nodes[..., LIGHT] == pytest.approx(10.0)
+    assert nodes[0, 0, AREA] == pytest.approx(13 * 1e-4, rel=1e-4)
+    assert nodes[1, 1, AREA] == pytest.approx(16 * 1e-4, rel=1e-4)
+
+
+def test_blocks_with_few_pixels_and_unknown_rays_are_left_out() -> None:
+    rays = grid_rays(4, 8)
+    z = np.zeros((4, 8), np.float32)
+    z[0, :3] = 1.0  # three of sixteen
+    z[:, 4:] = 1.0
+    rays[z == 0] = np.nan
+    nodes = means(z, rays, np.ones_like(z), 4)
+    assert nodes[0, 0, W] == 0
+    assert nodes[0, 1, W] == pytest.approx(1.0)
+    assert np.isfinite(nodes).all()
+
+
+def test_blocks_at_the_border_may_be_cut() -> None:
+    nodes = means(np.full((6, 7), 2.0), grid_rays(6, 7), np.ones((6, 7)), 4)
+    assert nodes.shape[:2] == (2, 2)
+    assert nodes[..., W] == pytest.approx(0.5)
+    assert nodes[1, 1, AREA] == pytest.approx(6 * 1e-4, rel=1e-4)
+
+
+def roof(shape: tuple[int, int] = (24, 32)) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes that see two planes meet in a vertical edge at x = 0, and 1 for the right one."""
+    rays = grid_rays(*shape, pitch=0.02).astype(float)
+    nodes = np.zeros((*shape, COLUMNS))
+    nodes[..., X], nodes[..., Y] = rays[..., 0] + 0.01, rays[..., 1]
+    right = nodes[..., X] > 0
+    nodes[..., W] = 0.3 + np.where(right, 0.3, -0.2) * nodes[..., X]
+    return nodes, right
+
+
+def test_planes_reach_up_to_an_edge_and_do_not_cut_it_off() -> None:
+    nodes, right = roof()
+    fitted(nodes)
+    np.testing.assert_allclose(nodes[..., A], np.where(right, 0.3, -0.2), atol=1e-9)
+    np.testing.assert_allclose(nodes[..., B], 0, atol=1e-9)
+    np.testing.assert_allclose(nodes[..., C], 0.3, atol=1e-9)
+
+
+def test_what_is_not_flat_gets_no_plane() -> None:
+    nodes, _ = roof()
+    nodes[..., W] *= np.random.default_rng(0).uniform(0.9, 1.1, nodes.shape[:2])
+    fitted(nodes)
+    assert (nodes[..., C] != 0).mean() < 0.05
+
+
+def test_spread_carries_a_bias_to_its_own_surface_only() -> None:
+    rays = grid_rays(48, 64)
+    right = rays[..., 0] > 0.045
+    z = np.where(right, 1.0, 2.0).astype(np.float32)
+    z[5, 5] = 0
+    nodes = fitted(means(z, rays, np.ones_like(z), 4))
+    near = nodes[..., W] > 0.75
+    shift, factor = np.where(near, 0.0, 0.1), np.where(near, 1.0, 1.5)
+    z_out, factor_out = np.empty_like(z), np.empty_like(z)
+    for a, b in ((0, 20), (20, 48)):
+        kernels.spread(nodes, shift, factor, z, rays, 4, 0.03, a, b, z_out, factor_out)
+    wanted = z - np.where(right, 0.0, 0.1) / np.sqrt(1 + (rays**2).sum(-1))
+    seen = z > 0
+    np.testing.assert_allclose(z_out[seen], wanted[seen], atol=1e-3)
+    np.testing.assert_allclose(factor_out[seen], np.where(right, 1.0, 1.5)[seen], atol=1e-2)
+    assert z_out[5, 5] == 0
+
+
+def test_flat_nodes_are_counted_on_planes_and_not_on_bent_ones() -> None:
+    nodes, _ = roof()
+    bent = nodes.copy()
+    bent[..., W] *= 1 + bent[..., X] ** 2
+    flat = kernels.flat_nodes(fitted(nodes), 4, 0.1, 0.003)
+    assert flat > 5000
+    assert kernels.flat_nodes(fitted(bent), 4, 0.1, 0.003) < 0.8 * flat

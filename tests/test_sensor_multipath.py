@@ -1,0 +1,345 @@
+"""Compensation of light that surfaces reflect onto each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.filters.multipath import Multipath, light_image
+from tofuse.geometry.cameras import Pinhole, ray_lengths
+from tofuse.kernels.threads import threads
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
+from tofuse.sensor.multipath import GainEstimator, Interference, LightImage, Reflections
+from tofuse.simulation import record
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.render import render
+
+CAMERA = Pinhole(60, 48, 54.0, 54.0, 29.5, 23.5)
+PERIOD_M = 5.0
+GAIN = 900.0
+HALF = np.sqrt(0.5)
+# Planes n . x = d, seen from inside.
+LEFT, RIGHT = ((HALF, 0.0, -HALF), -3 * HALF), ((-HALF, 0.0, -HALF), -3 * HALF)
+FLOOR = ((0.0, -1.0, 0.0), -0.9)
+WALL = ((0.2, 0.1, -0.9747), -2.5)
+
+Plane = tuple[tuple[float, float, float], float]
+
+
+class Seen:
+    """Planes that enclose the camera, and the light that it gets from them, summed brute force.
+
+    One bounce, between the pixels of the image alone; no shadows, as there are none in a convex
+    room.
+    """
+
+    def __init__(self, *planes: Plane, albedo: float = 0.6, camera: Pinhole = CAMERA) -> None:
+        self.camera = camera
+        rays = camera.rays().astype(float)
+        length = ray_lengths(camera).astype(float)
+        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) / length[..., None]
+        normals = np.array([n for n, _ in planes])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        offsets = np.array([d for _, d in planes])
+        along = directions @ normals.T
+        reach = np.where(along < -1e-9, offsets / np.minimum(along, -1e-9), np.inf)
+        self.plane = reach.argmin(-1)
+        self.range = reach.min(-1)
+        n = normals[self.plane].reshape(-1, 3)
+        d = directions.reshape(-1, 3)
+        r = self.range.ravel()
+        cosine = -(n * d).sum(1)
+        half = length.ravel() ** -2.0
+        lit = half * cosine / r**2
+        x = d * r[:, None]
+        area = (r**2 / cosine) / (camera.fx * camera.fy * length.ravel() ** 3)
+        k = np.pi / PERIOD_M
+        light = np.zeros(len(r), complex)
+        for part in np.array_split(np.arange(len(r)), 40) if len(planes) > 1 else ():
+            step = x[part, None] - x[None]
+            square = np.maximum((step**2).sum(-1), 1e-9)
+            leaving = np.clip(np.einsum("pqc,qc->pq", step, n), 0, None)
+            arriving = np.clip(-np.einsum("pqc,pc->pq", step, n[part]), 0, None)
+            factor = leaving * arriving * area / (square * (np.pi * square + area))
+            phase = k * (np.sqrt(square) + r)
+            light[part] = (factor * albedo * lit * np.exp(1j * phase)).sum(1)
+        measured = lit * np.exp(2j * k * r) + light * np.exp(1j * k * r)
+        shape = self.range.shape
+        self.bias = (np.angle(measured * np.exp(-2j * k * r)) / (2 * k)).reshape(shape)
+        self.raw = (GAIN * albedo * half * np.abs(measured)).reshape(shape)
+        self.own = (GAIN * albedo * half * lit).reshape(shape)
+        self.length = length
+
+    @property
+    def image(self) -> LightImage:
+        z = ((self.range + self.bias) / self.length).astype(np.float32)
+        return LightImage(z, self.camera.rays(), self.raw.astype(np.float32), PERIOD_M)
+
+    def frame(self, **changes: object) -> RangeFrame:
+        image = self.image
+        frame = RangeFrame(3, 0.1, self.camera, image.z, "z", image.light, ambiguity_m=PERIOD_M)
+        return replace(frame, **changes)  # type: ignore[arg-type]
+
+    def errors(self, z: np.ndarray) -> np.ndarray:
+        """Error of the radial range in m."""
+        return z * self.length - self.range
+
+
+@pytest.fixture(scope="module")
+def corner() -> Seen:
+    return Seen(LEFT, RIGHT, FLOOR)
+
+
+# No light from beyond the image: there is none in `Seen`.
+REFLECTIONS = Reflections(columns=30, lamp=0.1)
+EVERY_PIXEL = Reflections(columns=60, lamp=0.1)
+
+
+def solved(seen: Seen, reflections: Reflections = REFLECTIONS, gain: float = GAIN) -> Interference:
+    found = reflections.solve(seen.image, gain)
+    assert found is not None
+    return found
+
+
+def angles_deg(seen: Seen, z: np.ndarray) -> np.ndarray:
+    """Angles between planes fitted to each pair of surfaces."""
+    rays = seen.camera.rays().astype(float)
+    points = np.concatenate([rays, np.ones((*z.shape, 1))], -1) * z[..., None]
+    normals = []
+    for k in np.unique(seen.plane):
+        p = points[seen.plane == k]
+        normals.append(np.linalg.svd(p - p.mean(0), full_matrices=False)[2][2])
+    pairs = [abs(a @ b) for i, a in enumerate(normals) for b in normals[:i]]
+    return np.degrees(np.arccos(pairs))
+
+
+def test_the_bias_of_a_corner_is_found_with_its_sign_and_size(corner: Seen) -> None:
+    before = corner.errors(corner.image.z)
+    # Light on detours comes late: corners look too far away.
+    assert np.median(before) > 0.03
+    assert (before > 0).mean() > 0.95
+    exact = np.abs(corner.errors(solved(corner, EVERY_PIXEL).z))
+    assert np.median(exact) < 0.001
+    assert np.percentile(exact, 90) < 0.003
+    coarse = np.abs(corner.errors(solved(corner).z))
+    assert np.median(coarse) < np.median(before) / 10
+    assert np.percentile(coarse, 90) < np.percentile(before, 90) / 8
+
+
+def test_a_rounded_corner_becomes_square(corner: Seen) -> None:
+    assert np.abs(angles_deg(corner, corner.image.z) - 90).max() > 1.5
+    found = solved(corner, EVERY_PIXEL)
+    np.testing.assert_allclose(angles_deg(corner, found.z), 90, atol=0.3)
+
+
+def test_the_share_of_amplitude_is_found(corner: Seen) -> None:
+    found = solved(corner)
+    true = corner.raw / corner.own
+    assert np.median(true) > 1.05
+    assert np.median(np.abs(found.factor / true - 1)) < 0.02
+
+
+def test_more_iterations_come_closer(corner: Seen) -> None:
+    errors = [
+        np.abs(corner.errors(solved(corner, replace(REFLECTIONS, iterations=n)).z)).mean()
+        for n in (1, 2, 3)
+    ]
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_all_bounces_take_out_more_than_one(corner: Seen) -> None:
+    one = solved(corner).z
+    every = solved(corner, replace(REFLECTIONS, bounces="all")).z
+    assert np.median(every - one) < -0.002
+
+
+def test_light_from_beyond_the_image_takes_out_more(corner: Seen) -> None:
+    assert np.median(solved(corner, replace(REFLECTIONS, lamp=1.3)).z - solved(corner).z) < -0.002
+
+
+def test_only_the_ratio_of_amplitude_and_gain_counts(corner: Seen) -> None:
+    brighter = replace(corner.image, light=corner.image.light * np.float32(8))
+    found = REFLECTIONS.solve(brighter, 8 * GAIN)
+    assert found is not None
+    np.testing.assert_allclose(found.z, solved(corner).z, atol=1e-5)
+
+
+def test_a_flat_wall_stays_where_it_is() -> None:
+    rng = np.random.default_rng(0)
+    wall = Seen(WALL)
+    image = wall.image
+    noisy = image.z * (1 + 0.003 * rng.normal(size=image.z.shape).astype(np.float32))
+    for z in (image.z, noisy):
+        found = REFLECTIONS.solve(replace(image, z=z), GAIN)
+        assert found is not None
+        assert np.abs(found.z - z).max() < 0.0005
+
+
+def test_a_convex_edge_stays_where_it_is() -> None:
+    rays = CAMERA.rays().astype(float)
+    # Two faces that fall back from the edge at x = 0.
+    z = (2 / (1 - 0.7 * np.abs(rays[..., 0]))).astype(np.float32)
+    found = REFLECTIONS.solve(LightImage(z, CAMERA.rays(), np.full_like(z, 100), PERIOD_M), GAIN)
+    assert found is not None
+    assert np.abs(found.z - z).max() < 0.0005
+
+
+@pytest.mark.parametrize("albedo", [0.25, 0.6, 0.9])
+def test_the_gain_is_found_from_how_surfaces_bend(albedo: float) -> None:
+    seen = Seen(LEFT, RIGHT, FLOOR, albedo=albedo)
+    estimator = GainEstimator(EVERY_PIXEL)
+    for _ in range(4):
+        estimator.add(seen.image)
+    assert estimator.gain is not None
+    assert GAIN / 1.7 < estimator.gain < GAIN * 1.7
+    found = solved(seen, gain=estimator.gain)
+    before, after = seen.errors(seen.image.z), seen.errors(found.z)
+    assert np.median(np.abs(after)) < 0.6 * np.median(np.abs(before))
+
+
+def test_without_bends_the_brightest_tenth_is_taken_for_white_paint() -> None:
+    wall = Seen(WALL, albedo=0.35)
+    estimator = GainEstimator(REFLECTIONS)
+    assert estimator.gain is None
+    estimator.add(wall.image)
+    assert estimator.gain == pytest.approx(GAIN * 0.35 / GainEstimator.ALBEDO, rel=0.15)
+
+
+def test_the_gain_settles(corner: Seen) -> None:
+    estimator = GainEstimator(replace(REFLECTIONS, columns=16, iterations=1))
+    looked = 0
+    for _ in range(GainEstimator.EVERY * GainEstimator.MOST + 40):
+        before = len(estimator._bright)
+        estimator.add(corner.image)
+        looked += len(estimator._bright) - before
+    assert looked == GainEstimator.MOST
+
+
+def test_nothing_to_compute_from_gives_nothing() -> None:
+    dark = replace(Seen(WALL).image, light=np.zeros((48, 60), np.float32))
+    empty = replace(dark, z=np.zeros((48, 60), np.float32))
+    for image in (dark, empty):
+        assert REFLECTIONS.solve(image, GAIN) is None
+        estimator = GainEstimator(REFLECTIONS)
+        estimator.add(image)
+        assert estimator.gain is None
+
+
+def test_the_part_corrects_depth_of_both_kinds_and_amplitude_of_both_kinds(corner: Seen) -> None:
+    found = solved(corner, Reflections(columns=30, lamp=1.0))
+    part = Multipath(gain=GAIN, lamp=1.0, columns=30)
+    frame = corner.frame()
+    fixed = part.start().apply(frame)
+    assert isinstance(fixed, RangeFrame)
+    assert fixed.amplitude_image is not None
+    np.testing.assert_allclose(fixed.depth, found.z, rtol=1e-6)
+    np.testing.assert_allclose(fixed.amplitude_image, corner.raw / found.factor, rtol=1e-5)
+
+    far = part.start().apply(replace(frame, depth=frame.radial_range, depth_kind="range"))
+    assert isinstance(far, RangeFrame)
+    np.testing.assert_allclose(far.depth, fixed.radial_range, rtol=1e-5)
+
+    white = corner.raw * frame.radial_range**2 * corner.length**4
+    even = part.start().apply(
+        replace(
+            frame,
+            amplitude_image=white.astype(np.float32),
+            amplitude_kind="range_compensated",
+        )
+    )
+    assert isinstance(even, RangeFrame)
+    assert even.amplitude_image is not None
+    np.testing.assert_allclose(even.depth, fixed.depth, rtol=1e-4)
+    wanted = fixed.amplitude_image * fixed.radial_range**2 * corner.length**4
+    np.testing.assert_allclose(even.amplitude_image, wanted, rtol=1e-3)
+
+
+def test_what_is_not_known_is_left_alone(corner: Seen) -> None:
+    frame = corner.frame()
+    cloud = CloudFrame.of(frame.points)
+    for given in (
+        replace(frame, amplitude_image=None),
+        replace(frame, ambiguity_m=None),
+        replace(frame, ambiguity_m=18.7),
+        replace(frame, amplitude_kind="ir"),
+        replace(frame, depth=np.zeros_like(frame.depth)),
+        replace(frame, amplitude_image=np.zeros_like(frame.depth)),
+        cloud,
+    ):
+        assert Multipath().start().apply(given) is given
+    assert Multipath(period_m=5.0).start().apply(replace(frame, ambiguity_m=None)) is not frame
+
+
+def test_holes_stay_holes_and_bad_numbers_do_no_harm(corner: Seen) -> None:
+    rng = np.random.default_rng(4)
+    frame = corner.frame()
+    assert frame.amplitude_image is not None
+    holes = rng.random(frame.depth.shape) < 0.1
+    amplitude = frame.amplitude_image.copy()
+    for value in (np.nan, np.inf, -5.0, 0.0, SATURATED_AMPLITUDE):
+        amplitude[rng.random(amplitude.shape) < 0.02] = value
+    bad = frame.keep(~holes)
+    bad = replace(bad, amplitude_image=amplitude)
+    fixed = Multipath(gain=GAIN, lamp=1.0, columns=30).start().apply(bad)
+    assert isinstance(fixed, RangeFrame)
+    assert (fixed.valid == bad.valid).all()
+    assert np.isfinite(fixed.depth).all()
+    assert fixed.amplitude_image is not None
+    assert (fixed.amplitude_image[amplitude == SATURATED_AMPLITUDE] == SATURATED_AMPLITUDE).all()
+    error = np.abs(corner.errors(fixed.z))[bad.valid]
+    assert np.median(error) < np.median(corner.bias) / 5
+
+    noise = RangeFrame(
+        0, 0.0, CAMERA, rng.uniform(0.05, 5, (48, 60)).astype(np.float32), "z",
+        rng.uniform(0, 9000, (48, 60)).astype(np.float32), ambiguity_m=5.0,
+    )  # fmt: skip
+    fixed = Multipath().start().apply(noise)
+    assert isinstance(fixed, RangeFrame)
+    assert (fixed.valid == noise.valid).all()
+
+
+def test_threads_change_nothing(corner: Seen) -> None:
+    results = []
+    for count in (1, 2, 3):
+        with threads(count):
+            corrector = Multipath().start()
+            for _ in range(2):
+                fixed = corrector.apply(corner.frame())
+            assert isinstance(fixed, RangeFrame)
+            assert fixed.amplitude_image is not None
+            results.append(fixed.depth.tobytes() + fixed.amplitude_image.tobytes())
+    assert len(set(results)) == 1
+
+
+def test_options_that_make_no_sense_are_refused() -> None:
+    for options in (
+        {"gain": 0.0},
+        {"period_m": -1.0},
+        {"iterations": 0},
+        {"columns": 4},
+        {"lamp": 0.5},
+    ):
+        with pytest.raises(ValueError, match="must be"):
+            Multipath(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("texture", "share"), [(True, 2.5), (False, 2.5)])
+def test_the_simulated_corner_comes_closer_to_the_truth(texture: bool, share: float) -> None:
+    plan = record.plan("corner", effects=Effects.none(multipath=True), texture=texture)
+    corrector = Multipath().start()
+    before, after = [], []
+    for k in (0, 30):
+        rendered = render(plan.scene, plan.sequence, plan.model, k, effects=plan.effects)
+        frame = rendered.frame
+        image = light_image(frame)
+        assert image is not None
+        fixed = corrector.apply(frame)
+        assert isinstance(fixed, RangeFrame)
+        seen = frame.valid & (rendered.depth > 0)
+        before.append(np.abs(frame.depth - rendered.depth)[seen])
+        after.append(np.abs(fixed.depth - rendered.depth)[seen])
+    assert np.median(before) > 0.025
+    assert np.median(after) < np.median(before) / share
+    assert np.percentile(after, 90) < np.percentile(before, 90) / share
