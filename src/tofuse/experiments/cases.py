@@ -30,7 +30,7 @@ METHODS = ("thesis", "default")
 GUESSES = ("identity", "previous")
 # Which 1000 points a registration draws decides much, so that one draw says little.
 DRAWS = 3
-_MODEL_POINTS = 400_000
+_MODEL_POINTS = 200_000
 CHEST = (0.88, 0.94)  # heights of a band around the torso, m above the floor
 
 
@@ -311,14 +311,14 @@ def build_model(
     """Put frames together by poses (N, 4, 4), NaN where lost, and measure the model."""
     assert poses is not None
     total = sum(len(f) for f in frames)
-    step = max(1, total // _MODEL_POINTS)
+    step = max(1, -(-total // _MODEL_POINTS))
     parts = [
-        se3.transform(recorded.T_truth_world @ T, frame.points[:: max(1, step)])
+        se3.transform(recorded.T_truth_world @ T, frame.points[::step])
         for frame, T in zip(frames, poses, strict=True)
         if np.isfinite(T[0, 0])
     ]
     points = np.concatenate(parts)
-    sizes = {"surface_error_m": measures.surface_error_m(points, recorded.surface)}
+    sizes = {"surface_error_m": measures.surface_error_m(points, recorded.surface_tree)}
     fit = None
     if case.scene in ("room", "empty-room"):
         extent = measures.extent_m(points)

@@ -223,7 +223,7 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         axes.plot(flat[0][:, 0], flat[0][:, 1], "o-", color=BEFORE, markersize=4, linewidth=1)
         axes.set_xlim(box[0, 0], box[1, 0])
         axes.set_ylim(box[0, 1], box[1, 1])
-        axes.set_aspect("equal", "datalim")
+        axes.set_aspect("equal", "box")
         _label(axes, "x, m", f"{name} optimisation — z, m")
         drawn.append(svg(figure, f"The synthetic case {name} optimisation, from above"))
     return drawn[0], drawn[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,13 @@ class Recorded:
         """(K, 3) random points on the true surface, in its own frame (z up), m."""
         vertices, faces = self.made.scene.truth_mesh()
         return sample_surface(vertices[faces], 60_000)
+
+    @cached_property
+    def surface_tree(self) -> Any:
+        """`surface` as a SciPy cKDTree."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.surface)
 
 
 def record_scene(

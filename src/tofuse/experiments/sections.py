@@ -190,7 +190,9 @@ def _plans(
     outlines = _outlines(result)
     groups = [about(r.model_after) for r in shown.values()]
     groups += [about(r.model_before) for r in shown.values()]
-    frame = figures.plan_limits(*groups, about(result.perfect), *outlines, truth)
+    # Cameras around an object stay outside the picture, or the object would be small in it.
+    seen = [] if shown[METHODS[0]].case in ("torso", "box") else [truth]
+    frame = figures.plan_limits(*groups, about(result.perfect), *outlines, *seen)
 
     def draw(model: Model, cameras: Float64, title: str, method: str) -> Figure:
         label = f"{result.case.title} from above, {method}, {title}"

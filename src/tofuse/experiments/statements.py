@@ -142,7 +142,11 @@ def _slower_is_better(results: Results, method: str) -> Finding:
     for run in results.cases["rail"].select(method, "identity"):
         turn = int(np.linalg.norm(run.truth[:, :3, 3], axis=1).argmax())
         step = run.score_before.step_m
-        errors.append((np.nanmean(step[: turn + 1]), np.nanmean(step[turn + 1 :])))
+        legs = [leg[np.isfinite(leg)] for leg in (step[: turn + 1], step[turn + 1 :])]
+        if all(len(leg) for leg in legs):
+            errors.append([float(leg.mean()) for leg in legs])
+    if not errors:
+        return Finding("disagrees", "The sequence ends before the way back.")
     out, back = zip(*errors, strict=True)
     return graded(
         [b < o for o, b in errors],

@@ -1,0 +1,131 @@
+"""What is measured on trajectories and models is what it says, on shapes that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from tofuse.experiments import measures
+from tofuse.experiments.recorded import record_scene, sample_surface
+from tofuse.geometry import se3
+from tofuse.simulation.record import simulate_recording
+
+
+def turning(step_deg: float, count: int) -> np.ndarray:
+    twist = np.zeros((count, 6))
+    twist[:, 4] = np.radians(step_deg) * np.arange(count)
+    return se3.exp(twist)
+
+
+def box_points(rng, widths, turn_deg=0.0, shift=(0.0, 0.0)) -> np.ndarray:
+    """Upright walls and the top of a box whose lower rim is at 0.9 m."""
+    a, b, height = widths
+    walls = rng.uniform(-0.5, 0.5, (6000, 3)) * [a, b, height]
+    side = rng.integers(4, size=6000)
+    for k, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1))):
+        walls[side == k, axis] = sign * (a, b)[axis] / 2
+    top = rng.uniform(-0.5, 0.5, (1500, 3)) * [a, b, 0] + np.array([0, 0, height / 2])
+    points = np.vstack([walls, top]) + np.array([0, 0, 0.9 + height / 2])
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    points[:, :2] = points[:, :2] @ np.array([[c, s], [-s, c]]) + shift
+    return points + rng.normal(0, 0.002, points.shape)
+
+
+@pytest.mark.parametrize(
+    ("widths", "turn"),
+    [((0.30, 0.30, 0.40), 0.0), ((0.33, 0.31, 0.42), 0.0), ((0.30, 0.34, 0.40), 25.0)],
+)
+def test_a_box_is_measured_whatever_its_size_and_turn(widths, turn):
+    points = box_points(np.random.default_rng(0), widths, turn, shift=(0.04, -0.03))
+    fit = measures.fit_box(points, 0.9, 0.4, 0.3)
+    np.testing.assert_allclose(np.sort(fit.widths_m), np.sort(widths[:2]), atol=0.003)
+    np.testing.assert_allclose(fit.angles_deg, 90, atol=0.6)
+    assert fit.height_m == pytest.approx(widths[2], abs=0.006)
+    np.testing.assert_allclose(fit.corners.mean(0), [0.04, -0.03], atol=0.003)
+
+
+def test_a_bent_box_shows_in_the_angles():
+    points = box_points(np.random.default_rng(1), (0.3, 0.3, 0.4))
+    points[:, 0] += np.tan(np.radians(6)) * points[:, 1]
+    angles = measures.fit_box(points, 0.9, 0.4, 0.3).angles_deg
+    np.testing.assert_allclose(np.sort(angles), [84, 84, 96, 96], atol=0.7)
+
+
+def test_girth_is_the_length_around():
+    rng = np.random.default_rng(2)
+    angle = rng.uniform(0, 2 * np.pi, 20_000)
+    z = rng.uniform(0, 1, 20_000)
+    body = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), z], 1) + np.array([1.0, 2.0, 0.0])
+    assert measures.girth_m(body, 0.4, 0.5) == pytest.approx(2 * np.pi * 0.2, rel=0.01)
+    wider = body.copy()
+    wider[z > 0.6, :2] = 1.1 * (wider[z > 0.6, :2] - [1, 2]) + [1, 2]
+    assert measures.girth_m(wider, 0.4, 0.5) == pytest.approx(2 * np.pi * 0.2, rel=0.01)
+    assert measures.girth_m(wider, 0.7, 0.8) == pytest.approx(2 * np.pi * 0.22, rel=0.01)
+    assert np.isnan(measures.girth_m(body, 5.0, 6.0))
+
+
+def test_path_scores_say_where_a_path_goes_wrong():
+    truth = np.tile(np.eye(4), (11, 1, 1))
+    truth[:, 0, 3] = 0.1 * np.arange(11)
+    path = truth.copy()
+    path[:, 1, 3] = 0.01 * np.arange(11)  # drifts in y
+    path[4] = np.nan
+    score = measures.score_path(path, truth)
+    assert score.end_m == pytest.approx(0.1)
+    assert score.end_deg == pytest.approx(0)
+    assert score.axes_rms_m[0] == score.axes_rms_m[2] == 0
+    assert score.axes_rms_m[1] == pytest.approx(0.01 * np.sqrt(36.9))
+    assert np.isnan(score.step_m[[0, 4, 5]]).all()
+    np.testing.assert_allclose(score.step_m[[1, 2, 3, 6, 10]], 0.01)
+    # Alignment takes the tilt of the straight path away, nothing else would.
+    assert score.ate_m < 0.02
+
+
+def test_turns_are_counted_beyond_a_whole_one():
+    poses = turning(20.0, 28)  # 540 degrees
+    up = np.array([0.0, 1.0, 0.0])
+    assert measures.turned_deg(poses, up)[-1] == pytest.approx(540)
+    assert measures.turned_deg(poses, -up)[-1] == pytest.approx(-540)
+    poses[5] = np.nan
+    assert measures.turned_deg(poses, up)[-1] == pytest.approx(500)
+
+
+def test_lines_and_circles():
+    t = np.linspace(0, 1, 50)
+    line = np.stack([t, 2 * t, -t], 1)
+    assert measures.straightness_m(line) == pytest.approx(0, abs=1e-12)
+    bent = line + np.stack([0 * t, 0 * t, 0.1 * np.sign(np.arange(50) % 2 - 0.5)], 1)
+    assert measures.straightness_m(bent) == pytest.approx(0.1 * np.sqrt(5 / 6), rel=0.02)
+    arc = 1.4 * np.stack([np.cos(4 * t), 0 * t, np.sin(4 * t)], 1) + [3, 2, 1]
+    arc[3] = np.nan
+    assert measures.circle_radius_m(arc) == pytest.approx(1.4)
+
+
+def test_displacement_joins_position_and_orientation():
+    a, b = turning(0, 2), turning(0, 2)
+    b[0, 0, 3] = 0.3
+    turn = np.zeros(6)
+    turn[4] = 0.1
+    b[1] = b[1] @ se3.exp(turn)
+    np.testing.assert_allclose(measures.displacement_m(a, b), [0.3, 4 * np.sin(0.05)])
+
+
+def test_the_distance_from_a_surface_is_that_of_the_model():
+    square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
+    surface = sample_surface(square, 60_000)
+    assert (np.histogram2d(*surface[:, :2].T, bins=4)[0] > 60_000 / 16 * 0.9).all()
+    above = np.random.default_rng(3).uniform(0, 1, (5000, 3)) * [1, 1, 0] + [0, 0, 0.05]
+    assert measures.surface_error_m(above, cKDTree(surface)) == pytest.approx(0.05, abs=1e-3)
+
+
+def test_frames_of_a_stride_are_those_of_a_recording_with_that_stride():
+    recorded = record_scene("rail", (2, 3), 1, limit=7)
+    assert recorded.made.raw.tolist() == [0, 2, 3, 4, 6]
+    ours, reference = recorded.every(3), simulate_recording("rail", every=3, frames=3, seed=1)
+    assert len(ours) == len(reference) == 3
+    np.testing.assert_array_equal(ours.reference, reference.reference)
+    np.testing.assert_array_equal(ours.timestamps, reference.timestamps)
+    for a, b in zip(ours, reference, strict=True):
+        np.testing.assert_array_equal(a.depth, b.depth)
+        np.testing.assert_array_equal(a.confidence_image, b.confidence_image)

@@ -1,0 +1,155 @@
+"""The experiments' page: what is judged follows the numbers, and nothing of others is touched."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError, OutputError
+from tofuse.experiments.page import run_experiments
+from tofuse.experiments.peaks import PeaksSweep
+from tofuse.experiments.statements import STATEMENTS, Results, graded, judge_all
+from tofuse.experiments.statements import _straighter as straighter
+
+
+@pytest.fixture(scope="module")
+def peaks_page(tmp_path_factory):
+    out = tmp_path_factory.mktemp("experiments") / "peaks"
+    return run_experiments(out, cases=("peaks",), seeds=2)
+
+
+@pytest.fixture(scope="module")
+def rail_page(tmp_path_factory):
+    out = tmp_path_factory.mktemp("experiments") / "rail"
+    return run_experiments(out, cases=("rail",), limit=12, draws=1)
+
+
+def read(page):
+    return json.loads((page.parent / "results.json").read_text(encoding="utf-8"))
+
+
+def test_a_mean_grade_decides():
+    assert graded([1, 1, 1], "").outcome == "agrees"
+    assert graded([0, 0, 0], "").outcome == "disagrees"
+    assert graded([1, 0, 0.5], "").outcome == "partly"
+    assert graded([1, 0.5], "So.").numbers == "So. Holds in 1 of 2 draws."
+
+
+def test_names_are_unique():
+    names = [s.name for s in STATEMENTS]
+    assert len(set(names)) == len(names) >= 20
+
+
+def test_the_sweep_is_judged_by_its_numbers():
+    sigmas = np.arange(1, 11) / 100
+    axes = np.ones((10, 2, 6))
+    axes[:, 0] += np.array([2, 0.1, 2, 3, 0.5, 0.5]) * np.maximum(sigmas - 0.04, 0)[:, None]
+    position = np.stack([np.where(sigmas > 0.05, 2.0, 0.1), np.full(10, 0.05)], 1)
+    sweep = PeaksSweep(sigmas, position, position, axes, 0 * axes, ())
+    chosen = {s.name: s for s in STATEMENTS}
+
+    def outcome(name, sweep):
+        return chosen[name].judge(Results({}, sweep), "thesis").outcome
+
+    for name in ("threshold", "improves", "y", "x-z", "more-noise", "yaw"):
+        assert outcome(f"peaks-{name}", sweep) == "agrees"
+    worse = replace(
+        sweep, axes=axes[:, ::-1], position=position[:, ::-1], rotation=position[:, ::-1]
+    )
+    for name in ("improves", "y", "more-noise", "yaw"):
+        assert outcome(f"peaks-{name}", worse) == "disagrees"
+    assert outcome("peaks-threshold", replace(sweep, position=position + 1)) == "partly"
+
+
+def test_peaks_alone_gives_a_page_and_its_numbers(peaks_page):
+    data = read(peaks_page)
+    assert (data["kind"], data["parameters"]["seeds"]) == ("experiments", 2)
+    assert data["cases"] == {}
+    assert {s["section"] for s in data["statements"]} == {"5.6"}
+    error = data["peaks"]["position_m"]
+    assert len(error["sequential"]) == 10
+    assert error["optimised"][-1] < error["sequential"][-1]
+    text = peaks_page.read_text(encoding="utf-8")
+    for outside in ("http://", "https://", "<script", "@import"):
+        assert outside not in text
+    # Six panels, and the example before and after.
+    assert text.count('<svg class="plot"') == 8
+    assert "“The yaw-angle is most improved.”" in text
+
+
+def test_a_scene_is_run_in_every_way(rail_page):
+    data = read(rail_page)
+    runs = data["cases"]["rail"]["runs"]
+    ways = {(r["method"], r["stride"], r["guess"]) for r in runs}
+    assert len(runs) == len(ways) == 2 * 3 * 2
+    assert {r["stride"] for r in runs} == {3, 5, 7}
+    for run in runs:
+        assert run["frames"] == run["with_pose"] == -(-12 // run["stride"])
+        assert run["before"]["end_error_m"] < 0.1
+    # The same frames by the true poses lie on the true surface.
+    assert data["cases"]["rail"]["true_poses"]["surface_error_m"] < 0.03
+    judged = {s["name"]: s for s in data["statements"]}
+    assert set(judged) == {s.name for s in STATEMENTS if s.needs == ("rail",)}
+    for s in judged.values():
+        assert set(s["findings"]) == {"thesis", "default"}
+    text = rail_page.read_text(encoding="utf-8")
+    assert "Translation of the camera" in text
+    assert "nan" not in text.lower().replace("tofu", "")
+
+
+def test_one_seed_one_result(peaks_page, tmp_path):
+    again = run_experiments(tmp_path / "again", cases=("peaks",), seeds=2)
+    first, second = read(peaks_page), read(again)
+    del first["seconds"], second["seconds"]
+    assert first == second
+
+
+def test_only_earlier_experiments_are_replaced(peaks_page, tmp_path):
+    with pytest.raises(OutputError, match="overwrite"):
+        run_experiments(peaks_page.parent, cases=("peaks",), seeds=1)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="not empty"):
+            run_experiments(other, cases=("peaks",), seeds=1, overwrite=overwrite)
+    assert [p.name for p in other.iterdir()] == ["thesis.tex"]
+    before = read(peaks_page)
+    with pytest.raises(InputError, match="no case 'sofa'"):
+        run_experiments(peaks_page.parent, cases=("sofa",), overwrite=True)
+    assert read(peaks_page) == before
+
+
+def test_unknown_cases_leave_nothing_behind(tmp_path):
+    with pytest.raises(InputError, match="use some of"):
+        run_experiments(tmp_path / "new", cases=("peaks", "sofa"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_nothing_is_judged_without_its_case():
+    assert judge_all(Results({}, None), ("thesis",)) == ()
+
+
+def test_straightness_follows_the_trajectories():
+    class Runs:
+        def __init__(self, *runs):
+            self.runs = runs
+
+        def select(self, _method, _guess="previous"):
+            return self.runs
+
+    straight = np.tile(np.eye(4), (20, 1, 1))
+    straight[:, 0, 3] = np.linspace(0, 1, 20)
+    bent = straight.copy()
+    bent[:, 1, 3] = np.linspace(0, 1, 20) ** 2
+
+    class Run:
+        def __init__(self, before, after):
+            self.before, self.after = before, after
+
+    good, bad = Run(bent, straight), Run(straight, bent)
+    for runs, outcome in (((good, good), "agrees"), ((good, bad), "partly"), ((bad,), "disagrees")):
+        assert straighter(Results({"rail": Runs(*runs)}, None), "thesis").outcome == outcome
