@@ -2,9 +2,9 @@
 
 Four tables: time a frame over resolution; time and memory over the number of frames, the sequence
 going forth and back; the first-ever compilation, in a process of its own with an empty cache; and
-each kernel's own time on one thread, beside the time that the machine needs to move the bytes that
-the kernel must touch (CPU time, each array once). The frames are those of a made room, or of a recording. All but the
-compilation is warm.
+each kernel's own CPU time on one thread, beside the time that the machine needs to move the bytes
+that the kernel must touch, which are those of its arrays, each once. The frames are those of a
+made room, or of a recording. All but the compilation is warm.
 
     python benchmarks/scaling.py [RECORDING] [--columns 160 320 640] [--counts 500 1000 5000]
 """
@@ -42,6 +42,11 @@ LENGTH = 60  # frames of the sequence that goes forth and back
 BANDWIDTH_BYTES = 1 << 28
 
 
+def made_pose(k: int) -> Float64:
+    """T_world_camera (4, 4) of the k-th frame of the made room."""
+    return se3.exp([0.5 * np.sin(0.02 * k), 0, 0.004 * k, 0.1 * np.sin(0.05 * k), 0.012 * k, 0])
+
+
 def made_frames(columns: int, count: int) -> list[RangeFrame]:
     """Look round a room of 5 x 4 x 3 m with two boxes in it, with 2 mm of noise at 1 m."""
     rows = columns * 3 // 4
@@ -50,37 +55,39 @@ def made_frames(columns: int, count: int) -> list[RangeFrame]:
     directions = np.concatenate([rays, np.ones((rows, columns, 1))], -1).reshape(-1, 3)
     frames = []
     for k in range(count):
-        T = se3.exp([0.5 * np.sin(0.02 * k), 0, 0.004 * k, 0.1 * np.sin(0.05 * k), 0.012 * k, 0])
-        z = _room(T[:3, 3], directions @ T[:3, :3].T).reshape(rows, columns)
+        T = made_pose(k)
+        outward = directions @ T[:3, :3].T
+        z, axis = _room(T[:3, 3], outward)
+        points = T[:3, 3] + z[:, None] * outward
+        length = np.linalg.norm(outward, axis=1)
+        cosine = np.abs(np.take_along_axis(outward, axis[:, None], 1)[:, 0]) / length
+        albedo = 0.5 + 0.2 * np.sin(7 * points).sum(1) / 3
+        light = 4000 * albedo * cosine / (z * length) ** 2
         rng = np.random.default_rng([0, columns, k])
         z = z + 0.002 * z * z * rng.standard_normal(z.shape)
-        light = np.full(z.shape, 1000.0) / np.maximum(z, 0.1) ** 2
-        frames.append(
-            RangeFrame(
-                k,
-                k / 30,
-                camera,
-                z.astype(np.float32),
-                amplitude_image=(light * (1 + 0.3 * np.sin(9 * z))).astype(np.float32),
-            )
-        )
+        light = light * (1 + 0.01 * rng.standard_normal(z.shape))
+        depth, amplitude = (image.reshape(rows, columns).astype(np.float32) for image in (z, light))
+        frames.append(RangeFrame(k, k / 30, camera, depth, amplitude_image=amplitude))
     return frames
 
 
-def _room(origin: Float64, directions: Float64) -> Float64:
-    """z of what rays of unit z hit, from inside a box and from outside two smaller ones."""
+def _room(origin: Float64, directions: Float64) -> tuple[Float64, NDArray[np.intp]]:
+    """z of what rays of unit z hit, from inside a box and from outside two more, and its axis."""
     with np.errstate(divide="ignore"):
         inverse = 1 / directions
     low, high = np.array([-2.5, -1.5, -1.0]), np.array([2.5, 1.5, 3.0])
-    nearest = (np.where(directions > 0, high - origin, low - origin) * inverse).min(1)
+    walls = np.where(directions > 0, high - origin, low - origin) * inverse
+    nearest, axis = walls.min(1), walls.argmin(1)
     for low, high in (
-        ((-1.2, 0.5, 1.2), (-0.4, 1.5, 2.0)),
-        ((0.6, 0.2, 1.8), (1.3, 1.5, 2.4)),
+        (np.array([-1.2, 0.5, 1.2]), np.array([-0.4, 1.5, 2.0])),
+        (np.array([0.6, 0.2, 1.8]), np.array([1.3, 1.5, 2.4])),
     ):
-        a, b = (np.array(low) - origin) * inverse, (np.array(high) - origin) * inverse
-        enter, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-        nearest = np.where((enter < leave) & (enter > 0), np.minimum(nearest, enter), nearest)
-    return nearest
+        a, b = (low - origin) * inverse, (high - origin) * inverse
+        first = np.minimum(a, b)
+        enter, leave = first.max(1), np.maximum(a, b).min(1)
+        hit = (enter < leave) & (enter > 0) & (enter < nearest)
+        nearest, axis = np.where(hit, enter, nearest), np.where(hit, first.argmax(1), axis)
+    return nearest, axis
 
 
 def recorded_frames(path: str, count: int) -> list[RangeFrame]:
