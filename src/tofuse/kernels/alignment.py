@@ -168,13 +168,6 @@ def accumulate(
         J[3] = py * m2 - pz * m1
         J[4] = pz * m0 - px * m2
         J[5] = px * m1 - py * m0
-        q = 0
-        for p in range(6):
-            gj = g * J[p]
-            out[GEOMETRY_G + p] += gj * r
-            for o in range(p, 6):
-                out[GEOMETRY_H + q] += gj * J[o]
-                q += 1
         if known:
             K[0] = s0
             K[1] = s1
@@ -187,6 +180,15 @@ def accumulate(
                 for o in range(p, 6):
                     out[CROSS_G + q] += 0.5 * g * (J[p] * K[o] + K[p] * J[o])
                     q += 1
+            for p in range(6):
+                J[p] = 0.5 * (J[p] + K[p])
+        q = 0
+        for p in range(6):
+            gj = g * J[p]
+            out[GEOMETRY_G + p] += gj * r
+            for o in range(p, 6):
+                out[GEOMETRY_H + q] += gj * J[o]
+                q += 1
 
         tx = np.float64(target_photo[i, j, 1])
         ty = np.float64(target_photo[i, j, 2])
@@ -222,13 +224,6 @@ def accumulate(
         J[4] = pz * m0 - px * m2
         J[5] = px * m1 - py * m0
         J[6] = -1.0
-        q = 0
-        for p in range(7):
-            gj = g * J[p]
-            out[PHOTO_G + p] += gj * rp
-            for o in range(p, 7):
-                out[PHOTO_H + q] += gj * J[o]
-                q += 1
         gx = np.float64(source_photo[k, 1])
         gy = np.float64(source_photo[k, 2])
         if not np.isnan(gx):
@@ -247,6 +242,15 @@ def accumulate(
                 for o in range(p, 7):
                     out[CROSS_P + q] += 0.5 * g * (J[p] * K[o] + K[p] * J[o])
                     q += 1
+            for p in range(6):
+                J[p] = 0.5 * (J[p] + K[p])
+        q = 0
+        for p in range(7):
+            gj = g * J[p]
+            out[PHOTO_G + p] += gj * rp
+            for o in range(p, 7):
+                out[PHOTO_H + q] += gj * J[o]
+                q += 1
     return out
 
 

@@ -115,16 +115,24 @@ def fit_planes(
     sums: Float64,
     radii: NDArray[np.int64],
     limit: float,
+    fill: float,
+    offset: float,
     planes: Float32,
     quality: Float32,
     start: int,
     stop: int,
 ) -> None:
-    """Fit a plane at each pixel of rows start..stop, over the widest window that is one surface.
+    """Fit a plane at each pixel of rows start..stop: its slope over the widest window that is one
+    surface, its depth over the smallest.
+
+    The slope needs many pixels, as noise in it acts like noise in the motion. The depth does not,
+    and a wide window would bend curved surfaces, more in some views than in others, which drags
+    the motion.
 
     A window is one surface if its mean weighted squared residual is what noise of variance `limit`
-    can give (three standard deviations), the pixel itself is within 5 sigmas, and the pixels are
-    spread around the centre, not all on one side of it as at an outline.
+    can give (three standard deviations), the pixel itself is within 5 sigmas, at least the share
+    `fill` of the window is valid, and the centre of what is valid is not off the pixel by more
+    than the share `offset` of its spread (squared), as it is at an outline.
 
     planes is (H, W, 4): the coefficients a, b, c of 1/z = a x + b y + c, and 1/z at the pixel; all
     0 where no window fits. quality is (H, W, 2): mean squared weighted residual of the smallest
@@ -145,7 +153,6 @@ def fit_planes(
                 continue
             x0 = np.float64(rays[i, j, 0])
             y0 = np.float64(rays[i, j, 1])
-            found = False
             # From the smallest window up: a window that fails ends it, so a wide window never
             # jumps over a gap that a smaller one has seen.
             for q in range(len(radii)):
@@ -163,7 +170,7 @@ def fit_planes(
                     )
                 n = s[10]
                 side = 2 * r + 1
-                if n < 0.5 * side * side or n < 6:
+                if n < fill * side * side or n < 6:
                     break
                 inverse = 1.0 / s[0]
                 mx = s[1] * inverse
@@ -180,7 +187,7 @@ def fit_planes(
                     break
                 dx = x0 - mx
                 dy = y0 - my
-                if dx * dx > 0.5 * cxx or dy * dy > 0.5 * cyy:
+                if dx * dx > offset * cxx or dy * dy > offset * cyy:
                     break
                 a = (cyy * cxw - cxy * cyw) / det
                 b = (cxx * cyw - cxy * cxw) / det
@@ -194,15 +201,13 @@ def fit_planes(
                 misfit = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
                 if left_over > misfit or off * off * weight[i, j] > 25 * limit or value <= 0:
                     break
-                found = True
+                if q == 0:
+                    leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) / det
+                    quality[i, j, 1] = inverse * (1.0 + leverage)
+                    planes[i, j, 3] = value
                 planes[i, j, 0] = a
                 planes[i, j, 1] = b
-                planes[i, j, 2] = value - a * x0 - b * y0
-                planes[i, j, 3] = value
-                leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) / det
-                quality[i, j, 1] = inverse * (1.0 + leverage)
-            if not found:
-                planes[i, j, 3] = 0
+                planes[i, j, 2] = planes[i, j, 3] - a * x0 - b * y0
 
 
 @kernel

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,17 +42,43 @@ class SurfaceOptions:
     columns
         Images are halved until they have at most this many columns.
     radii
-        Half widths of the windows of the plane fits, pixels; the widest that is one surface wins.
+        Half widths of the windows of the plane fits, pixels: the smallest gives the depth, the
+        widest that is one surface the slope.
+    edge_jump, edge_margin
+        Pixels this near (in pixels) to a jump in depth by this share are left out of the fits:
+        they mix light of both sides.
     misfit
         How much larger than the noise shown by small windows the variance in wider ones may be.
+    fill, offset
+        Least share of a window that must be valid, and largest squared offset of its centre, as a
+        share of its squared spread.
     photo_radius
         Half width of the box that smooths the albedo, pixels.
     """
 
     columns: int = 320
-    radii: tuple[int, ...] = (2, 4, 7)
+    radii: tuple[int, ...] = (2, 5)
+    edge_jump: float = 0.04
+    edge_margin: int = 1
     misfit: float = 1.2
+    fill: float = 0.7
+    offset: float = 0.2
     photo_radius: int = 1
+
+    def __post_init__(self) -> None:
+        if not 16 <= self.columns <= 4096:
+            raise ValueError(f"columns is {self.columns}, not 16 to 4096")
+        if not self.radii or list(self.radii) != sorted(set(self.radii)):
+            raise ValueError(f"radii is {self.radii}; give ascending half widths")
+        if not 1 <= self.radii[0] <= self.radii[-1] <= 50:
+            raise ValueError(f"radii is {self.radii}, not 1 to 50 pixels")
+        if not 0 <= self.edge_margin <= 20 or not 0 <= self.photo_radius <= 20:
+            raise ValueError("edge_margin and photo_radius must be 0 to 20 pixels")
+        for name in ("edge_jump", "fill", "offset"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
+        if not 0 < self.misfit < 1e6:
+            raise ValueError(f"misfit is {self.misfit}, not above 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +181,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     sigma = _noise_law(frame, z, light, rays, step)
     # d(1/z) = dz / z^2
     weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
+    if options.edge_margin:
+        weight[_near_edges(w, options.edge_jump, options.edge_margin)] = 0
     rows, columns = z.shape
     sums = np.zeros((rows + 1, columns + 1, SUMS))
     run_chunks(lambda a, b: weighted_sums(w, rays, weight, sums, a, b), rows, _CHUNKS)
@@ -164,7 +193,9 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     radii = np.array(options.radii, np.int64)
     limit = options.misfit * scale
     run_chunks(
-        lambda a, b: fit_planes(w, rays, weight, sums, radii, limit, planes, quality, a, b),
+        lambda a, b: fit_planes(
+            w, rays, weight, sums, radii, limit, options.fill, options.offset, planes, quality, a, b
+        ),
         rows,
         _CHUNKS,
     )
@@ -224,6 +255,20 @@ def _reduced(frame: RangeFrame, columns: int) -> tuple[Float32, Float32, Float32
     return np.ascontiguousarray(rays), z, light, step
 
 
+def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
+    """Pixels within `margin` of a jump in depth by a share `jump`, or of a missing pixel.
+
+    There a pixel mixes light of both sides, as far as the lens blurs.
+    """
+    edge = np.zeros(w.shape, np.uint8)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        across = np.abs(w[a] - w[b]) > np.float32(jump) * np.maximum(w[a], w[b])
+        edge[a] |= across
+        edge[b] |= across
+    size = 2 * margin + 1
+    return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
+
+
 def _noise_law(
     frame: RangeFrame, z: Float32, light: Float32 | None, rays: Float32, step: int
 ) -> Float32:
@@ -253,7 +298,7 @@ def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radi
     values = []
     radii = np.array([radius], np.int64)
     for i in range(radius, rows - radius, max(1, rows // 16)):
-        fit_planes(w, rays, weight, sums, radii, np.inf, planes, quality, i, i + 1)
+        fit_planes(w, rays, weight, sums, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
         values.append(quality[i, :, 0])
     found = np.concatenate(values) if values else np.zeros(0)
     found = found[np.isfinite(found)]

@@ -92,16 +92,18 @@ class Points:
     def of(cls, view: SurfaceMap, stride: int) -> Points:
         """Take every `stride`-th pixel of every `stride`-th row that has a plane."""
         part = (slice(stride // 2, None, stride), slice(stride // 2, None, stride))
-        z = view.z[part]
-        ok = (z > 0) & (view.planes[part][..., 3] > 0)
-        z = z[ok]
+        inverse_z = view.planes[part][..., 3]
+        ok = inverse_z > 0
+        # On the fitted surface, as the target's: what smoothing does to a curved surface is then
+        # the same on both sides.
+        z = 1 / inverse_z[ok]
         points = np.empty((len(z), 3), np.float32)
         points[:, :2] = view.rays[part][ok] * z[:, None]
         points[:, 2] = z
         return cls(
             points,
             view.normals[part][ok],
-            view.sigma[part][ok],
+            np.sqrt(view.plane_variance[part][ok]) * z * z,
             view.photo[part][ok],
         )
 
