@@ -20,6 +20,9 @@ from tofuse.simulation.record import Plan, plan
 
 Float64 = NDArray[np.float64]
 
+# About 1 cm apart in a room, so that distances from them are good to half of that.
+_SURFACE_POINTS = 500_000
+
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
@@ -64,7 +67,7 @@ class Recorded:
     def surface(self) -> Float64:
         """(K, 3) random points on the true surface, in its own frame (z up), m."""
         vertices, faces = self.made.scene.truth_mesh()
-        return sample_surface(vertices[faces], 60_000)
+        return sample_surface(vertices[faces], _SURFACE_POINTS)
 
     @cached_property
     def surface_tree(self) -> Any:

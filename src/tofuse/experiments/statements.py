@@ -460,15 +460,19 @@ def _overlap_removed(results: Results, method: str) -> Finding:
 
 
 def _pushed_out(results: Results, method: str) -> Finding:
+    case = results.cases["torso"]
+    runs = case.select(method)
     pairs = [
         (measures.circle_radius_m(r.before[:, :3, 3]), measures.circle_radius_m(r.after[:, :3, 3]))
-        for r in results.cases["torso"].select(method)
+        for r in runs
     ]
     before, after = zip(*pairs, strict=True)
+    short = _mid(_overlap_deg(case, r)[0] for r in runs) < 0
     return graded(
         [a > b for b, a in pairs],
         f"Radius of the circle through the cameras: {_mid(before):.2f} m before, "
-        f"{_mid(after):.2f} m after (true: {torso.DISTANCE:.2f} m).",
+        f"{_mid(after):.2f} m after (true: {torso.DISTANCE:.2f} m)."
+        + (" The chain falls short of a turn, and closing a gap pulls in." if short else ""),
     )
 
 
