@@ -361,12 +361,17 @@ def main(arguments: Items[str] | None = None) -> None:
         against = "the truth" if sequence.exact else "reference poses that are not exact"
         text.append(f"### {sequence.title}\n\nAgainst {against}.\n\n{table(rows)}")
         print(f"\n{text[-1]}", flush=True)
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_text(options.out / "tracking.md", "\n\n".join(text) + "\n")
-    write_text(options.out / "tracking.json", json.dumps({"machine": about, "sequences": found}))
+        keep(options.out, about, text, found)
     if found:
         figure(found, options.out / "tracking.png")
         print(f"\nwritten: {options.out / 'tracking'}.md, .json, .png")
+
+
+def keep(out: Path, about: str, text: Items[str], found: dict[str, Any]) -> None:
+    """Write what there is so far: a long run that is stopped leaves the sequences before."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_text(out / "tracking.md", "\n\n".join(text) + "\n")
+    write_text(out / "tracking.json", json.dumps({"machine": about, "sequences": found}))
 
 
 if __name__ == "__main__":
