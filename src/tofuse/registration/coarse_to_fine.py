@@ -30,10 +30,12 @@ Float64 = NDArray[np.float64]
 
 _SPACING_SAMPLE = 5000
 _SMALLEST_LEVEL = 60
-_EXTENT_SHARE = 20
+_EXTENT_SHARE = 10
 # Median roughness of surfaces above which normals say little.
 _ROUGHEST = 0.25
 _COARSER = 1.5
+# The finest level has at least this many resolutions along the scene.
+_FINEST = 10
 
 
 @part("registration", "in-turn")
@@ -172,11 +174,13 @@ class CoarseToFine(Registrar):
                 break
             # Points lie on surfaces: their number falls with the square of the edge.
             size *= 1.02 * max(1.05, math.sqrt(most / self.points))
-        while min(len(data), len(model)) > _SMALLEST_LEVEL and (
-            max(self._roughness(data), self._roughness(model)) > _ROUGHEST
-        ):
+        # Averaging thins noise, but not what is rough in itself: that keeps its first size.
+        first = size, data, model
+        while max(self._roughness(data), self._roughness(model)) > _ROUGHEST:
             size *= _COARSER
             data, model = averaged(source, size), averaged(target, size)
+            if min(len(data), len(model)) < _SMALLEST_LEVEL or size * _FINEST > _extent(model):
+                return first
         return size, data, model
 
     def _roughness(self, view: CloudFrame) -> float:
