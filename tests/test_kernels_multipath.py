@@ -26,9 +26,12 @@ def means(z: np.ndarray, rays: np.ndarray, light: np.ndarray, step: int) -> np.n
 
 def fitted(nodes: np.ndarray, limit: float = 0.006) -> np.ndarray:
     planes = np.zeros((*nodes.shape[:2], 4))
+    seen = nodes[..., W] > 0
+    length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
+    measured = np.where(seen, length / np.where(seen, nodes[..., W], 1), 0)
     for radius in (2, 1):
         kernels.window_planes(nodes, radius, planes)
-        kernels.choose_planes(nodes, planes, radius, limit)
+        kernels.choose_planes(nodes, planes, radius, limit, measured, np.zeros_like(measured))
     return nodes
 
 
@@ -119,6 +122,25 @@ def test_planes_reach_up_to_an_edge_and_do_not_cut_it_off() -> None:
     np.testing.assert_allclose(nodes[..., A], np.where(right, 0.3, -0.2), atol=1e-9)
     np.testing.assert_allclose(nodes[..., B], 0, atol=1e-9)
     np.testing.assert_allclose(nodes[..., C], 0.3, atol=1e-9)
+
+
+def test_a_node_at_an_edge_is_compared_with_a_plane_as_that_is_corrected() -> None:
+    nodes, right = roof()
+    length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
+    true = length / nodes[..., W]
+    shift = np.where(right, 0.4, 0.0)
+    # The two columns right of the edge were corrected as if they were on the left.
+    strip = right & (nodes[..., X] < 0.04)
+    measured = true + shift
+    nodes[..., W] = length / np.where(strip, measured, true)
+    planes = np.zeros((*nodes.shape[:2], 4))
+    kernels.window_planes(nodes, 2, planes)
+    kernels.choose_planes(nodes, planes, 3, 0.006, measured, shift)
+    kernels.window_planes(nodes, 1, planes)
+    kernels.choose_planes(nodes, planes, 2, 0.006, measured, shift)
+    inner = nodes[..., X] > 0.02
+    assert strip[inner].any()
+    np.testing.assert_allclose(nodes[inner & strip][:, A], 0.3, atol=1e-6)
 
 
 def test_what_is_not_flat_gets_no_plane() -> None:

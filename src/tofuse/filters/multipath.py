@@ -23,7 +23,7 @@ Float32 = NDArray[np.float32]
 _LONGEST_PERIOD_M = 6.0
 
 
-@part("correction", "multipath")
+@part("correction", "multipath", label="validated")
 @dataclass(frozen=True)
 class Multipath(Correction):
     """Compensate the light that surfaces reflect onto each other (Fuchs 2010), see `sensor`.

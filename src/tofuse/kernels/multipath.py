@@ -138,19 +138,29 @@ def window_planes(nodes: Float64, radius: int, planes: Float64) -> None:
 
 
 @kernel
-def choose_planes(nodes: Float64, planes: Float64, radius: int, limit: float) -> None:
-    """Give each node without a plane the best of the windows that it lies in (Kuwahara 1976).
+def choose_planes(
+    nodes: Float64, planes: Float64, radius: int, limit: float, measured: Float64, shift: Float64
+) -> None:
+    """Give each node without a plane the best of the windows around it (Kuwahara 1976).
 
     So that planes reach up to an edge and do not cut it off. Only planes that fit their window and
     the node to within `limit` (relative) are taken; of equal ones, that of the nearest window.
+
+    Next to an edge a node's own bias depends on the plane that it is given to, so it is compared
+    with each plane after the correction by that window's.
+
+    Parameters
+    ----------
+    measured, shift
+        (Hn, Wn) radial range in m without correction, and the bias of each node's as far as known.
     """
     rows, columns = nodes.shape[:2]
     for i in range(rows):
         for j in range(columns):
-            w = nodes[i, j, W]
-            if w <= 0 or nodes[i, j, C] != 0.0 or nodes[i, j, A] != 0.0:
+            if nodes[i, j, W] <= 0 or nodes[i, j, C] != 0.0 or nodes[i, j, A] != 0.0:
                 continue
             best = np.inf
+            length = np.sqrt(1.0 + nodes[i, j, X] ** 2 + nodes[i, j, Y] ** 2)
             for p in range(max(i - radius, 0), min(i + radius + 1, rows)):
                 for q in range(max(j - radius, 0), min(j + radius + 1, columns)):
                     misfit = planes[p, q, 3]
@@ -161,8 +171,9 @@ def choose_planes(nodes: Float64, planes: Float64, radius: int, limit: float) ->
                         + planes[p, q, 1] * nodes[i, j, Y]
                         + planes[p, q, 2]
                     )
+                    w = length / (measured[i, j] - shift[p, q])
                     off = abs(fitted - w) / w
-                    if off > 2 * limit:
+                    if not w > 0 or off > 2 * limit:
                         continue
                     away = (p - i) ** 2 + (q - j) ** 2
                     cost = misfit + off + 0.1 * limit * away
@@ -244,8 +255,8 @@ def spread(
     """Carry the nodes' correction to the pixels of rows start to stop.
 
     A pixel takes the mean of the four nodes around it, by their distance in the image and by how
-    far the pixel lies off each node's plane (relative to `tolerance`, a share of the depth): so
-    nothing leaks over edges.
+    far the pixel, corrected as the node is, lies off the node's plane (relative to `tolerance`, a
+    share of the depth): so nothing leaks over edges.
 
     Parameters
     ----------
@@ -269,14 +280,16 @@ def spread(
             j0 = int(np.floor(fj))
             x = np.float64(rays[i, j, 0])
             y = np.float64(rays[i, j, 1])
-            v = 1.0 / np.float64(d)
+            length = np.sqrt(1.0 + x * x + y * y)
             total = move = gain = 0.0
             for p in range(max(i0, 0), min(i0 + 2, rows)):
                 for q in range(max(j0, 0), min(j0 + 2, columns)):
                     if nodes[p, q, W] <= 0:
                         continue
-                    off = nodes[p, q, A] * x + nodes[p, q, B] * y + nodes[p, q, C] - v
-                    off = off / (v * tolerance)
+                    # Its depth, if it is on this node's surface, is this.
+                    own = d - shift[p, q] / length
+                    off = (nodes[p, q, A] * x + nodes[p, q, B] * y + nodes[p, q, C]) * own - 1.0
+                    off = off / tolerance
                     like = 1.0 / (1.0 + off * off)
                     near = (1.0 - abs(p - fi)) * (1.0 - abs(q - fj)) + 1e-3
                     weight = near * like * like
@@ -284,7 +297,7 @@ def spread(
                     move += weight * shift[p, q]
                     gain += weight * factor[p, q]
             if total > 0:
-                z_out[i, j] = d - move / total / np.sqrt(1.0 + x * x + y * y)
+                z_out[i, j] = d - move / total / length
                 factor_out[i, j] = gain / total
 
 

@@ -30,6 +30,7 @@ from tofuse.sensor.multipath_surfaces import (
     Surfaces,
     block_nodes,
     fit_planes,
+    ray_ranges,
     seen_sources,
     unseen_sources,
 )
@@ -115,13 +116,10 @@ class Reflections:
         """
         step = self._step(image)
         nodes = block_nodes(image.z, image.rays, image.light, step)
-        measured = nodes[..., W].copy()
-        found = self._at_nodes(nodes, image.period_m, gain)
+        found = self._at_nodes(nodes, image.period_m, gain, at_edges=True)
         if found is None:
             return None
         shift, ratio = found
-        # The planes are corrected ones; a pixel is compared with them as it was measured.
-        nodes[..., W] = measured
         z, factor = np.empty_like(image.z), np.empty_like(image.z)
         over = np.abs(1 + ratio)
         run_chunks(
@@ -147,14 +145,11 @@ class Reflections:
             Radius in nodes around which planes are fitted.
         """
         nodes = block_nodes(image.z, image.rays, image.light, self._step(image))
-        w = nodes[..., W].copy()
-        found = self._at_nodes(nodes, image.period_m, gain)
+        measured = ray_ranges(nodes)
+        found = self._at_nodes(nodes, image.period_m, gain, at_edges=False)
         if found is None:
             return 0.0
-        length = _lengths(nodes)
-        nodes[..., W] = np.where(
-            w > 0, length / np.where(w > 0, length / np.where(w > 0, w, 1) - found[0], 1), 0
-        )
+        _correct(nodes, measured, found[0])
         fit_planes(nodes)
         return kernels.flat_nodes(nodes, window, 0.1, 0.003)
 
@@ -162,21 +157,25 @@ class Reflections:
         return max(1, round(image.z.shape[1] / self.columns))
 
     def _at_nodes(
-        self, nodes: Float64, period_m: float, gain: float
+        self, nodes: Float64, period_m: float, gain: float, *, at_edges: bool
     ) -> tuple[Float64, Complex] | None:
         """Bias of the range (Hn, Wn) in m and I / D (Hn, Wn); fits planes to the corrected nodes.
 
-        `W` of the nodes is the corrected inverse depth of the last but one iteration.
+        `W` of the nodes is the corrected inverse depth of the last but one iteration. `at_edges`
+        says whether nodes next to an edge are compared with planes as those are corrected: that
+        is more exact, but makes surfaces look flat with any gain.
         """
         k = np.pi / period_m
         seen = nodes[..., W] > 0
-        length = _lengths(nodes)
-        measured = np.where(seen, length / np.where(seen, nodes[..., W], 1), 0)
+        measured = ray_ranges(nodes)
         shift = np.zeros(seen.shape)
         ratio = np.zeros(seen.shape, complex)
         for _ in range(self.iterations):
-            nodes[..., W] = np.where(seen, length / np.where(seen, measured - shift, 1), 0)
-            fit_planes(nodes)
+            _correct(nodes, measured, shift)
+            if at_edges:
+                fit_planes(nodes, measured, shift)
+            else:
+                fit_planes(nodes)
             surfaces = Surfaces.of(nodes, np.abs(1 + ratio))
             if not (surfaces.good & (surfaces.albedo > 0)).any():
                 return None
@@ -197,8 +196,11 @@ class Reflections:
         return shift, ratio
 
 
-def _lengths(nodes: Float64) -> Float64:
-    return np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
+def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:
+    """Set the nodes' inverse depth to what is measured less the bias of the radial range."""
+    seen = measured > 0
+    length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
+    nodes[..., W] = np.where(seen, length / np.where(seen, measured - shift, 1), 0)
 
 
 def _arriving(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex:

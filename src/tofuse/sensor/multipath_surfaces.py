@@ -36,13 +36,32 @@ def block_nodes(z: Float32, rays: Float32, light: Float32, step: int) -> Float64
     return nodes
 
 
-def fit_planes(nodes: Float64) -> None:
-    """Fit a plane to every node that lies on one, in windows of 5 and then of 3 nodes."""
+def fit_planes(
+    nodes: Float64, measured: Float64 | None = None, shift: Float64 | None = None
+) -> None:
+    """Fit a plane to every node that lies on one, in windows of 5 and then of 3 nodes.
+
+    Parameters
+    ----------
+    measured, shift
+        (Hn, Wn) radial range in m that was measured, and the bias by which the nodes' depth has
+        been corrected; none unless given.
+    """
+    if measured is None or shift is None:
+        measured = ray_ranges(nodes)
+        shift = np.zeros_like(measured)
     nodes[..., A:] = 0
     planes = np.zeros((*nodes.shape[:2], 4))
     for radius in (2, 1):
         kernels.window_planes(nodes, radius, planes)
-        kernels.choose_planes(nodes, planes, radius, _FLAT)
+        kernels.choose_planes(nodes, planes, radius, _FLAT, measured, shift)
+
+
+def ray_ranges(nodes: Float64) -> Float64:
+    """Radial range (Hn, Wn) in m of the nodes, 0 where there is none."""
+    w = nodes[..., W]
+    length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
+    return np.where(w > 0, length / np.where(w > 0, w, 1), 0)
 
 
 @dataclass(frozen=True, eq=False)
