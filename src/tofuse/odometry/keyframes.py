@@ -29,6 +29,7 @@ Float64 = NDArray[np.float64]
 Guess = Literal["identity", "previous", "odometry"]
 
 # A relocalisation starts far off: coarser, and with more patience, than tracking.
+_PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 3, 0.0, 0.0))
 _WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 
@@ -135,7 +136,7 @@ class _KeyframeTracker(Tracker):
         self._keyframes: list[_Keyframe] = []
         self._T: Float64 | None = None  # of the last frame with a pose
         self._T_odometry: Float64 | None = None
-        self._motion = np.eye(4)
+        self._motion: Float64 | None = None  # of the last two frames, if both have a pose
         self._lost = False
 
     def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
@@ -160,7 +161,7 @@ class _KeyframeTracker(Tracker):
             return self._lose(reasons[0])
         aligned, reference = found
         T = aligned.T_world_source
-        self._motion = np.eye(4) if self._lost else se3.inverse(self._T) @ T
+        self._motion = None if self._lost else se3.inverse(self._T) @ T
         self._T, self._T_odometry, self._lost = T, T_odometry, False
         if self._is_new(T, reference):
             self._keep(view, T)
@@ -173,7 +174,7 @@ class _KeyframeTracker(Tracker):
 
     def _lose(self, reason: str) -> Step:
         self._lost = True
-        self._motion = np.eye(4)
+        self._motion = None
         return Step("lost", reason, None)
 
     def _track(
@@ -183,23 +184,33 @@ class _KeyframeTracker(Tracker):
         options = self._options
         newest = self._keyframes[-options.targets :]
         targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
-        for predicted in self._predictions(T_odometry):
-            aligned = align(view, targets, predicted, options.alignment)
+        for predicted, start, how in self._predictions(view, targets, T_odometry):
+            aligned = align(view, targets, predicted, how, start=start)
             objection = options.acceptance.objection(aligned)
             if not objection:
                 return aligned, newest[-1]
             reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
         return None
 
-    def _predictions(self, T_odometry: Float64 | None) -> Iterator[Float64]:
+    def _predictions(
+        self, view: SurfaceMap, targets: list[Target], T_odometry: Float64 | None
+    ) -> Iterator[tuple[Float64, Float64, ProjectiveOptions]]:
+        """Where the camera may be, where to begin the search, and how; the likeliest first."""
         assert self._T is not None
         guess = self._options.guess
         before = self._T_odometry
         if guess == "odometry" and T_odometry is not None and before is not None:
-            yield self._T @ se3.inverse(before) @ T_odometry
-        elif guess == "previous" and not self._lost:
-            yield se3.orthonormalise(self._T @ self._motion)
-        yield self._T
+            T = self._T @ se3.inverse(before) @ T_odometry
+            yield T, T, self._options.alignment
+        elif guess == "previous" and self._motion is not None:
+            T = se3.orthonormalise(self._T @ self._motion)
+            yield T, T, self._options.alignment
+        # Nothing tells how the camera moves: try some turns of it, and of what it sees.
+        coarse = replace(self._options.alignment, levels=_PATIENT[:1])
+        starts = [self._T @ motion for motion in _turns(view)]
+        tried = [align(view, targets, self._T, coarse, start=start) for start in starts]
+        best = max(tried, key=lambda aligned: aligned.score)
+        yield self._T, best.T_world_source, replace(self._options.alignment, levels=_PATIENT)
 
     def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe] | None:
         """Look for the view among the keyframes, the newest first."""
@@ -227,6 +238,20 @@ class _KeyframeTracker(Tracker):
     def _keep(self, view: SurfaceMap, T: Float64) -> None:
         depth = float(np.median(view.z[view.z > 0]))
         self._keyframes.append(_Keyframe(view, T, depth))
+
+
+def _turns(view: SurfaceMap) -> list[Float64]:
+    """Motions of the camera to try: none, and turns about itself and about what it sees."""
+    centre = np.eye(4)
+    centre[2, 3] = float(np.median(view.z[view.z > 0]))
+    motions = [np.eye(4)]
+    for angle in np.radians([-12, -6, 6, 12]):
+        for axis in (3, 4):
+            twist = np.zeros(6)
+            twist[axis] = angle
+            turn = se3.exp(twist)
+            motions += [turn, centre @ turn @ se3.inverse(centre)]
+    return motions
 
 
 def _registration(aligned: Aligned, T_world_reference: Float64) -> Registration:

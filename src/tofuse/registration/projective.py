@@ -65,9 +65,9 @@ class ProjectiveOptions:
     """
 
     levels: tuple[Level, ...] = (
-        Level(4, 10, 0.03, 0.1),
-        Level(2, 6, 0.005, 0.02),
-        Level(1, 3, 0.0, 0.0),
+        Level(4, 6, 0.03, 0.1),
+        Level(2, 4, 0.005, 0.02),
+        Level(1, 2, 0.0, 0.0),
     )
     robust: float = 3.5
     max_angle: float = 0.7
@@ -103,7 +103,7 @@ class Points:
         return cls(
             points,
             view.normals[part][ok],
-            np.sqrt(view.plane_variance[part][ok]) * z * z,
+            (np.sqrt(view.plane_variance[part][ok]) * z * z).astype(np.float32),
             view.photo[part][ok],
         )
 
@@ -141,6 +141,11 @@ class Aligned:
         Of the inliers' distances.
     scale
         Rms of the inliers' residuals in sigmas.
+    photo_scale
+        The same of the log albedo's, as a standard deviation.
+    score
+        How much of the view fits, for comparing alignments of one view: robust weights of both
+        terms, less twice the points in free space, as a share of the points.
     """
 
     T_world_source: Float64
@@ -156,7 +161,8 @@ class Aligned:
     in_front: int
     rms_m: float
     scale: float
-    photo_scale: float = 0.0
+    photo_scale: float
+    score: float
 
     @cached_property
     def inlier_share(self) -> float:
@@ -247,6 +253,10 @@ def align(
         rms_m=float(np.sqrt(total[kernels.SQUARES_M] / inliers)) if inliers else np.inf,
         scale=state.scale_g,
         photo_scale=state.scale_p,
+        score=float(
+            (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
+            / max(len(points.points), 1)
+        ),
     )
 
 
