@@ -10,6 +10,8 @@ import pytest
 from tofuse.filters.multipath import Multipath, light_image
 from tofuse.geometry.cameras import Pinhole, ray_lengths
 from tofuse.kernels.threads import threads
+from tofuse.pipeline.config import changed, from_method
+from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.sensor.multipath import GainEstimator, Interference, LightImage, Reflections
 from tofuse.simulation import record
@@ -311,6 +313,25 @@ def test_threads_change_nothing(corner: Seen) -> None:
             assert fixed.amplitude_image is not None
             results.append(fixed.depth.tobytes() + fixed.amplitude_image.tobytes())
     assert len(set(results)) == 1
+
+
+def test_a_configuration_names_it_and_the_mapper_applies_it_to_every_frame(corner: Seen) -> None:
+    base = replace(from_method("thesis"), filters=())
+    wanted = Multipath(gain=GAIN, columns=30)
+    corrections = [{"part": "multipath", "gain": GAIN, "columns": 30}]
+    config = changed(base, {"corrections": corrections}, where="test.toml")
+    assert config.corrections == (wanted,)
+    frames = [replace(corner.frame(), index=k, timestamp=k / 10) for k in range(3)]
+    corrector = wanted.start()
+
+    mapper, plain = Mapper(config), Mapper(base)
+    for frame in frames:
+        mapper.push(frame)
+        plain.push(corrector.apply(frame))
+    result, expected = mapper.finish(), plain.finish()
+    np.testing.assert_array_equal(result.cloud.points, expected.cloud.points)
+    np.testing.assert_array_equal(result.trajectory, expected.trajectory)
+    assert result.config["corrections"][0]["part"] == "multipath"
 
 
 def test_options_that_make_no_sense_are_refused() -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tofuse.filters._options import above, at_least, whole
 from tofuse.filters.correction import Correction
-from tofuse.geometry.cameras import ray_lengths
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.multipath import Bounces, GainEstimator, Interference, LightImage, Reflections
@@ -112,15 +111,16 @@ def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage 
     if frame.amplitude_image is None or not len(frame):
         return None
     z = np.where(frame.valid, frame.z, np.float32(0))
+    rays = frame.camera.rays()
     amplitude = frame.amplitude_image
     fine = frame.valid & np.isfinite(amplitude) & (amplitude > 0)
     fine &= amplitude < SATURATED_AMPLITUDE
     light = np.where(fine, amplitude, np.float32(0))
     if frame.amplitude_kind == "range_compensated":
-        length = np.where(fine, ray_lengths(frame.camera), 1)
-        r = np.where(fine, frame.radial_range, 1)
-        light = light / (r * r * length**FALLOFF)
-    return LightImage(z, frame.camera.rays(), light.astype(np.float32), period_m)
+        square = np.where(fine, 1 + (rays * rays).sum(-1), np.float32(1))
+        # z squared times the square of the ray's length is the range's.
+        light = light / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
+    return LightImage(z, rays, light.astype(np.float32, copy=False), period_m)
 
 
 def _corrected(frame: RangeFrame, image: LightImage, found: Interference) -> RangeFrame:

@@ -48,13 +48,18 @@ def block_means(
             for i in range(top, bottom):
                 for j in range(left, right):
                     if z[i, j] > 0:
-                        d[n] = z[i, j]
+                        # Insertion into ascending order: quicker than sorting so few.
+                        m = n
+                        while m > 0 and d[m - 1] > z[i, j]:
+                            d[m] = d[m - 1]
+                            m -= 1
+                        d[m] = z[i, j]
                         n += 1
             for c in range(COLUMNS):
                 nodes[bi, bj, c] = 0.0
             if 4 * n < (bottom - top) * (right - left):
                 continue
-            middle = np.sort(d[:n])[n // 2]
+            middle = d[n // 2]
             count = 0
             lit = 0
             mapped = 0
