@@ -352,11 +352,11 @@ def main(arguments: Items[str] | None = None) -> None:
         except FileNotFoundError as error:
             print(f"\n{name}: left out, there is no {error}", flush=True)
             continue
+        print(f"\n{sequence.title}", flush=True)
         rows = []
         for r in compare(sequence, options.methods, options.threads):
             rows.append(r)
-            if "problem" in r:
-                print(f"  {r['method']}: {r['problem']}", flush=True)
+            print(f"  {brief(r)}", flush=True)
         found[sequence.title] = rows
         against = "the truth" if sequence.exact else "reference poses that are not exact"
         text.append(f"### {sequence.title}\n\nAgainst {against}.\n\n{table(rows)}")
@@ -365,6 +365,14 @@ def main(arguments: Items[str] | None = None) -> None:
     if found:
         figure(found, options.out / "tracking.png")
         print(f"\nwritten: {options.out / 'tracking'}.md, .json, .png")
+
+
+def brief(r: dict[str, Any]) -> str:
+    """Return a row in a few words, for those who wait."""
+    if "problem" in r:
+        return f"{r['method']}: {r['problem']}"
+    speed = f"{r['ms_median']:.1f} ms a frame, " if "ms_median" in r else ""
+    return f"{r['method']}: {speed}ATE {r['ate_m']:.4f} m"
 
 
 def keep(out: Path, about: str, text: Items[str], found: dict[str, Any]) -> None:
