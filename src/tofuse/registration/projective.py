@@ -143,6 +143,8 @@ class Aligned:
         Rms of the inliers' residuals in sigmas.
     photo_scale
         The same of the log albedo's, as a standard deviation.
+    exposure
+        Log albedo of the targets minus the source's.
     score
         How much of the view fits, for comparing alignments of one view: robust weights of both
         terms, less twice the points in free space, as a share of the points.
@@ -163,6 +165,7 @@ class Aligned:
     scale: float
     photo_scale: float
     score: float
+    exposure: float = 0.0
 
     @cached_property
     def inlier_share(self) -> float:
@@ -253,6 +256,7 @@ def align(
         rms_m=float(np.sqrt(total[kernels.SQUARES_M] / inliers)) if inliers else np.inf,
         scale=state.scale_g,
         photo_scale=state.scale_p,
+        exposure=state.exposure,
         score=float(
             (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
             / max(len(points.points), 1)

@@ -1,0 +1,193 @@
+"""What each patch of an image says about a pose: normal equations, tile by tile.
+
+Errors of a range camera that are not noise (light by way of other surfaces, scattering in the
+lens, motion) are alike over patches much larger than a pixel. How the patches disagree about the
+pose tells more of its error than the noise of the pixels does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Layout of a tile's sums.
+H = 0  # 28: upper triangle of the 7x7 sum of w J J^T; the seventh unknown is the exposure
+G = 28  # 7: sum of w J r
+A = 35  # 7: sum of w J, what an error common to the tile does to G
+WEIGHT = 42  # sum of w
+RESIDUAL = 43  # sum of w r
+COUNT = 44
+CROSS = 45  # 28: symmetrised product of the Jacobians of target and source
+SIZE = 73
+GEOMETRY, PHOTO = 0, 1
+
+
+@kernel
+def tile_sums(
+    z: Float32,
+    rays: Float32,
+    normals: Float32,
+    sigma: Float32,
+    source_photo: Float32,
+    planes: Float32,
+    plane_variance: Float32,
+    target_photo: Float32,
+    lookup: Float32,
+    lookup_frame: Float64,
+    T: Float64,
+    exposure: float,
+    scale_g: float,
+    scale_p: float,
+    robust: float,
+    min_cosine: float,
+    stride: int,
+    tiles_x: int,
+    tiles_y: int,
+    start: int,
+    stop: int,
+) -> Float64:
+    """Sum over the source's pixels of rows of tiles start..stop; see `alignment.accumulate`.
+
+    Returns
+    -------
+    (stop - start, tiles_x, 2, SIZE), for the distances and for the albedo.
+    """
+    rows, columns = z.shape
+    out = np.zeros((stop - start, tiles_x, 2, SIZE))
+    height, width = planes.shape[0], planes.shape[1]
+    nodes_v, nodes_u = lookup.shape[0], lookup.shape[1]
+    limit2 = robust * robust
+    J = np.zeros(7)
+    K = np.zeros(7)
+    first = (start * rows + tiles_y - 1) // tiles_y
+    last = (stop * rows + tiles_y - 1) // tiles_y
+    half = stride // 2
+    for row in range(first + (half - first) % stride, last, stride):
+        for column in range(half, columns, stride):
+            pz = np.float64(z[row, column])
+            if pz <= 0:
+                continue
+            tile = out[row * tiles_y // rows - start, column * tiles_x // columns]
+            px = rays[row, column, 0] * pz
+            py = rays[row, column, 1] * pz
+            qz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if qz <= 0.02:
+                continue
+            qx = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            qy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            xn = qx / qz
+            yn = qy / qz
+            fu = (xn - lookup_frame[0]) * lookup_frame[2]
+            fv = (yn - lookup_frame[1]) * lookup_frame[3]
+            if not (fu >= 0 and fv >= 0 and fu < nodes_u - 1 and fv < nodes_v - 1):
+                continue
+            iu = int(fu)
+            iv = int(fv)
+            au = fu - iu
+            av = fv - iv
+            u = (1 - av) * ((1 - au) * lookup[iv, iu, 0] + au * lookup[iv, iu + 1, 0]) + av * (
+                (1 - au) * lookup[iv + 1, iu, 0] + au * lookup[iv + 1, iu + 1, 0]
+            )
+            v = (1 - av) * ((1 - au) * lookup[iv, iu, 1] + au * lookup[iv, iu + 1, 1]) + av * (
+                (1 - au) * lookup[iv + 1, iu, 1] + au * lookup[iv + 1, iu + 1, 1]
+            )
+            if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+                continue
+            i = int(v + 0.5)
+            j = int(u + 0.5)
+            if planes[i, j, 3] <= 0:
+                continue
+            a = np.float64(planes[i, j, 0])
+            b = np.float64(planes[i, j, 1])
+            c = np.float64(planes[i, j, 2])
+            length = np.sqrt(a * a + b * b + c * c)
+            r = (a * qx + b * qy + c * qz - 1.0) / length
+            m0 = (T[0, 0] * a + T[1, 0] * b + T[2, 0] * c) / length
+            m1 = (T[0, 1] * a + T[1, 1] * b + T[2, 1] * c) / length
+            m2 = (T[0, 2] * a + T[1, 2] * b + T[2, 2] * c) / length
+            along = (m0 * px + m1 * py + m2 * pz) / pz
+            sz = sigma[row, column] * scale_g
+            variance = along * along * sz * sz + plane_variance[i, j] * scale_g * scale_g / (
+                length * length
+            )
+            e2 = r * r / variance
+            if e2 >= limit2:
+                continue
+            s0 = np.float64(normals[row, column, 0])
+            s1 = np.float64(normals[row, column, 1])
+            s2 = np.float64(normals[row, column, 2])
+            known = s0 != 0 or s1 != 0 or s2 != 0
+            if known and s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
+                continue
+            f = 1 - e2 / limit2
+            _jacobian(J, m0, m1, m2, px, py, pz)
+            J[6] = 0.0
+            _jacobian(K, s0, s1, s2, px, py, pz)
+            K[6] = 0.0
+            slope = f * (f - 4 * e2 / limit2) / variance
+            _add(tile[GEOMETRY], J, K, r, f * f / variance, slope)
+
+            tx = np.float64(target_photo[i, j, 1])
+            ty = np.float64(target_photo[i, j, 2])
+            level = np.float64(source_photo[row, column, 0])
+            if scale_p <= 0 or np.isnan(tx) or np.isnan(level):
+                continue
+            # To first order the albedo where the point lands exactly; a pixel's rays follow from
+            # the lookup's local slope.
+            xu = 1.0 / (lookup_frame[2] * (lookup[iv, iu + 1, 0] - lookup[iv, iu, 0]))
+            yv = 1.0 / (lookup_frame[3] * (lookup[iv + 1, iu, 1] - lookup[iv, iu, 1]))
+            r = target_photo[i, j, 0] + tx * (u - j) * xu + ty * (v - i) * yv - level - exposure
+            e2 = r * r / (scale_p * scale_p)
+            if e2 >= limit2:
+                continue
+            f = 1 - e2 / limit2
+            d0 = tx / qz
+            d1 = ty / qz
+            d2 = -(tx * xn + ty * yn) / qz
+            m0 = T[0, 0] * d0 + T[1, 0] * d1 + T[2, 0] * d2
+            m1 = T[0, 1] * d0 + T[1, 1] * d1 + T[2, 1] * d2
+            m2 = T[0, 2] * d0 + T[1, 2] * d1 + T[2, 2] * d2
+            _jacobian(J, m0, m1, m2, px, py, pz)
+            J[6] = -1.0
+            gx = np.float64(source_photo[row, column, 1])
+            gy = np.float64(source_photo[row, column, 2])
+            if np.isnan(gx):
+                gx = np.float64(0)
+                gy = np.float64(0)
+            _jacobian(K, gx / pz, gy / pz, -(gx * px + gy * py) / (pz * pz), px, py, pz)
+            K[6] = -1.0
+            p2 = scale_p * scale_p
+            _add(tile[PHOTO], J, K, r, f * f / p2, f * (f - 4 * e2 / limit2) / p2)
+    return out
+
+
+@kernel
+def _jacobian(J: Float64, m0: float, m1: float, m2: float, px: float, py: float, pz: float) -> None:
+    """Derivative of m . p by the right perturbation, into J[:6]."""
+    J[0] = m0
+    J[1] = m1
+    J[2] = m2
+    J[3] = py * m2 - pz * m1
+    J[4] = pz * m0 - px * m2
+    J[5] = px * m1 - py * m0
+
+
+@kernel
+def _add(sums: Float64, J: Float64, K: Float64, r: float, weight: float, slope: float) -> None:
+    q = 0
+    for p in range(7):
+        gj = weight * 0.5 * (J[p] + K[p])
+        sums[G + p] += gj * r
+        sums[A + p] += gj
+        for o in range(p, 7):
+            sums[H + q] += gj * 0.5 * (J[o] + K[o])
+            sums[CROSS + q] += 0.5 * slope * (J[p] * K[o] + K[p] * J[o])
+            q += 1
+    sums[WEIGHT] += weight
+    sums[RESIDUAL] += weight * r
+    sums[COUNT] += 1

@@ -1,0 +1,299 @@
+"""How far an alignment can be trusted: its covariance, and the directions it can't see.
+
+The estimate solves g(T) = sum w J r = 0. To first order its error is ``X^-1 g``, g taken at the
+true pose, and its covariance ``X^-1 B X^-1`` with X the slope of g and B its covariance (the
+"sandwich" of M-estimation; Huber 1981, ch. 6). Neither is the plain information matrix:
+
+- noise in normals and albedo slopes is in J on both sides of J J^T, and makes information from
+  nothing. In X, the symmetrised product of target's and source's Jacobian, it cancels. The robust
+  weights enter X with the slope of the influence function, not with the weights themselves;
+- B is not the pixels' noise alone. Smoothing makes neighbours share their noise; and light by way
+  of other surfaces, scattering and motion bend whole patches of the range image. What the patches
+  disagree about is seen in the residuals, after allowing for what the fit has taken up; what they
+  have in common the fit takes up wholly, and it is seen in nothing. It is known to grow with how
+  much the view has changed: a bias of the camera alone, seen from one place, moves no pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels import tiles as kernels
+from tofuse.kernels.threads import run_chunks
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target
+
+Float64 = NDArray[np.float64]
+
+_UPPER7 = np.triu_indices(7)
+# Everything here is in units of 1 cm and 1 degree, so that eigenvalues can be compared.
+_SCALE = np.append(UNITS, 1.0)
+_SCALES = np.outer(_SCALE, _SCALE)
+# Tiles with fewer compared pixels say nothing about a patch.
+_LEAST_PIXELS = 10
+_LEAST_TILES = 6
+# Pixels that are looked at, about: what more would say is noise that neighbours share.
+_PIXELS = 6336
+
+
+@dataclass(frozen=True)
+class UncertaintyOptions:
+    """The constants of the covariance; see docs/uncertainty.md for how they were found.
+
+    Attributes
+    ----------
+    tiles
+        Patches in a row, and rows of patches.
+    noise_pixels, photo_noise_pixels
+        How many pixels share one value of noise after smoothing, of distances and of albedo.
+    reach
+        Errors of patches this far apart are still alike (by 1/e), as a share of the image's width.
+    hidden
+        Error that neighbouring patches share and the residuals don't show: share of the depth,
+        for each radian by which the view has changed.
+    offset
+        The part of it that all patches share, relative to the rest.
+    floor
+        Least error of the pose, as a share of the change of the view.
+    loosest
+        Largest sigma that the data itself is trusted to give, in units of 1 cm and 1 degree.
+    """
+
+    tiles: tuple[int, int] = (8, 6)
+    noise_pixels: float = 8.0
+    photo_noise_pixels: float = 4.0
+    reach: float = 0.31
+    hidden: float = 0.003
+    offset: float = 3.0
+    floor: float = 0.008
+    loosest: float = 1.8
+
+    def __post_init__(self) -> None:
+        if len(self.tiles) != 2 or not all(2 <= n <= 64 for n in self.tiles):
+            raise ValueError(f"tiles is {self.tiles}; give two numbers from 2 to 64")
+        for name in ("noise_pixels", "photo_noise_pixels", "reach", "loosest"):
+            if not 0 < getattr(self, name) < 1e3:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+        for name in ("hidden", "offset", "floor"):
+            if not 0 <= getattr(self, name) < 1e3:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """What the patches of a view say at the final pose, in units of 1 cm and 1 degree.
+
+    Attributes
+    ----------
+    geometry, photo
+        (7, 7) sums of w J J^T; the seventh unknown is the exposure.
+    cross
+        (7, 7) X, the slope of the gradient.
+    places
+        (n, 2) of the patches with distances: column and row, as a share of the image's width.
+    weights
+        (n,) sums of w, 1/m^2.
+    means
+        (n,) weighted mean distances, m.
+    responses
+        (n, 7) sums of w J: what an error common to the patch does to the gradient.
+    change
+        How much the view has changed: the angle in rad, and the way as a share of the depth.
+    depth
+        Median depth, m.
+    stride
+        Every how manieth pixel, along either axis, took part.
+    """
+
+    geometry: Float64
+    photo: Float64
+    cross: Float64
+    places: Float64
+    weights: Float64
+    means: Float64
+    responses: Float64
+    change: float
+    depth: float
+    stride: int
+
+
+def patches(
+    source: SurfaceMap,
+    targets: Sequence[Target],
+    aligned: Aligned,
+    alignment: ProjectiveOptions,
+    options: UncertaintyOptions,
+) -> Patches:
+    """Sum up what the patches of an aligned view say about its pose."""
+    rows, columns = source.z.shape
+    stride = max(1, round(float(np.sqrt(rows * columns / _PIXELS))))
+    across, down = options.tiles
+    inverse_z = source.planes[..., 3]
+    known = inverse_z > 0
+    z = np.divide(1, inverse_z, out=np.zeros_like(inverse_z), where=known)
+    sigma = np.sqrt(source.plane_variance) * z * z
+    photometric = (
+        alignment.photometric and source.has_photo and all(t.view.has_photo for t in targets)
+    )
+    found = z[known]
+    depth = float(np.median(found)) if len(found) else 1.0
+    sums = []
+    changes = []
+    for target in targets:
+        view = target.view
+        T = np.ascontiguousarray(target.T_target_world @ aligned.T_world_source)
+        changes.append(float(se3.angle(T)) + float(np.linalg.norm(T[:3, 3])) / depth)
+
+        def work(a: int, b: int, view: SurfaceMap = view, T: Float64 = T) -> Float64:
+            return kernels.tile_sums(
+                z,
+                source.rays,
+                source.normals,
+                sigma,
+                source.photo,
+                view.planes,
+                view.plane_variance,
+                view.photo,
+                view.projection.lookup,
+                view.projection.frame,
+                T,
+                aligned.exposure,
+                aligned.scale,
+                aligned.photo_scale if photometric else 0.0,
+                alignment.robust,
+                float(np.cos(alignment.max_angle)),
+                stride,
+                across,
+                down,
+                a,
+                b,
+            )
+
+        sums.append(np.concatenate(run_chunks(work, down, 2)))
+    v, u = np.mgrid[:down, :across]
+    places = np.stack([u / across, v * rows / (down * columns)], -1).reshape(-1, 2)
+    total = np.stack(sums).reshape(-1, 2, kernels.SIZE)
+    places = np.tile(places, (len(targets), 1))
+    whole = total.sum(0)
+    geometry, photo = (_matrix(whole[k, kernels.H : kernels.H + 28]) for k in range(2))
+    distances = total[:, kernels.GEOMETRY]
+    told = distances[:, kernels.COUNT] >= _LEAST_PIXELS
+    distances = distances[told]
+    weights = distances[:, kernels.WEIGHT]
+    return Patches(
+        geometry,
+        photo,
+        _matrix(whole[:, kernels.CROSS : kernels.CROSS + 28].sum(0)),
+        places[told],
+        weights,
+        distances[:, kernels.RESIDUAL] / weights,
+        distances[:, kernels.A : kernels.A + 7] * _SCALE,
+        float(np.mean(changes)) if changes else 0.0,
+        depth,
+        stride,
+    )
+
+
+def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
+    """(6, 6) covariance in m and rad of the right perturbation, from what the patches say."""
+    bread = _bounded_inverse(found.cross, options.loosest)
+    per_pixel = found.stride**2
+    B = max(1.0, options.noise_pixels / per_pixel) * found.geometry
+    B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
+    if len(found.weights) >= _LEAST_TILES:
+        apart = np.linalg.norm(found.places[:, None] - found.places[None], axis=-1)
+        alike = np.exp(-apart / options.reach)
+        seen = _seen_variance(found, bread, alike, options)
+        hidden = (options.hidden * found.depth * found.change) ** 2
+        shared = np.exp(-0.5 * apart / options.reach) + options.offset**2
+        B += found.responses.T @ (seen * alike + hidden * shared) @ found.responses
+    C = (bread @ B @ bread)[:6, :6]
+    floor = options.floor * found.change * np.array([found.depth] * 3 + [1.0] * 3) / UNITS
+    C += np.diag(floor**2)
+    return 0.5 * (C + C.T) * np.outer(UNITS, UNITS)
+
+
+def covariance(
+    source: SurfaceMap,
+    targets: Sequence[Target],
+    aligned: Aligned,
+    alignment: ProjectiveOptions,
+    options: UncertaintyOptions | None = None,
+) -> Float64:
+    """(6, 6) covariance of an alignment: m and rad, right perturbation in the source's frame.
+
+    Directions that the data does not hold have the uncertainty of the prediction.
+
+    Parameters
+    ----------
+    source, targets, alignment
+        As given to `align`, which returned `aligned`.
+    options
+        The calibrated ones unless given.
+    """
+    chosen = options or UncertaintyOptions()
+    C = covariance_of_patches(patches(source, targets, aligned, alignment, chosen), chosen)
+    prior = np.array([alignment.prior_m] * 3 + [alignment.prior_rad] * 3)
+    return with_prior(C, aligned.unobservable, prior)
+
+
+def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
+    """Give the unobservable directions the uncertainty of the prediction.
+
+    Parameters
+    ----------
+    C
+        (6, 6) covariance, m and rad.
+    unobservable
+        (k, 6) orthonormal directions in units of 1 cm and 1 degree.
+    prior
+        (6,) sigma of the prediction, m and rad.
+    """
+    if not len(unobservable):
+        return C
+    scaled = C / np.outer(UNITS, UNITS)
+    P = unobservable.T @ unobservable
+    kept = np.eye(6) - P
+    scaled = kept @ scaled @ kept + P @ np.diag((prior / UNITS) ** 2) @ P
+    return 0.5 * (scaled + scaled.T) * np.outer(UNITS, UNITS)
+
+
+def _seen_variance(
+    found: Patches, bread: Float64, alike: Float64, options: UncertaintyOptions
+) -> float:
+    """Variance in m^2 of what patches have in common with their neighbours, from the residuals.
+
+    By moments, corrected for what the fit has taken up: residuals are (1 - P) times the errors,
+    P the projection of the fit (as in restricted maximum likelihood).
+    """
+    n = len(found.weights)
+    M = np.eye(n) - (found.responses / found.weights[:, None]) @ bread @ found.responses.T
+    share = found.weights / found.weights.sum()
+    share = np.minimum(share, 4 * np.median(share))
+    expected = float(share @ ((M @ alike) * M).sum(1))
+    noise = float(share @ ((M / found.weights) * M).sum(1))
+    surplus = float(share @ found.means**2) - noise
+    return max(surplus, 0.0) / max(expected, 0.1 * float(share.sum()))
+
+
+def _bounded_inverse(X: Float64, loosest: float) -> Float64:
+    """Inverse of X whose eigenvalues stay below the square of `loosest`."""
+    X = X.copy()
+    if X[6, 6] <= 0:
+        X[6, :] = X[:, 6] = 0.0
+        X[6, 6] = 1.0
+    values, vectors = np.linalg.eigh(X)
+    inverse: Float64 = (vectors / np.maximum(values, loosest**-2)) @ vectors.T
+    return inverse
+
+
+def _matrix(upper: Float64) -> Float64:
+    out = np.zeros((7, 7))
+    out[_UPPER7] = upper
+    out.T[_UPPER7] = upper
+    return out * _SCALES
