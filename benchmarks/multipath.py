@@ -155,7 +155,7 @@ def millimetres(errors: list[Float64]) -> str:
 
 def line(name: str, effects: str, case: Case) -> str:
     return (
-        f"{name:22s}{effects:11s}{millimetres(case.before)}  |{millimetres(case.after)}"
+        f"{name:25s}{effects:11s}{millimetres(case.before)}  |{millimetres(case.after)}"
         f"  |{case.gain:7.0f}{np.median(case.seconds) * 1e3:8.1f}"
     )
 
@@ -210,8 +210,8 @@ def surfaces_of(frame: RangeFrame, trusted: NDArray[np.bool_]) -> list[NDArray[n
 
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else DATA
-    print(f"{'':33s}{'mm before':>22s}  |{'mm after':>22s}  |")
-    print(f"{'scene':22s}{'effects':11s}" + 2 * "    med    90%  signed  |" + "   gain      ms")
+    print(f"{'':36s}{'mm before':>22s}  |{'mm after':>22s}  |")
+    print(f"{'scene':25s}{'effects':11s}" + 2 * "    med    90%  signed  |" + "   gain      ms")
     with threads(1):
         corner = None
         for scene in SCENES:
