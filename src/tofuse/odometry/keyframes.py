@@ -24,6 +24,7 @@ from tofuse.registration.projective import (
     Target,
     align,
 )
+from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
 Float64 = NDArray[np.float64]
 Guess = Literal["identity", "previous", "odometry"]
@@ -87,6 +88,8 @@ class Keyframes(Odometry):
         How views are prepared.
     alignment
         How they are aligned.
+    uncertainty
+        How its covariance is told.
     acceptance
         When an alignment is believed; `relocated` when it was found again.
     guess
@@ -102,6 +105,7 @@ class Keyframes(Odometry):
 
     surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
+    uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     acceptance: Acceptance = Acceptance()
     relocated: Acceptance = Acceptance(0.75, 0.3, 0.1, 300, 4.0)
     guess: Guess = "previous"
@@ -165,7 +169,9 @@ class _KeyframeTracker(Tracker):
         self._T, self._T_odometry, self._lost = T, T_odometry, False
         if self._is_new(T, reference):
             self._keep(view, T)
-        registration = _registration(aligned, reference.T_world_camera)
+        target = Target(reference.view, se3.inverse(reference.T_world_camera))
+        C = covariance(view, [target], aligned, options.alignment, options.uncertainty)
+        registration = _registration(aligned, reference.T_world_camera, C)
         status: Literal["tracked", "predicted"] = "tracked"
         reason = ""
         if len(aligned.unobservable) == 6:
@@ -254,9 +260,12 @@ def _turns(view: SurfaceMap) -> list[Float64]:
     return motions
 
 
-def _registration(aligned: Aligned, T_world_reference: Float64) -> Registration:
+def _registration(
+    aligned: Aligned, T_world_reference: Float64, covariance: Float64
+) -> Registration:
     directions = aligned.unobservable * UNITS
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    information: Float64 = np.linalg.inv(covariance)
     return Registration(
         T_target_source=se3.inverse(T_world_reference) @ aligned.T_world_source,
         converged=aligned.converged,
@@ -265,6 +274,6 @@ def _registration(aligned: Aligned, T_world_reference: Float64) -> Registration:
         points=max(aligned.compared, 1),
         error=aligned.scale,
         rms_m=aligned.rms_m,
-        information=aligned.information,
+        information=information,
         unobservable=directions / np.maximum(lengths, 1e-12),
     )

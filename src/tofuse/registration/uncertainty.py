@@ -37,6 +37,8 @@ _SCALES = np.outer(_SCALE, _SCALE)
 # Tiles with fewer compared pixels say nothing about a patch.
 _LEAST_PIXELS = 10
 _LEAST_TILES = 6
+# In units of 1 cm and 1 degree: keeps what a still camera gives invertible.
+_LEAST_SIGMA = 1e-3
 # Pixels that are looked at, about: what more would say is noise that neighbours share.
 _PIXELS = 6336
 
@@ -214,7 +216,7 @@ def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float6
         B += found.responses.T @ (seen * alike + hidden * shared) @ found.responses
     C = (bread @ B @ bread)[:6, :6]
     floor = options.floor * found.change * np.array([found.depth] * 3 + [1.0] * 3) / UNITS
-    C += np.diag(floor**2)
+    C += np.diag(np.maximum(floor, _LEAST_SIGMA) ** 2)
     return 0.5 * (C + C.T) * np.outer(UNITS, UNITS)
 
 
