@@ -52,6 +52,12 @@ def test_a_bent_box_shows_in_the_angles():
     np.testing.assert_allclose(np.sort(angles), [84, 84, 96, 96], atol=0.7)
 
 
+def test_a_wall_that_was_not_seen_is_not_made_up():
+    points = box_points(np.random.default_rng(1), (0.3, 0.3, 0.4))
+    seen = points[points[:, 0] < -0.1]
+    assert np.isnan(measures.fit_box(seen, 0.9, 0.4, 0.3).widths_m).all()
+
+
 def test_girth_is_the_length_around():
     rng = np.random.default_rng(2)
     angle = rng.uniform(0, 2 * np.pi, 20_000)

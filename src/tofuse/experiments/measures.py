@@ -169,6 +169,8 @@ class BoxFit:
 def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxFit:
     """Fit the walls and the top of a box that stands roughly where it should.
 
+    All is NaN where a wall has no points.
+
     Parameters
     ----------
     points
@@ -183,6 +185,9 @@ def fit_box(points: Float64, bottom: float, height: float, width: float) -> BoxF
     middle = (np.percentile(sides, 3, axis=0) + np.percentile(sides, 97, axis=0)) / 2
     fits = [_walls(sides, middle, turn, width) for turn in np.radians([-30, -15, 0, 15, 30])]
     normals, offsets, _ = min(fits, key=lambda fit: fit[2])
+    if np.isnan(offsets).any():
+        nothing = np.full((4, 2), np.nan)
+        return BoxFit(nothing, nothing[0], nothing[:, 0], float("nan"))
     following = np.roll(np.arange(4), -1)
     pairs = np.stack([np.arange(4), following], 1)
     corners = np.linalg.solve(normals[pairs], offsets[pairs][..., None])[..., 0].astype(np.float64)
@@ -202,6 +207,8 @@ def _walls(
 ) -> tuple[Float64, Float64, float]:
     """Fit four lines, n . p = d, from a square turned by an angle; returns n, d, and the misfit.
 
+    d is NaN for a line that no points decided.
+
     Points belong to the nearest line; those further off than a fifth of the width count as that
     far, so that a model with double walls keeps four lines.
     """
@@ -209,6 +216,7 @@ def _walls(
     normals = np.stack([np.cos(angle), np.sin(angle)], 1)
     offsets = normals @ middle + width / 2
     reach = width / 5
+    fitted = np.zeros(4, bool)
     for _ in range(15):
         distance = np.abs(flat @ normals.T - offsets)
         nearest = distance.argmin(1)
@@ -222,9 +230,9 @@ def _walls(
             n *= np.sign(n @ (mean - middle)) or 1.0
             # A wall of the box, not one that runs across it.
             if n @ normals[k] > 0.8:
-                normals[k], offsets[k] = n, n @ mean
+                normals[k], offsets[k], fitted[k] = n, n @ mean, True
     misfit = np.minimum(np.abs(flat @ normals.T - offsets).min(1), reach)
-    return normals, offsets, float(np.mean(misfit**2))
+    return normals, np.where(fitted, offsets, np.nan), float(np.mean(misfit**2))
 
 
 def displacement_m(a: Float64, b: Float64, ahead: float = 2.0) -> Float64:

@@ -196,7 +196,7 @@ def _plans(
 
     def draw(model: Model, cameras: Float64, title: str, method: str) -> Figure:
         label = f"{result.case.title} from above, {method}, {title}"
-        measured = [model.box.corners] if model.box is not None else []
+        measured = [model.box.corners] if model.box and np.isfinite(model.box.corners).all() else []
         drawn = figures.plan(
             about(model), cameras, frame, title=title, label=label, true=outlines,
             measured=measured,
