@@ -265,7 +265,7 @@ def _registration(
 ) -> Registration:
     directions = aligned.unobservable * UNITS
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    information: Float64 = np.linalg.inv(covariance)
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
     return Registration(
         T_target_source=se3.inverse(T_world_reference) @ aligned.T_world_source,
         converged=aligned.converged,
