@@ -42,6 +42,9 @@ class Config:
         Makes the cloud.
     corrections
         Applied in this order to every frame, before the filters.
+    model_filters
+        Applied after tracking, to what goes into the model: a tracker that weighs each pixel by
+        its noise loses by what a clean model gains.
     """
 
     method: str
@@ -51,11 +54,12 @@ class Config:
     optimiser: Optimiser
     fusion: CloudFusion
     corrections: tuple[Correction, ...] = ()
+    model_filters: tuple[Filter, ...] = ()
 
     @property
     def window(self) -> int:
         """How many frames the filters look at, the current one included."""
-        return max([f.window for f in self.filters], default=1)
+        return max([f.window for f in (*self.filters, *self.model_filters)], default=1)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, as in `run.json`."""
@@ -151,6 +155,7 @@ def check_views(config: Config, kind: ViewKind) -> None:
     chosen: tuple[Correction | Filter | Odometry, ...] = (
         *config.corrections,
         *config.filters,
+        *config.model_filters,
         config.odometry,
     )
     for part in chosen:

@@ -122,13 +122,14 @@ class Mapper:
                 past = tuple(self._corrected(f) for f in before)
                 frame = self._corrected(frame)
                 filtered, removals = apply_filters(self.config.filters, frame, past)
+                clean, more = apply_filters(self.config.model_filters, filtered, past)
                 self._history.append(frame)
-            for removal in removals:
+            for removal in (*removals, *more):
                 self._seen[removal.name] = self._seen.get(removal.name, 0) + removal.seen
                 self._removed[removal.name] = self._removed.get(removal.name, 0) + removal.removed
             with self._watch.timing("tracking"):
                 step = self._tracker.push(filtered, T_odometry)
-            self._add(frame, filtered, step)
+            self._add(frame, clean, step)
             if step.T_world_camera is not None:
                 with self._watch.timing("loops"):
                     self._loops.push(self._views[frame.index], step.T_world_camera)

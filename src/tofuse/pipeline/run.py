@@ -130,10 +130,12 @@ def fitted(config: Config, recording: Recording) -> Config:
     highest = recording.metadata.get("confidence_max")
     if not isinstance(highest, int | float) or not 1 <= highest <= 255:
         return config
-    filters = tuple(
-        f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in config.filters
+    scaled = (
+        tuple(f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in filters)
+        for filters in (config.filters, config.model_filters)
     )
-    return replace(config, filters=filters)
+    filters, model_filters = scaled
+    return replace(config, filters=filters, model_filters=model_filters)
 
 
 def _seed(options: Options) -> int:
@@ -201,7 +203,7 @@ def _filter_steps(
         frame = corrector.apply(frame)
         history = [corrector.apply(past) for past in history]
         steps.append((name_of(correction), frame))
-    for item in config.filters:
+    for item in (*config.filters, *config.model_filters):
         frame, removals = apply_filters([item], frame, history)
         steps.append((removals[0].name, frame))
     return tuple(steps)

@@ -60,8 +60,10 @@ class ProjectiveOptions:
     held
         How well a direction must be held, in units of 1 cm and 1 degree, not to be taken from the
         prediction.
-    tolerance_m, tolerance_rad
-        A level ends when a step is smaller.
+    tolerance
+        A level ends when a step is smaller, in units of 1 cm and 1 degree.
+    settled
+        An alignment has converged if its last step was smaller, in the same units.
     """
 
     levels: tuple[Level, ...] = (
@@ -75,8 +77,8 @@ class ProjectiveOptions:
     prior_m: float = 0.3
     prior_rad: float = 0.3
     held: float = 1.0
-    tolerance_m: float = 1e-4
-    tolerance_rad: float = 1e-4
+    tolerance: float = 0.01
+    settled: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +127,7 @@ class Aligned:
     T_world_source
         (4, 4).
     converged
-        Whether the last level ended by its tolerance.
+        Whether the last step was small.
     iterations
         Over all levels.
     information
@@ -222,7 +224,6 @@ def align(
         for k in range(level.iterations):
             state.total = _sum(points, targets, state, level, options, photometric)
             iterations += 1
-            converged = False
             H, g = _normal_equations(state, photometric)
             cross = _cross(state.total, state, photometric)
             if number > 0 or k >= level.iterations // 2:
@@ -232,11 +233,9 @@ def align(
             if photometric:
                 state.exposure += step[6]
             _rescale(state, level, photometric)
-            if (
-                np.abs(step[:3]).max() < options.tolerance_m
-                and np.abs(step[3:6]).max() < options.tolerance_rad
-            ):
-                converged = True
+            size = np.abs(step[:6] / UNITS).max()
+            converged = bool(size < options.settled)
+            if size < options.tolerance:
                 break
     total = state.total
     information = _reduced_information(total, state, photometric)
