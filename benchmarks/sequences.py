@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,7 +48,10 @@ class Sequence:
     title
         What it is, with the camera.
     frames
-        Decoded and filtered as the default method filters them.
+        Decoded, corrected and filtered as the default method does for its tracker.
+    cleaned
+        The same after the filters that the default method keeps for its model: for trackers
+        that don't know each pixel's noise.
     checked
         The recording that map consistency looks at: unfiltered, but for an object, which is
         cut out.
@@ -60,6 +63,7 @@ class Sequence:
 
     title: str
     frames: tuple[RangeFrame, ...]
+    cleaned: tuple[RangeFrame, ...]
     checked: Recording
     reference: Float64
     exact: bool
@@ -80,24 +84,33 @@ def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = Fals
         shutil.rmtree(OUT / "recordings" / name, ignore_errors=True)
     recording = kind.open(data).select(end=frames)
     config = fitted(default("range"), recording)
-    chosen = (Foreground(), *config.filters) if kind.object else config.filters
+    cut = (Foreground(),) if kind.object else ()
+    correctors = [correction.start() for correction in config.corrections]
     past: deque[Frame] = deque(maxlen=config.window - 1)
-    filtered, bare = [], []
+    tracked, cleaned, bare = [], [], []
     for frame in recording:
-        assert isinstance(frame, RangeFrame)
-        filtered.append(apply_filters(chosen, frame, past)[0])
+        bare.append(apply_filters(cut, frame)[0])
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        tracked.append(apply_filters((*cut, *config.filters), frame, past)[0])
+        cleaned.append(apply_filters(config.model_filters, tracked[-1], past)[0])
         past.append(frame)
-        bare.append(apply_filters((Foreground(),), frame)[0] if kind.object else frame)
     reference = recording.reference
     assert reference is not None
     source = ArraySource(bare, reference, metadata=recording.metadata)
     return Sequence(
-        f"{kind.title}, {len(filtered)} frames",
-        tuple(replace(frame) for frame in filtered),
+        f"{kind.title}, {len(tracked)} frames",
+        _images(tracked),
+        _images(cleaned),
         Recording.of(source, name, "benchmark"),
         reference,
         kind.exact,
     )
+
+
+def _images(frames: Iterable[Frame]) -> tuple[RangeFrame, ...]:
+    """New frames, which keep nothing that was derived from the old ones."""
+    return tuple(replace(frame) for frame in frames if isinstance(frame, RangeFrame))
 
 
 def _recorded(*parts: str) -> Callable[[Path], Recording]:

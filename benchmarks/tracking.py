@@ -1,10 +1,11 @@
 """tofuse's tracker beside its peers on the same frames: speed, accuracy, map consistency.
 
-Every method gets the same frames, decoded and filtered beforehand. What a method does from there
-to a pose is timed, and only that: bringing the frame into the type that the method takes is not.
-Each row is warm: a pass over the first frames went before, and the first frame is not counted.
-Peers with a choice of tunings run the first frames with each, and go on with the one of the least
-ATE; tofuse has one tuning for all sequences. Rows of one run can be compared with each other, not
+Every method gets the same frames, decoded, corrected and filtered beforehand. What a method does
+from there to a pose is timed, and only that: bringing the frame into the type that the method takes
+is not. Each row is warm: a pass over the first frames went before, and the first frame is not
+counted. Peers run the first frames with each of their tunings, and with and without the filters
+that tofuse keeps for its model, and go on with what had the least ATE; tofuse has one tuning for
+all sequences. Rows of one run can be compared with each other, not
 with those of another machine. A peer that is not installed is named as such: `pip install
 tofuse[bench]`.
 
@@ -39,12 +40,12 @@ from tofuse.files.atomic import write_text
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as using_threads
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.pipeline.methods import default
 from tofuse.recordings.frames import RangeFrame
 
 Float64 = NDArray[np.float64]
 
 WARM_UP = 5
-TUNING_FRAMES = 100
 CONSISTENCY_FRAMES = 60
 
 
@@ -61,7 +62,7 @@ class Tofuse:
 
     def resolution(self, frame: RangeFrame) -> str:
         columns = frame.camera.width
-        while columns > Keyframes().surface.columns:
+        while columns > keyframes().surface.columns:
             columns //= 2
         return f"{columns} columns of {peers.grid(frame)}"
 
@@ -69,9 +70,16 @@ class Tofuse:
         return TofuseSession(self.photometric)
 
 
+def keyframes() -> Keyframes:
+    """Return the tracker of the default method."""
+    odometry = default("range").odometry
+    assert isinstance(odometry, Keyframes)
+    return odometry
+
+
 class TofuseSession:
     def __init__(self, photometric: bool) -> None:
-        options = Keyframes()
+        options = keyframes()
         alignment = replace(options.alignment, photometric=photometric)
         self._tracker = replace(options, alignment=alignment).start(0)
         self.statuses: list[str] = []
@@ -127,16 +135,21 @@ def run(method: peers.Method, frames: Items[RangeFrame], threads: int) -> Run:
 
 
 def best(
-    candidates: Items[peers.Method], sequence: sequences.Sequence, threads: int
-) -> tuple[peers.Method, str]:
-    """Return the tuning with the least ATE over the first frames, and how it was chosen."""
-    if len(candidates) == 1:
-        return candidates[0], ""
-    first = sequence.frames[:TUNING_FRAMES]
+    candidates: Items[peers.Method], sequence: sequences.Sequence, threads: int, frames: int
+) -> tuple[peers.Method, bool, str]:
+    """Choose a peer's tuning, and its frames, by the least ATE over the first frames.
+
+    Returns the method, whether it gets the cleaned frames, and how it was chosen. The tunings run
+    on the cleaned frames; the best of them then on the others.
+    """
+    first = sequence.cleaned[:frames]
     reference = sequence.reference[: len(first)]
     errors = [ate(run(c, first, threads).poses, reference) for c in candidates]
     chosen = candidates[int(np.nanargmin(errors))]
-    return chosen, f"best of {len(candidates)} on {len(first)} frames"
+    bare = ate(run(chosen, sequence.frames[:frames], threads).poses, reference)
+    cleaned = not bare < min(errors)
+    how = f"best of {len(candidates)} on {len(first)} frames, " if len(candidates) > 1 else ""
+    return chosen, cleaned, f"{how}{'cleaned' if cleaned else 'as tofuse has them'}"
 
 
 def ate(poses: Float64, reference: Float64) -> float:
@@ -196,7 +209,7 @@ def accuracy(sequence: sequences.Sequence, poses: Float64) -> dict[str, Any]:
 
 
 def compare(
-    sequence: sequences.Sequence, wanted: Items[str], threads: int
+    sequence: sequences.Sequence, wanted: Items[str], threads: int, tuning_frames: int
 ) -> Iterator[dict[str, Any]]:
     """Run the methods on a sequence, one after the other, and give their rows."""
     frames = sequence.frames
@@ -209,8 +222,10 @@ def compare(
             continue
         try:
             run(candidates[0], frames[:WARM_UP], threads)
-            chosen, how = best(candidates, sequence, threads)
-            result = run(chosen, frames, threads)
+            chosen, cleaned, how = candidates[0], False, ""
+            if not isinstance(chosen, Tofuse):
+                chosen, cleaned, how = best(candidates, sequence, threads, tuning_frames)
+            result = run(chosen, sequence.cleaned if cleaned else frames, threads)
         except ImportError as error:
             yield {"method": label, "problem": f"not installed ({error})"}
             continue
@@ -331,6 +346,9 @@ def main(arguments: Items[str] | None = None) -> None:
     parser.add_argument("--sequences", nargs="+", default=sequences.names(), metavar="NAME")
     parser.add_argument("--methods", nargs="+", default=[], help="beginnings of their names")
     parser.add_argument("--frames", type=int, help="use only the first so many")
+    parser.add_argument(
+        "--tuning-frames", type=int, default=100, help="peers are tuned on the first so many"
+    )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=sequences.DATA, help="recorded sequences")
     parser.add_argument("--out", type=Path, default=sequences.OUT)
@@ -354,7 +372,7 @@ def main(arguments: Items[str] | None = None) -> None:
             continue
         print(f"\n{sequence.title}", flush=True)
         rows = []
-        for r in compare(sequence, options.methods, options.threads):
+        for r in compare(sequence, options.methods, options.threads, options.tuning_frames):
             rows.append(r)
             print(f"  {brief(r)}", flush=True)
         found[sequence.title] = rows

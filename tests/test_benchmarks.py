@@ -114,9 +114,10 @@ def test_the_tuning_with_the_least_error_is_chosen(scripts, small_room):
     still = np.tile(np.eye(4), (6, 1, 1))
     object.__setattr__(sequence, "reference", still)
     candidates = [_Drifting(0.1), _Drifting(0.01), _Drifting(0.05)]
-    chosen, how = scripts["tracking"].best(candidates, sequence, 1)
+    chosen, cleaned, how = scripts["tracking"].best(candidates, sequence, 1, 100)
     assert chosen is candidates[1]
-    assert how == "best of 3 on 6 frames"
+    assert cleaned
+    assert how == "best of 3 on 6 frames, cleaned"
 
 
 def test_peers_see_the_same_surface_without_distortion(scripts):

@@ -109,16 +109,19 @@ class _OdometrySession:
     def push(self, prepared: Any) -> Float64 | None:
         before, self._before = self._before, prepared
         if before is not None:
-            found = self._run(
-                prepared,
-                before,
-                self._images.K,
-                self._start,
-                _SCALE,
-                MAX_DEPTH_M,
-                self._criteria,
-                self._method,
-            )
+            try:
+                found = self._run(
+                    prepared,
+                    before,
+                    self._images.K,
+                    self._start,
+                    _SCALE,
+                    MAX_DEPTH_M,
+                    self._criteria,
+                    self._method,
+                )
+            except RuntimeError:  # too little in common
+                return None
             self._T = self._T @ found.transformation.numpy()
         return self._T
 
@@ -150,9 +153,12 @@ class _DenseSession:
         self._input.set_data_from_image("depth", depth)
         self._input.set_data_from_image("color", color)
         if self._index:
-            found = self._model.track_frame_to_model(
-                self._input, self._cast, _SCALE, MAX_DEPTH_M, 0.07, self._method, self._criteria
-            )
+            try:
+                found = self._model.track_frame_to_model(
+                    self._input, self._cast, _SCALE, MAX_DEPTH_M, 0.07, self._method, self._criteria
+                )
+            except RuntimeError:  # too little in common
+                return None
             self._T = self._T @ found.transformation.numpy()
         self._model.update_frame_pose(self._index, self._images.o3d.core.Tensor(self._T))
         self._model.integrate(self._input, _SCALE, MAX_DEPTH_M, 8.0)
