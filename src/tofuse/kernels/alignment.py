@@ -306,3 +306,110 @@ def moved(T: Float64, xi: Float64) -> Float64:
     out[:3, :3] = fixed
     out[3, 3] = 1
     return out
+
+
+@kernel
+def normal_equations(total: Float64, photometric: bool) -> tuple[Float64, Float64, Float64]:
+    """Unpack what `accumulate` summed: H (7, 7), g (7,) and the cross-information (7, 7).
+
+    The seventh unknown is the exposure; without the photometric term its row is that of the unit
+    matrix in H and 0 in the cross-information.
+    """
+    H = np.zeros((7, 7))
+    C = np.zeros((7, 7))
+    g = np.zeros(7)
+    q = 0
+    for p in range(6):
+        g[p] = total[GEOMETRY_G + p]
+        for o in range(p, 6):
+            H[p, o] = total[GEOMETRY_H + q]
+            C[p, o] = total[CROSS_G + q]
+            q += 1
+    if photometric:
+        q = 0
+        for p in range(7):
+            g[p] += total[PHOTO_G + p]
+            for o in range(p, 7):
+                H[p, o] += total[PHOTO_H + q]
+                C[p, o] += total[CROSS_P + q]
+                q += 1
+    for p in range(7):
+        for o in range(p):
+            H[p, o] = H[o, p]
+            C[p, o] = C[o, p]
+    if H[6, 6] <= 0:
+        H[6, 6] = 1.0
+    return H, g, C
+
+
+@kernel
+def twist_between(A: Float64, B: Float64) -> Float64:
+    """Logarithm (6,) of A^-1 B, for rotations well below half a turn."""
+    R = np.zeros((3, 3))
+    t = np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            t[i] += A[k, i] * (B[k, 3] - A[k, 3])
+            for j in range(3):
+                R[i, j] += A[k, i] * B[k, j]
+    w = np.empty(3)
+    w[0] = R[2, 1] - R[1, 2]
+    w[1] = R[0, 2] - R[2, 0]
+    w[2] = R[1, 0] - R[0, 1]
+    sine = 0.5 * np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    w *= 0.5 * (angle / sine if sine > 1e-9 else 1.0)
+    if angle < 0.02:
+        c = 1.0 / 12 + angle * angle / 720
+    else:
+        c = 1.0 / (angle * angle) - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
+    out = np.empty(6)
+    out[3:] = w
+    # The inverse left Jacobian: 1 - W / 2 + c W^2.
+    wt = np.array([w[1] * t[2] - w[2] * t[1], w[2] * t[0] - w[0] * t[2], w[0] * t[1] - w[1] * t[0]])
+    wwt = np.array(
+        [w[1] * wt[2] - w[2] * wt[1], w[2] * wt[0] - w[0] * wt[2], w[0] * wt[1] - w[1] * wt[0]]
+    )
+    out[:3] = t - 0.5 * wt + c * wwt
+    return out
+
+
+@kernel
+def gather(
+    rays: Float32,
+    planes: Float32,
+    plane_variance: Float32,
+    photo: Float32,
+    stride: int,
+    points: Float32,
+    normals: Float32,
+    sigma: Float32,
+    light: Float32,
+) -> int:
+    """Take every `stride`-th pixel of every `stride`-th row that has a plane; returns how many.
+
+    Writes points on the fitted surface (N, 3), unit normals (N, 3), sigma of z (N,) and the
+    photometric values (N, 3), row by row.
+    """
+    n = 0
+    for i in range(stride // 2, planes.shape[0], stride):
+        for j in range(stride // 2, planes.shape[1], stride):
+            v = planes[i, j, 3]
+            if v <= 0:
+                continue
+            z = 1 / v
+            points[n, 0] = rays[i, j, 0] * z
+            points[n, 1] = rays[i, j, 1] * z
+            points[n, 2] = z
+            a = planes[i, j, 0]
+            b = planes[i, j, 1]
+            c = planes[i, j, 2]
+            length = np.sqrt(a * a + b * b + c * c)
+            normals[n, 0] = a / length
+            normals[n, 1] = b / length
+            normals[n, 2] = c / length
+            sigma[n] = np.sqrt(plane_variance[i, j]) * z * z
+            for k in range(3):
+                light[n, k] = photo[i, j, k]
+            n += 1
+    return n

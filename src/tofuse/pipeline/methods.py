@@ -57,7 +57,7 @@ def default(kind: ViewKind) -> Config:
         return replace(base, odometry=Sequential(registration=icp, guess="previous"))
     return replace(
         base,
-        corrections=(Multipath(),),
+        corrections=(Multipath(lamp=1.0),),
         filters=(),
         model_filters=(Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),

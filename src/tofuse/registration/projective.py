@@ -13,19 +13,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.geometry import se3
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.doubt import faked_information
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+# Points from which it is told how much information can be faked: the sums are smooth.
+_DOUBT_POINTS = 500
 _CHUNK_POINTS = 6000
-_UPPER6 = np.triu_indices(6)
-_UPPER7 = np.triu_indices(7)
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,9 @@ class ProjectiveOptions:
     held
         How well a direction must be held, in units of 1 cm and 1 degree, not to be taken from the
         prediction.
+    common_tilt, common_slope
+        Errors fixed to the camera, which bend both views alike and so fake information: standard
+        deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
     tolerance
         A level ends when a step is smaller, in units of 1 cm and 1 degree.
     settled
@@ -77,6 +80,8 @@ class ProjectiveOptions:
     prior_m: float = 0.3
     prior_rad: float = 0.3
     held: float = 1.0
+    common_tilt: float = 0.03
+    common_slope: float = 0.1
     tolerance: float = 0.01
     settled: float = 0.1
 
@@ -92,22 +97,27 @@ class Points:
 
     @classmethod
     def of(cls, view: SurfaceMap, stride: int) -> Points:
-        """Take every `stride`-th pixel of every `stride`-th row that has a plane."""
-        part = (slice(stride // 2, None, stride), slice(stride // 2, None, stride))
-        inverse_z = view.planes[part][..., 3]
-        ok = inverse_z > 0
-        # On the fitted surface, as the target's: what smoothing does to a curved surface is then
-        # the same on both sides.
-        z = 1 / inverse_z[ok]
-        points = np.empty((len(z), 3), np.float32)
-        points[:, :2] = view.rays[part][ok] * z[:, None]
-        points[:, 2] = z
-        return cls(
+        """Take every `stride`-th pixel of every `stride`-th row that has a plane.
+
+        The points lie on the fitted surface, as the target's do: what smoothing does to a curved
+        surface is then the same on both sides.
+        """
+        rows, columns = view.z.shape
+        most = -(-rows // stride) * -(-columns // stride)
+        points, normals, photo = (np.empty((most, 3), np.float32) for _ in range(3))
+        sigma = np.empty(most, np.float32)
+        n = kernels.gather(
+            view.rays,
+            view.planes,
+            view.plane_variance,
+            view.photo,
+            stride,
             points,
-            view.normals[part][ok],
-            (np.sqrt(view.plane_variance[part][ok]) * z * z).astype(np.float32),
-            view.photo[part][ok],
+            normals,
+            sigma,
+            photo,
         )
+        return cls(points[:n], normals[:n], sigma[:n], photo[:n])
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +219,8 @@ def align(
     start
         (4, 4) where the iterations begin; the prediction unless given.
     """
-    T0 = np.ascontiguousarray(T_world_predicted if start is None else start)
+    T_world_predicted = np.ascontiguousarray(T_world_predicted)
+    T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
     state = _State(T0.copy(), exposure)
     photometric = (
         options.photometric and source.has_photo and all(t.view.has_photo for t in targets)
@@ -221,13 +232,15 @@ def align(
     for number, level in enumerate(options.levels):
         if number:
             points = Points.of(source, level.stride)
+        doubt = None
         for k in range(level.iterations):
             state.total = _sum(points, targets, state, level, options, photometric)
             iterations += 1
-            H, g = _normal_equations(state, photometric)
-            cross = _cross(state.total, state, photometric)
+            H, g, C = kernels.normal_equations(state.total, photometric)
             if number > 0 or k >= level.iterations // 2:
-                weak = _weak_directions(cross, options.held)
+                if doubt is None:
+                    doubt = _doubt(points, state, level, options, photometric)
+                weak = _weak_directions(_without_exposure(C) - doubt, options.held)
             step = _step(H, g, state, weak, T_world_predicted, options)
             state.T = kernels.moved(state.T, step[:6])
             if photometric:
@@ -238,14 +251,14 @@ def align(
             if size < options.tolerance:
                 break
     total = state.total
-    information = _reduced_information(total, state, photometric)
+    H, _, C = kernels.normal_equations(total, photometric)
     inliers = total[kernels.INLIERS]
     return Aligned(
         T_world_source=state.T,
         converged=converged,
         iterations=iterations,
-        information=information,
-        cross=_cross(total, state, photometric),
+        information=_without_exposure(H),
+        cross=_without_exposure(C),
         unobservable=weak,
         points=len(points.points) * len(targets),
         landed=int(total[kernels.LANDED]),
@@ -304,28 +317,6 @@ def _sum(
     return total
 
 
-def _symmetric(upper: Float64, size: int) -> Float64:
-    out = np.zeros((size, size))
-    index = _UPPER6 if size == 6 else _UPPER7
-    out[index] = upper
-    out.T[index] = upper
-    return out
-
-
-def _normal_equations(state: _State, photometric: bool) -> tuple[Float64, Float64]:
-    t = state.total
-    H = np.zeros((7, 7))
-    g = np.zeros(7)
-    H[:6, :6] = _symmetric(t[kernels.GEOMETRY_H : kernels.GEOMETRY_H + 21], 6)
-    g[:6] = t[kernels.GEOMETRY_G : kernels.GEOMETRY_G + 6]
-    if photometric:
-        H += _symmetric(t[kernels.PHOTO_H : kernels.PHOTO_H + 28], 7)
-        g += t[kernels.PHOTO_G : kernels.PHOTO_G + 7]
-    if H[6, 6] <= 0:
-        H[6, 6] = 1.0
-    return H, g
-
-
 def _without_exposure(H: Float64) -> Float64:
     """Marginalise the seventh unknown."""
     if H[6, 6] <= 0:
@@ -333,17 +324,25 @@ def _without_exposure(H: Float64) -> Float64:
     return H[:6, :6] - np.outer(H[:6, 6], H[6, :6]) / H[6, 6]
 
 
-def _reduced_information(total: Float64, state: _State, photometric: bool) -> Float64:
-    H, _ = _normal_equations(state, photometric)
-    return _without_exposure(H)
-
-
-def _cross(total: Float64, state: _State, photometric: bool) -> Float64:
-    C = np.zeros((7, 7))
-    C[:6, :6] = _symmetric(total[kernels.CROSS_G : kernels.CROSS_G + 21], 6)
-    if photometric:
-        C += _symmetric(total[kernels.CROSS_P : kernels.CROSS_P + 28], 7)
-    return _without_exposure(C)
+def _doubt(
+    points: Points, state: _State, level: Level, options: ProjectiveOptions, photometric: bool
+) -> Float64:
+    """(6, 6) information that errors fixed to the camera can fake; from some of the points."""
+    n = len(points.points)
+    some = slice(None, None, max(1, n // _DOUBT_POINTS))
+    p, normals = points.points[some], points.normals[some]
+    along = (p * normals).sum(1) / p[:, 2]
+    variance = 2 * (along * points.sigma[some] * state.scale_g) ** 2 + level.slack_m**2
+    faked = faked_information(
+        p,
+        normals,
+        variance,
+        state.scale_p**2 if photometric else 0.0,
+        np.isfinite(points.photo[some, 1]),
+        options.common_tilt,
+        options.common_slope,
+    )
+    return faked * state.total[kernels.INLIERS] / max(len(p), 1)
 
 
 def _weak_directions(cross: Float64, held: float) -> Float64:
@@ -365,7 +364,7 @@ def _step(
     A = H * np.outer(scale, scale)
     b = g * scale
     prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3) / UNITS
-    away = se3.log(se3.inverse(T_predicted) @ state.T) / UNITS
+    away = kernels.twist_between(T_predicted, state.T) / UNITS
     A[np.arange(6), np.arange(6)] += 1 / prior**2
     b[:6] += away / prior**2
     if len(weak):
