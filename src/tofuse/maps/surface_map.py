@@ -155,6 +155,15 @@ class SurfaceMap:
     has_photo: bool = field(default=False)
 
     @cached_property
+    def normals(self) -> Float32:
+        """(H, W, 3) unit normals away from the camera, 0 where unknown."""
+        abc = self.planes[..., :3]
+        length = np.sqrt((abc * abc).sum(-1, keepdims=True))
+        return np.where(self.planes[..., 3:] > 0, abc / np.maximum(length, 1e-12), 0).astype(
+            np.float32
+        )
+
+    @cached_property
     def planar_share(self) -> float:
         """Share of the pixels at which a plane was fitted."""
         return float(np.count_nonzero(self.planes[..., 3] > 0)) / self.z.size
