@@ -144,7 +144,7 @@ class Aligned:
         (6, 6) of the right perturbation, from the noise that the views show.
     cross
         (6, 6) the symmetrised cross-information: like the information, but independent noise in
-        the Jacobians of the two views cancels in it.
+        the Jacobians of the two views cancels in it; less what errors that they share can fake.
     unobservable
         (k, 6) unit directions (in units of 1 cm and 1 degree) that the data does not hold.
     points, landed, compared, inliers, in_front
@@ -258,7 +258,7 @@ def align(
         converged=converged,
         iterations=iterations,
         information=_without_exposure(H),
-        cross=_without_exposure(C),
+        cross=_without_exposure(C) - (np.zeros((6, 6)) if doubt is None else doubt),
         unobservable=weak,
         points=len(points.points) * len(targets),
         landed=int(total[kernels.LANDED]),
