@@ -67,10 +67,10 @@ class UncertaintyOptions:
     """
 
     tiles: tuple[int, int] = (8, 6)
-    noise_pixels: float = 8.0
+    noise_pixels: float = 5.0
     photo_noise_pixels: float = 4.0
     reach: float = 0.31
-    hidden: float = 0.003
+    hidden: float = 0.0025
     offset: float = 3.0
     floor: float = 0.008
     loosest: float = 1.8

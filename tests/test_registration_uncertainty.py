@@ -1,0 +1,278 @@
+import numpy as np
+import pytest
+
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels import tiles
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.doubt import faked_information
+from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.registration.uncertainty import (
+    Patches,
+    UncertaintyOptions,
+    covariance,
+    covariance_of_patches,
+    patches,
+    with_prior,
+)
+
+CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
+GEOMETRY_ONLY = ProjectiveOptions(photometric=False)
+CORNER = ((0.0, 0.0, 1.0, 2.6), (0.8, 0.0, 0.6, 2.0), (0.0, 0.85, 0.53, 1.8))
+
+
+def _depth(planes, T=None):
+    """Depths (H, W) of planes n . X = d of the world, seen by a camera at T_world_camera."""
+    T = np.eye(4) if T is None else T
+    rays = CAMERA.rays().astype(float)
+    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+    depths = []
+    for *n, d in planes:
+        n = np.array(n) / np.linalg.norm(n)
+        along = rays @ (T[:3, :3].T @ n)
+        z = (d - n @ T[:3, 3]) / np.where(np.abs(along) > 1e-9, along, 1e-9)
+        depths.append(np.where(z > 0, z, np.inf))
+    return np.min(depths, 0)
+
+
+def _view(index, planes, T=None, *, sigma=0.004, bend=None, light=None):
+    rng = np.random.default_rng([5, index])
+    depth = _depth(planes, T) + sigma * rng.normal(size=(CAMERA.height, CAMERA.width))
+    if bend is not None:
+        depth = depth + bend
+    frame = RangeFrame(
+        index, index / 30, CAMERA, depth.astype(np.float32), "z", light, amplitude_kind="raw"
+    )
+    return surface_map(frame, SurfaceOptions())
+
+
+def _aligned(source, target, T):
+    targets = [Target(target, np.eye(4))]
+    return targets, align(source, targets, T, GEOMETRY_ONLY)
+
+
+def _sigmas(C):
+    return np.sqrt(np.diag(C)) / UNITS
+
+
+@pytest.fixture(scope="module")
+def corner_errors():
+    """Whitened errors (N, 6) of a corner that only noise disturbs, by two covariances."""
+    T = se3.exp([0.004, -0.003, 0.005, 0.002, -0.003, 0.002])
+    ours, plain = [], []
+    for k in range(40):
+        target, source = _view(2 * k, CORNER), _view(2 * k + 1, CORNER, T)
+        targets, aligned = _aligned(source, target, T)
+        error = se3.log(se3.inverse(aligned.T_world_source) @ T)
+        for C, out in (
+            (covariance(source, targets, aligned, GEOMETRY_ONLY), ours),
+            (np.linalg.inv(aligned.information), plain),
+        ):
+            values, vectors = np.linalg.eigh(C / np.outer(UNITS, UNITS))
+            out.append(vectors.T @ (error / UNITS) / np.sqrt(values))
+    return np.array(ours), np.array(plain)
+
+
+def test_covariance_holds_errors_of_noise(corner_errors):
+    ours, _ = corner_errors
+    within = np.mean(np.abs(ours) < 1.96)
+    assert within > 0.88
+    # Not so wide that it says nothing.
+    assert np.sqrt(np.mean(ours**2)) > 0.3
+
+
+def test_plain_information_is_too_sure(corner_errors):
+    ours, plain = corner_errors
+    assert np.sqrt(np.mean(plain**2)) > 1.5 * np.sqrt(np.mean(ours**2))
+
+
+def test_patches_that_disagree_widen_the_covariance():
+    T = se3.exp([0.01, 0, 0, 0, 0.01, 0])
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    bend = 0.02 * np.sin(2 * np.pi * u / 44) * np.sin(2 * np.pi * v / 36)
+    found = []
+    for shape in (None, bend):
+        target, source = _view(0, CORNER), _view(1, CORNER, T, bend=shape)
+        targets, aligned = _aligned(source, target, T)
+        found.append(_sigmas(covariance(source, targets, aligned, GEOMETRY_ONLY)))
+    assert (found[1] > 1.5 * found[0]).sum() >= 3
+
+
+def test_hidden_errors_grow_with_the_change_of_the_view():
+    steps = [se3.exp(np.array([0.02, 0, 0, 0, 0.03, 0]) * k) for k in (0, 1, 3)]
+    found = []
+    for T in steps:
+        target, source = _view(0, CORNER), _view(1, CORNER, T)
+        targets, aligned = _aligned(source, target, T)
+        found.append(_sigmas(covariance(source, targets, aligned, GEOMETRY_ONLY)))
+    assert (found[0] < found[1]).all()
+    assert (found[1] < found[2]).all()
+
+
+def test_what_a_wall_leaves_open_is_as_uncertain_as_the_prediction():
+    wall = [(0.0, 0.0, 1.0, 2.0)]
+    target, source = _view(0, wall), _view(1, wall)
+    targets, aligned = _aligned(source, target, np.eye(4))
+    C = covariance(source, targets, aligned, GEOMETRY_ONLY)
+    sigma = np.sqrt(np.diag(C))
+    assert len(aligned.unobservable) == 3
+    np.testing.assert_allclose(sigma[[0, 1]], GEOMETRY_ONLY.prior_m, rtol=0.1)
+    np.testing.assert_allclose(sigma[5], GEOMETRY_ONLY.prior_rad, rtol=0.1)
+    assert sigma[2] < 0.005
+    assert (np.linalg.eigvalsh(C) > 0).all()
+
+
+def test_covariance_is_the_same_for_any_number_of_threads():
+    from tofuse.kernels.threads import threads
+
+    T = se3.exp([0.01, 0, 0.01, 0, 0.01, 0])
+    target, source = _view(0, CORNER), _view(1, CORNER, T)
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            targets, aligned = _aligned(source, target, T)
+            found.append(covariance(source, targets, aligned, GEOMETRY_ONLY))
+    assert found[0].tobytes() == found[1].tobytes()
+
+
+def _made_patches(means, weights, change=0.0):
+    rng = np.random.default_rng(3)
+    n = len(means)
+    places = np.stack([np.arange(n) % 8, np.arange(n) // 8], -1) / 8
+    J = np.concatenate([rng.normal(size=(n, 6)), np.zeros((n, 1))], 1)
+    H = (J * weights[:, None]).T @ J
+    return Patches(
+        H, np.zeros((7, 7)), H, places, weights, means, J * weights[:, None], change, 2.0, 2
+    )
+
+
+def test_seen_errors_are_told_from_noise_by_their_size():
+    rng = np.random.default_rng(4)
+    weights = np.full(48, 1e2)  # noise of 10 cm
+    options = UncertaintyOptions(noise_pixels=1.0)
+    noise = covariance_of_patches(_made_patches(0.1 * rng.normal(size=48), weights), options)
+    large = covariance_of_patches(_made_patches(1.0 * rng.normal(size=48), weights), options)
+    ratio = np.sqrt(np.trace(large / np.outer(UNITS, UNITS)))
+    ratio /= np.sqrt(np.trace(noise / np.outer(UNITS, UNITS)))
+    assert 4 < ratio < 25
+
+
+def test_prior_takes_only_the_unobservable_directions():
+    C = np.diag([1e-6] * 3 + [1e-7] * 3)
+    directions = np.eye(6)[[0]]
+    out = with_prior(C, directions, np.full(6, 0.3))
+    np.testing.assert_allclose(out[0, 0], 0.09)
+    np.testing.assert_allclose(out[1:, 1:], C[1:, 1:], atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"tiles": (1, 4)}, {"noise_pixels": 0.0}, {"hidden": -1.0}, {"loosest": np.nan}]
+)
+def test_options_are_checked(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        UncertaintyOptions(**bad)
+
+
+def test_tile_sums_match_numpy():
+    """Distances alone, summed pixel by pixel; the sums do not depend on how rows are shared out."""
+    T = se3.exp([0.01, -0.01, 0.02, 0.004, 0.01, -0.006])
+    target, source = _view(0, CORNER), _view(1, CORNER, T)
+    inverse_z = source.planes[..., 3]
+    z = np.where(inverse_z > 0, 1 / np.maximum(inverse_z, 1e-6), 0).astype(np.float32)
+    sigma = (np.sqrt(source.plane_variance) * z * z).astype(np.float32)
+
+    def run(a, b):
+        return tiles.tile_sums(
+            z, source.rays, source.normals, sigma, source.photo, target.planes,
+            target.plane_variance, target.photo, target.projection.lookup,
+            target.projection.frame, T, 0.0, 1.0, 0.0, 3.5, np.cos(0.7), 2, 4, 3, a, b,
+        )  # fmt: skip
+
+    whole = run(0, 3)
+    np.testing.assert_array_equal(whole, np.concatenate([run(0, 1), run(1, 3)]))
+
+    expected = np.zeros((3, 4, tiles.SIZE))
+    for i in range(1, CAMERA.height, 2):
+        for j in range(1, CAMERA.width, 2):
+            if z[i, j] <= 0:
+                continue
+            p = np.append(source.rays[i, j], 1.0) * z[i, j]
+            q = T[:3, :3] @ p + T[:3, 3]
+            u, v = CAMERA.project(q[None])[0]
+            if not (-0.5 < u < CAMERA.width - 0.5 and -0.5 < v < CAMERA.height - 0.5):
+                continue
+            plane = target.planes[int(v + 0.5), int(u + 0.5)].astype(float)
+            if plane[3] <= 0:
+                continue
+            length = np.linalg.norm(plane[:3])
+            r = (plane[:3] @ q - 1) / length
+            m = T[:3, :3].T @ plane[:3] / length
+            s = source.normals[i, j].astype(float)
+            variance = (m @ p / p[2] * sigma[i, j]) ** 2
+            variance += target.plane_variance[int(v + 0.5), int(u + 0.5)] / length**2
+            e2 = r * r / variance / 3.5**2
+            if e2 >= 1 or s @ m < np.cos(0.7):
+                continue
+            J, K = (np.concatenate([x, np.cross(p, x), [0]]) for x in (m, s))
+            w = (1 - e2) ** 2 / variance
+            slope = (1 - e2) * (1 - 5 * e2) / variance
+            mean = (J + K) / 2
+            upper = np.triu_indices(7)
+            out = expected[i * 3 // CAMERA.height, j * 4 // CAMERA.width]
+            out[tiles.H : tiles.H + 28] += w * np.outer(mean, mean)[upper]
+            out[tiles.G : tiles.G + 7] += w * mean * r
+            out[tiles.A : tiles.A + 7] += w * mean
+            out[tiles.WEIGHT] += w
+            out[tiles.RESIDUAL] += w * r
+            out[tiles.COUNT] += 1
+            cross = slope * (np.outer(J, K) + np.outer(K, J)) / 2
+            out[tiles.CROSS : tiles.CROSS + 28] += cross[upper]
+    found = whole[:, :, tiles.GEOMETRY]
+    assert expected[..., tiles.COUNT].sum() > 500
+    # A pixel whose projection lies on the border of two may land on either.
+    assert np.abs(found[..., tiles.COUNT] - expected[..., tiles.COUNT]).sum() <= 4
+    scale = np.abs(expected).max((0, 1))
+    assert np.abs(found - expected).max((0, 1)) == pytest.approx(0 * scale, abs=0.02 * scale.max())
+    same = scale > 0
+    assert (np.abs(found - expected).max((0, 1))[same] < 0.03 * scale[same]).all()
+
+
+def test_faked_information_is_what_random_tilts_give():
+    rng = np.random.default_rng(6)
+    points = rng.uniform([-1, -1, 1], [1, 1, 3], (300, 3)).astype(np.float32)
+    normals = rng.normal(size=(300, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    variance = np.full(300, 1e-4)
+    tilt = 0.03
+    found = faked_information(points, normals, variance, 0.0, np.zeros(300, bool), tilt, slope=0.1)
+    total = np.zeros((6, 6))
+    rounds = 300
+    for _ in range(rounds):
+        off = tilt * rng.normal(size=(300, 3))
+        off -= (off * normals).sum(1, keepdims=True) * normals
+        J = np.concatenate([off, np.cross(points, off)], 1)
+        total += J.T @ J / 1e-4 / rounds
+    np.testing.assert_allclose(found, total, atol=0.02 * np.abs(total).max())
+
+
+def test_common_tilts_do_not_hold_a_wall():
+    """A wall that the camera bows the same way in every view still slides."""
+    wall = [(0.0, 0.0, 1.0, 2.0)]
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    bow = 0.01 * (((u - 43.5) / 44) ** 2 + ((v - 35.5) / 36) ** 2)
+    target, source = (_view(k, wall, bend=bow, sigma=0.002) for k in range(2))
+    targets = [Target(target, np.eye(4))]
+    fooled = ProjectiveOptions(photometric=False, common_tilt=0.0, common_slope=0.0)
+    assert len(align(source, targets, np.eye(4), fooled).unobservable) < 3
+    aligned = align(source, targets, np.eye(4), GEOMETRY_ONLY)
+    assert len(aligned.unobservable) == 3
+    found = patches(source, targets, aligned, GEOMETRY_ONLY, UncertaintyOptions())
+    assert found.change < 0.01
+
+
+def test_common_errors_do_not_hide_what_a_corner_holds():
+    target, source = _view(0, CORNER), _view(1, CORNER)
+    _, aligned = _aligned(source, target, np.eye(4))
+    assert len(aligned.unobservable) == 0
+    assert (np.linalg.eigvalsh(aligned.cross * np.outer(UNITS, UNITS)) > 1).all()
