@@ -254,11 +254,15 @@ def smooth_and_slope(
 
     For rows start..stop, out is (H, W, 3): mean over (2 radius + 1)^2 pixels, and its derivatives
     by the ray coordinates x and y. NaN where a pixel of the cross that the slopes need is missing
-    or its plane lies off the centre's by more than `jump` (share of the depth).
+    or its plane lies off the centre's by more than `jump` (share of the depth). A box with holes,
+    or cut off by the border, counts where the middle of its pixels is.
     """
     rows, columns = image.shape
     h = radius + 1
+    full = (2 * radius + 1) * (2 * radius + 1)
     m = np.empty(5)
+    mx = np.empty(5)
+    my = np.empty(5)
     for i in range(start, stop):
         for j in range(columns):
             out[i, j, 0] = np.nan
@@ -302,16 +306,28 @@ def smooth_and_slope(
                     good = False
                     break
                 m[k] = total / count
+                mx[k] = rays[ci, cj, 0]
+                my[k] = rays[ci, cj, 1]
+                if count < full:
+                    mx[k] = 0.0
+                    my[k] = 0.0
+                    for a in range(max(ci - radius, 0), min(ci + radius + 1, rows)):
+                        for b in range(max(cj - radius, 0), min(cj + radius + 1, columns)):
+                            if not np.isnan(image[a, b]):
+                                mx[k] += rays[a, b, 0] / count
+                                my[k] += rays[a, b, 1] / count
             if not good:
                 continue
-            out[i, j, 0] = m[0]
             # Chain rule: slopes by pixel to slopes by ray coordinate, for any lens.
-            xu = rays[i, j + h, 0] - rays[i, j - h, 0]
-            yu = rays[i, j + h, 1] - rays[i, j - h, 1]
-            xv = rays[i + h, j, 0] - rays[i - h, j, 0]
-            yv = rays[i + h, j, 1] - rays[i - h, j, 1]
+            xu = mx[2] - mx[1]
+            yu = my[2] - my[1]
+            xv = mx[4] - mx[3]
+            yv = my[4] - my[3]
             det = xu * yv - yu * xv
             du = m[2] - m[1]
             dv = m[4] - m[3]
-            out[i, j, 1] = (yv * du - yu * dv) / det
-            out[i, j, 2] = (xu * dv - xv * du) / det
+            sx = (yv * du - yu * dv) / det
+            sy = (xu * dv - xv * du) / det
+            out[i, j, 0] = m[0] + sx * (rays[i, j, 0] - mx[0]) + sy * (rays[i, j, 1] - my[0])
+            out[i, j, 1] = sx
+            out[i, j, 2] = sy

@@ -1,0 +1,301 @@
+"""Normal equations of projective alignment, against their sums in NumPy and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import BrownConrady, Pinhole
+from tofuse.kernels import alignment as kernels
+from tofuse.maps.surface_map import Projection
+
+CAMERA = Pinhole(24, 18, 30.0, 30.0, 11.5, 8.5)
+LENS = BrownConrady(24, 18, 30.0, 30.0, 11.5, 8.5, k1=-0.15, k2=0.05)
+NORMAL = np.array([0.1, -0.25, 0.6])  # a, b, c of the target's plane
+SLOPES = np.array([0.8, -0.5])  # of its log albedo
+UPPER6, UPPER7 = np.triu_indices(6), np.triu_indices(7)
+ROBUST, SCALE_P = 3.5, 0.2
+MOTION = se3.exp([0.02, -0.03, 0.01, 0.02, -0.015, 0.03])
+
+
+def target(camera=CAMERA):
+    """A slanted plane whose log albedo is linear in the rays."""
+    rays = camera.rays()
+    planes = np.empty((*rays.shape[:2], 4), np.float32)
+    planes[..., :3] = NORMAL
+    planes[..., 3] = rays @ NORMAL[:2] + NORMAL[2]
+    photo = np.empty((*rays.shape[:2], 3), np.float32)
+    photo[..., 0] = 1 + rays @ SLOPES
+    photo[..., 1:] = SLOPES
+    variance = np.full(rays.shape[:2], 1e-6, np.float32)
+    return planes, variance, photo, Projection.of(camera, 1)
+
+
+def source(n=60, noise=0.004, seed=1):
+    """Points near the target's plane as MOTION's camera sees them; normals, light nearly right."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-0.25, 0.25, (n, 2))
+    z = 1 / (xy @ NORMAL[:2] + NORMAL[2])
+    there = np.concatenate([xy * z[:, None], z[:, None]], 1) + rng.normal(0, noise, (n, 3))
+    points = se3.transform(se3.inverse(MOTION), there).astype(np.float32)
+    normals = np.broadcast_to(NORMAL / np.linalg.norm(NORMAL), (n, 3)) @ MOTION[:3, :3]
+    normals = normals + rng.normal(0, 0.02, (n, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    photo = np.empty((n, 3), np.float32)
+    photo[:, 0] = 1 + xy @ SLOPES + rng.normal(0, 0.1, n)
+    photo[:, 1:] = SLOPES + rng.normal(0, 0.1, (n, 2))
+    return points, normals, np.full(n, 0.003, np.float32), photo
+
+
+def accumulate(view, of, T=MOTION, *, exposure=0.0, scale_g=1.0, scale_p=SCALE_P, slack=0.01,
+               min_cosine=0.5, robust=ROBUST, start=0, stop=None):  # fmt: skip
+    planes, variance, photo, projection = of
+    stop = len(view[0]) if stop is None else stop
+    return kernels.accumulate(
+        *view, planes, variance, photo, projection.lookup, projection.frame,
+        np.ascontiguousarray(T), exposure, scale_g, scale_p, slack, robust, min_cosine, start, stop,
+    )  # fmt: skip
+
+
+def photometric_row(slopes, p, R=None, moved=None):
+    """Of the albedo's slopes at the point `moved`, by the right perturbation; (1, 7)."""
+    q = p if moved is None else moved
+    d = np.array([slopes[0], slopes[1], -(slopes @ q[:2]) / q[2]]) / q[2]
+    m = d if R is None else R.T @ d
+    return np.concatenate([m, np.cross(p, m), [-1.0]])
+
+
+def twin(view, of, T=MOTION, exposure=0.0, slack=0.01):
+    """The same sums, point by point, with plane and albedo where the point lands exactly."""
+    out = {"H": np.zeros((6, 6)), "g": np.zeros(6), "C": np.zeros((6, 6)), "HP": np.zeros((7, 7)),
+           "gP": np.zeros(7), "CP": np.zeros((7, 7)), "squares": 0.0, "weight": 0.0, "metres": 0.0,
+           "weight_p": 0.0, "squares_p": 0.0, "inliers": 0}  # fmt: skip
+    n_target = NORMAL / np.linalg.norm(NORMAL)
+    R = T[:3, :3]
+    for p, s, sigma, light in zip(*(a.astype(float) for a in view), strict=True):
+        q = R @ p + T[:3, 3]
+        r = (NORMAL @ q - 1) / np.linalg.norm(NORMAL)
+        m = R.T @ n_target
+        variance = (m @ p / p[2] * sigma) ** 2 + 1e-6 / (NORMAL @ NORMAL) + slack**2
+        if r * r / variance >= ROBUST**2:
+            continue
+        weight = (1 - r * r / variance / ROBUST**2) ** 2
+        J = np.concatenate([m, np.cross(p, m)])
+        K = np.concatenate([s, np.cross(p, s)])
+        middle = (J + K) / 2
+        out["H"] += weight / variance * np.outer(middle, middle)
+        out["g"] += weight / variance * middle * r
+        out["C"] += weight / variance * (np.outer(J, K) + np.outer(K, J)) / 2
+        out["squares"] += weight * r * r / variance
+        out["weight"] += weight
+        out["metres"] += r * r
+        out["inliers"] += 1
+        rp = 1 + SLOPES @ (q[:2] / q[2]) - light[0] - exposure
+        e2 = (rp / SCALE_P) ** 2
+        if e2 >= ROBUST**2:
+            continue
+        weight = (1 - e2 / ROBUST**2) ** 2
+        J = photometric_row(SLOPES, p, R, q)
+        K = photometric_row(light[1:], p)
+        out["CP"] += weight / SCALE_P**2 * (np.outer(J, K) + np.outer(K, J)) / 2
+        J[:6] = (J[:6] + K[:6]) / 2
+        out["HP"] += weight / SCALE_P**2 * np.outer(J, J)
+        out["gP"] += weight / SCALE_P**2 * J * rp
+        out["weight_p"] += weight
+        out["squares_p"] += weight * rp * rp
+    return out
+
+
+@pytest.mark.parametrize("exposure", [0.0, 0.3])
+def test_sums_are_those_of_numpy(exposure):
+    view, of = source(noise=0.015), target()
+    got, want = accumulate(view, of, exposure=exposure), twin(view, of, exposure=exposure)
+    assert got[kernels.LANDED] == got[kernels.COMPARED] == 60
+    assert got[kernels.INLIERS] == want["inliers"] > 30
+    pairs = [
+        (got[kernels.GEOMETRY_H :][:21], want["H"][UPPER6]),
+        (got[kernels.GEOMETRY_G :][:6], want["g"]),
+        (got[kernels.CROSS_G :][:21], want["C"][UPPER6]),
+        (got[kernels.PHOTO_H :][:28], want["HP"][UPPER7]),
+        (got[kernels.PHOTO_G :][:7], want["gP"]),
+        (got[kernels.CROSS_P :][:28], want["CP"][UPPER7]),
+        (got[kernels.SQUARES_G], want["squares"]),
+        (got[kernels.WEIGHT_G], want["weight"]),
+        (got[kernels.SQUARES_M], want["metres"]),
+        (got[kernels.WEIGHT_P], want["weight_p"]),
+        (got[kernels.SQUARES_P], want["squares_p"]),
+    ]
+    for found, wanted in pairs:
+        np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=2e-4 * np.abs(wanted).max())
+
+
+def test_the_gradient_is_that_of_the_cost_by_finite_differences():
+    """With equal normals and slopes on both sides, and next to no robust weighting."""
+    view, of = list(source(noise=0.004)), target()
+    wide = {"robust": 1e3, "slack": 0.02}
+    # Exactly the target's normal and slopes where the points land, so that both Jacobians agree.
+    view[1] = np.zeros_like(view[1])
+    view[3][:, 1:] = np.nan
+    found = accumulate(view, of, **wide)
+
+    def cost(xi):
+        T = MOTION @ se3.exp(xi)
+        sums = accumulate(view, of, T, **wide)
+        return sums[kernels.SQUARES_G], sums[kernels.SQUARES_P] / SCALE_P**2
+
+    step = 1e-4
+    for k in range(6):
+        xi = np.zeros(6)
+        xi[k] = step
+        slopes = (np.array(cost(xi)) - cost(-xi)) / (2 * step) / 2
+        geometry, photo = found[kernels.GEOMETRY_G + k], found[kernels.PHOTO_G + k]
+        scale_g = np.abs(found[kernels.GEOMETRY_G :][:6]).max()
+        scale_p = np.abs(found[kernels.PHOTO_G :][:6]).max()
+        assert slopes[0] == pytest.approx(geometry, abs=0.03 * scale_g)
+        assert slopes[1] == pytest.approx(photo, abs=0.03 * scale_p)
+    up, down = (accumulate(view, of, exposure=e, **wide)[kernels.SQUARES_P] for e in (step, -step))
+    slope = (up - down) / SCALE_P**2 / (2 * step) / 2
+    assert slope == pytest.approx(found[kernels.PHOTO_G + 6], rel=1e-3)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_a_point_lands_on_the_pixel_that_sees_it(camera, step):
+    """Each pixel's own point is compared with that pixel: a different depth in each."""
+    rays = camera.rays()[::1, ::1]
+    if step == 2:
+        rays = rays.reshape(9, 2, 12, 2, 2).mean((1, 3)).astype(np.float32)
+    rows, columns = rays.shape[:2]
+    w = 1 / (1 + np.arange(rows * columns, dtype=np.float32).reshape(rows, columns) / 100)
+    planes = np.zeros((rows, columns, 4), np.float32)
+    planes[..., 2] = planes[..., 3] = w
+    points = np.concatenate([rays, np.ones((rows, columns, 1))], -1) / w[..., None]
+    n = rows * columns
+    view = (points.reshape(n, 3).astype(np.float32), np.zeros((n, 3), np.float32),
+            np.full(n, 1e-4, np.float32), np.full((n, 3), np.nan, np.float32))  # fmt: skip
+    photo = np.full((rows, columns, 3), np.nan, np.float32)
+    of = (planes, np.full((rows, columns), 1e-8, np.float32), photo, Projection.of(camera, step))
+    sums = accumulate(view, of, np.eye(4), slack=0.0, robust=10.0)
+    assert sums[kernels.INLIERS] == n
+    assert sums[kernels.SQUARES_M] < 1e-9
+    assert sums[kernels.COUNT_P] == 0
+
+
+def test_what_can_not_be_compared_is_told_apart():
+    of = target()
+    points = np.float32([
+        [0, 0, 1 / 0.6],  # on the plane
+        [0, 0, 1.0],  # in front of what was seen
+        [0, 0, 3.0],  # behind
+        [0, 0, -1.0],  # behind the camera
+        [5, 0, 1.0],  # out of view
+    ])  # fmt: skip
+    n = len(points)
+    view = (points, np.zeros((n, 3), np.float32), np.full(n, 0.003, np.float32),
+            np.full((n, 3), np.nan, np.float32))  # fmt: skip
+    sums = accumulate(view, of, np.eye(4))
+    assert sums[kernels.LANDED] == 3
+    assert sums[kernels.INLIERS] == 1
+    assert sums[kernels.IN_FRONT] == 1
+    of[0][8:10, 11:13] = 0  # no plane there
+    sums = accumulate(view, of, np.eye(4))
+    assert (sums[kernels.LANDED], sums[kernels.COMPARED]) == (3, 0)
+
+
+def test_points_whose_normal_turns_away_are_no_inliers():
+    view, of = list(source()), target()
+    view[1][:30] = [1, 0, 0]
+    sums = accumulate(view, of)
+    assert sums[kernels.INLIERS] == 30
+    view[1][:30] = 0  # unknown: nothing speaks against them
+    assert accumulate(view, of)[kernels.INLIERS] == 60
+
+
+def test_outliers_count_nothing():
+    view, of = list(source()), target()
+    before = accumulate(view, of, stop=40)
+    view[0][40:, 2] *= 1.5
+    after = accumulate(view, of)
+    np.testing.assert_array_equal(before[: kernels.LANDED], after[: kernels.LANDED])
+
+
+def test_parts_of_the_points_add_up():
+    view, of = source(), target()
+    whole = accumulate(view, of)
+    parts = accumulate(view, of, stop=25) + accumulate(view, of, start=25)
+    np.testing.assert_allclose(parts, whole, rtol=1e-12, atol=1e-12)
+
+
+# --- the small solvers ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.1, 1.0, 2.5])
+def test_moved_is_the_exponential_map(size):
+    rng = np.random.default_rng(5)
+    T = se3.exp(rng.normal(size=6))
+    xi = size * rng.normal(size=6) / np.sqrt(6)
+    np.testing.assert_allclose(kernels.moved(T, xi), T @ se3.exp(xi), atol=1e-9)
+
+
+def test_moved_takes_rounding_out_of_rotations():
+    T = se3.exp([1, 2, 3, 0.5, -0.2, 0.3])
+    T[:3, :3] *= 1 + 1e-5
+    out = kernels.moved(T, np.zeros(6))
+    np.testing.assert_allclose(out[:3, :3].T @ out[:3, :3], np.eye(3), atol=1e-9)
+    np.testing.assert_array_equal(out[3], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-10, 1e-5, 0.01, 0.03, 1.0, 2.5])
+def test_twist_between_is_the_logarithm(size):
+    rng = np.random.default_rng(6)
+    A = se3.exp(rng.normal(size=6))
+    xi = size * rng.normal(size=6) / np.sqrt(6)
+    B = A @ se3.exp(xi)
+    np.testing.assert_allclose(kernels.twist_between(A, B), xi, atol=1e-9)
+
+
+@pytest.mark.parametrize("photometric", [True, False])
+def test_normal_equations_unpack_the_sums(photometric):
+    total = np.random.default_rng(7).uniform(1, 2, kernels.SIZE)
+    H, g, C = kernels.normal_equations(total, photometric)
+    wanted_H, wanted_C, wanted_g = np.zeros((7, 7)), np.zeros((7, 7)), np.zeros(7)
+    wanted_H[UPPER6] = total[kernels.GEOMETRY_H :][:21]
+    wanted_C[UPPER6] = total[kernels.CROSS_G :][:21]
+    wanted_g[:6] = total[kernels.GEOMETRY_G :][:6]
+    if photometric:
+        wanted_H[UPPER7] += total[kernels.PHOTO_H :][:28]
+        wanted_C[UPPER7] += total[kernels.CROSS_P :][:28]
+        wanted_g += total[kernels.PHOTO_G :][:7]
+    for M in (wanted_H, wanted_C):
+        M.T[UPPER7] = M[UPPER7]
+    if not photometric:
+        wanted_H[6, 6] = 1
+    np.testing.assert_array_equal(H, wanted_H)
+    np.testing.assert_array_equal(C, wanted_C)
+    np.testing.assert_array_equal(g, wanted_g)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+def test_gather_takes_every_strideth_pixel_with_a_plane(stride):
+    planes, variance, photo, _ = target()
+    planes[3:9, 5:11] = 0
+    variance[...] = np.random.default_rng(8).uniform(1e-6, 4e-6, variance.shape)
+    rays = CAMERA.rays()
+    most = planes.shape[0] * planes.shape[1]
+    points, normals, light = (np.full((most, 3), 7, np.float32) for _ in range(3))
+    sigma = np.full(most, 7, np.float32)
+    n = kernels.gather(rays, planes, variance, photo, stride, points, normals, sigma, light)
+    pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    w = planes[pick][..., 3]
+    good = w > 0
+    assert n == np.count_nonzero(good)
+    assert (sigma[n:] == 7).all()
+    z = 1 / w[good]
+    wanted = np.concatenate([rays[pick][good], np.ones((n, 1))], 1) * z[:, None]
+    np.testing.assert_allclose(points[:n], wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(points[:n] @ NORMAL, 1, rtol=1e-5)
+    unit = np.broadcast_to(NORMAL / np.linalg.norm(NORMAL), (n, 3))
+    np.testing.assert_allclose(normals[:n], unit, rtol=1e-5)
+    np.testing.assert_allclose(sigma[:n], np.sqrt(variance[pick][good]) * z**2, rtol=1e-5)
+    np.testing.assert_array_equal(light[:n], photo[pick][good])

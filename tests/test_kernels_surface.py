@@ -1,0 +1,356 @@
+"""Plane fits, halving and slopes of range images, against slow NumPy twins."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tofuse.geometry.cameras import BrownConrady, Pinhole
+from tofuse.kernels.surface import (
+    SUMS,
+    add_rows,
+    albedo_image,
+    fit_planes,
+    halve,
+    smooth_and_slope,
+    weighted_sums,
+)
+
+CAMERA = Pinhole(40, 30, 45.0, 45.0, 19.5, 14.5)
+LENS = BrownConrady(40, 30, 45.0, 45.0, 19.5, 14.5, k1=-0.2, k2=0.05, p1=0.01, p2=-0.005)
+A, B, C = 0.12, -0.2, 0.5  # a X + b Y + c Z = 1, about 2 m away
+
+
+def plane_w(rays, a=A, b=B, c=C):
+    return (a * rays[..., 0] + b * rays[..., 1] + c).astype(np.float32)
+
+
+def integral(w, rays, weight):
+    sums = np.zeros((w.shape[0] + 1, w.shape[1] + 1, SUMS))
+    for start, stop in ((0, 7), (7, w.shape[0])):
+        weighted_sums(w, rays, weight, sums, start, stop)
+    add_rows(sums)
+    return sums
+
+
+def fit(w, rays, weight, radii=(2, 5), limit=1e-6, fill=0.7, offset=0.2):
+    sums = integral(w, rays, weight)
+    planes = np.full((*w.shape, 4), 7, np.float32)
+    quality = np.full((*w.shape, 2), 7, np.float32)
+    for start, stop in ((0, 11), (11, w.shape[0])):
+        fit_planes(
+            w, rays, weight, sums, np.array(radii), limit, fill, offset,
+            planes, quality, start, stop,
+        )  # fmt: skip
+    return planes, quality
+
+
+# --- halve ---------------------------------------------------------------------------------------
+
+
+def halve_twin(z, value, jump):
+    rows, columns = z.shape[0] // 2, z.shape[1] // 2
+    z_out, value_out = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for i, j in itertools.product(range(rows), range(columns)):
+        block = z[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].ravel().astype(float)
+        amount = value[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].ravel().astype(float)
+        amount, block = amount[block > 0], block[block > 0]
+        if len(block):
+            middle = np.sort(block)[min(1, len(block) - 1)]
+            near = np.abs(block - middle) <= jump * middle
+            z_out[i, j] = 1 / np.mean(1 / block[near])
+            value_out[i, j] = amount[near].mean()
+    return z_out, value_out
+
+
+def halved(z, value, jump=0.02):
+    z_out = np.full((z.shape[0] // 2, z.shape[1] // 2), 7, np.float32)
+    value_out = z_out.copy()
+    halve(z, value, jump, z_out, value_out)
+    return z_out, value_out
+
+
+@pytest.mark.parametrize("shape", [(20, 16), (21, 17)])
+def test_halving_is_that_of_the_slow_twin(shape):
+    rng = np.random.default_rng(1)
+    z = rng.choice([0, 1.0, 1.5, 1.51, 3], shape).astype(np.float32)
+    z += np.where(z > 0, rng.uniform(0, 0.01, shape), 0).astype(np.float32)
+    value = rng.uniform(1, 9, shape).astype(np.float32)
+    for found, wanted in zip(halved(z, value), halve_twin(z, value, 0.02), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6)
+
+
+def test_halving_never_makes_a_depth_between_two_surfaces():
+    z = np.where(np.arange(41) < 21, 1, 3).astype(np.float32)[None].repeat(8, 0)
+    found, value = halved(z, z * 10)
+    assert set(np.unique(found)) <= {1.0, 3.0}
+    np.testing.assert_allclose(value, 10 * found)
+
+
+def test_halving_keeps_a_plane_a_plane():
+    rays = CAMERA.rays()
+    found, _ = halved(1 / plane_w(rays), plane_w(rays), jump=0.5)
+    blocks = rays.reshape(15, 2, 20, 2, 2).mean((1, 3))
+    np.testing.assert_allclose(1 / found, plane_w(blocks), rtol=1e-6)
+
+
+# --- sums and planes -----------------------------------------------------------------------------
+
+
+def test_integral_images_hold_the_weighted_moments_of_any_window():
+    rng = np.random.default_rng(2)
+    rays = CAMERA.rays()
+    w = rng.uniform(0.2, 2, rays.shape[:2]).astype(np.float32)
+    weight = (rng.uniform(0, 5, w.shape) * (rng.random(w.shape) > 0.3)).astype(np.float32)
+    sums = integral(w, rays, weight)
+    for top, bottom, left, right in ((0, 30, 0, 40), (3, 9, 5, 6), (10, 11, 0, 40), (4, 4, 2, 9)):
+        found = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+        s = np.s_[top:bottom, left:right]
+        g, v = weight[s].astype(float), w[s].astype(float)
+        x, y = np.moveaxis(rays[s].astype(float), -1, 0)
+        columns = (g**0, x, y, v, x * x, x * y, y * y, x * v, y * v, v * v)
+        wanted = [(g * column).sum() for column in columns] + [np.count_nonzero(g)]
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_pixels_without_weight_count_nothing_even_if_their_rays_are_unknown():
+    rays = CAMERA.rays().copy()
+    w, weight = plane_w(rays), np.ones(rays.shape[:2], np.float32)
+    weight[4, 4] = 0
+    rays[4, 4] = w[4, 4] = np.nan
+    assert np.isfinite(integral(w, rays, weight)).all()
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_the_coefficients_of_a_plane_are_exact(camera):
+    rays = camera.rays()
+    planes, quality = fit(plane_w(rays), rays, np.full(rays.shape[:2], 1e4, np.float32), limit=0.01)
+    inside = np.s_[3:-3, 3:-3]
+    assert np.abs(planes[inside][..., :3] - [A, B, C]).max() < 2e-5
+    np.testing.assert_allclose(planes[inside][..., 3], plane_w(rays)[inside], rtol=1e-5)
+    assert (quality[inside][..., 0] < 0.01).all()
+
+
+def twin_of_one_fit(w, rays, weight, i, j, r):
+    """Weighted least squares over one window: coefficients, value at the pixel, its variance."""
+    s = np.s_[max(i - r, 0) : i + r + 1, max(j - r, 0) : j + r + 1]
+    g = np.sqrt(weight[s].astype(float).ravel())
+    X = np.concatenate([rays[s].astype(float), np.ones((*w[s].shape, 1))], -1).reshape(-1, 3)
+    found = np.linalg.lstsq(X * g[:, None], w[s].astype(float).ravel() * g, rcond=None)[0]
+    here = np.append(rays[i, j].astype(float), 1)
+    inverse = np.linalg.inv((X * g[:, None] ** 2).T @ X)
+    left_over = (g**2 * (w[s].ravel() - X @ found) ** 2).sum() / (np.count_nonzero(g) - 3)
+    return found, here @ found, here @ inverse @ here, left_over
+
+
+def test_fits_are_weighted_least_squares_depth_by_the_smallest_window_slope_by_the_widest():
+    rng = np.random.default_rng(3)
+    rays = LENS.rays()
+    weight = rng.uniform(0.5e6, 2e6, rays.shape[:2]).astype(np.float32)
+    w = plane_w(rays) + (rng.normal(size=weight.shape) / np.sqrt(weight)).astype(np.float32)
+    planes, quality = fit(w, rays, weight, limit=100.0)
+    for i, j in ((8, 9), (15, 20), (20, 30)):
+        wide = twin_of_one_fit(w, rays, weight, i, j, 5)
+        small = twin_of_one_fit(w, rays, weight, i, j, 2)
+        np.testing.assert_allclose(planes[i, j, :2], wide[0][:2], rtol=1e-3, atol=1e-5)
+        assert planes[i, j, 3] == pytest.approx(small[1], rel=1e-6)
+        assert planes[i, j, :2] @ rays[i, j] + planes[i, j, 2] == pytest.approx(small[1], rel=1e-5)
+        assert quality[i, j, 1] == pytest.approx(small[2], rel=1e-4)
+        assert quality[i, j, 0] == pytest.approx(small[3], rel=1e-3)
+
+
+def test_noise_in_slopes_falls_with_the_window_and_the_stated_variance_of_depths_is_right():
+    rng = np.random.default_rng(4)
+    rays = CAMERA.rays()
+    sigma = 0.002
+    weight = np.full(rays.shape[:2], 1 / sigma**2, np.float32)
+    spread, errors = {2: [], 4: [], 8: []}, []
+    for _ in range(6):
+        w = plane_w(rays) + rng.normal(0, sigma, weight.shape).astype(np.float32)
+        for r in spread:
+            planes, quality = fit(w, rays, weight, radii=(r,), limit=2.0)
+            good = planes[9:-9, 9:-9]
+            good = good[good[..., 3] > 0]
+            spread[r].append(good[:, 0] - A)
+            if r == 2:
+                inside = planes[..., 3] > 0
+                off = (planes[..., 3] - plane_w(rays))[inside]
+                errors.append(off / np.sqrt(quality[..., 1][inside]))
+    variance = {r: np.concatenate(v).var() for r, v in spread.items()}
+    # The variance of a slope falls with the fourth power of the width.
+    for a, b in ((2, 4), (4, 8)):
+        wanted = ((2 * a + 1) / (2 * b + 1)) ** 4
+        assert wanted / 2 < variance[b] / variance[a] < wanted * 2
+    assert np.concatenate(errors).std() == pytest.approx(1, abs=0.1)
+
+
+def test_an_edge_is_not_bridged():
+    rays = CAMERA.rays()
+    near = np.arange(40) < 20
+    w = np.where(near, 1.0, 0.5).astype(np.float32)[None].repeat(30, 0)
+    weight = np.full(w.shape, 1e6, np.float32)
+    planes, _ = fit(w, rays, weight, limit=1.0)
+    # Windows that reach over the edge hold no plane; those that don't are exact.
+    assert (planes[5:-5, 18:22, 3] == 0).all()
+    np.testing.assert_allclose(planes[5:-5, 3:17, 3], 1.0, rtol=1e-5)
+    np.testing.assert_allclose(planes[5:-5, 23:-3, 3], 0.5, rtol=1e-5)
+    assert (np.abs(planes[5:-5, :, :2])[planes[5:-5, :, 3] > 0] < 1e-4).all()
+
+
+def test_a_crease_is_not_bridged_by_wide_windows():
+    rays = CAMERA.rays()
+    left, right = plane_w(rays, 0.6, 0, 0.5), plane_w(rays, -0.6, 0, 0.5)
+    w = np.where(rays[..., 0] < 0, left, right)
+    weight = np.full(w.shape, 1 / 0.002**2, np.float32)
+    planes, _ = fit(w, rays, weight, limit=1.2)
+    # The wide window, half way over the crease, fits worse than noise: the small one is kept.
+    np.testing.assert_allclose(planes[8:-8, 15:17, 0], 0.6, atol=1e-3)
+    np.testing.assert_allclose(planes[8:-8, 23:25, 0], -0.6, atol=1e-3)
+
+
+def test_a_wide_window_does_not_jump_over_what_a_small_one_has_seen():
+    rays = CAMERA.rays()
+    w = plane_w(rays)
+    # The pixel's neighbourhood is off the plane of everything around.
+    w[13:18, 18:23] += np.linspace(-0.3, 0.3, 25).reshape(5, 5).astype(np.float32) ** 2
+    planes, _ = fit(w, rays, np.full(w.shape, 1e6, np.float32), radii=(2, 12), limit=1.0)
+    assert (planes[15, 20] == 0).all()
+
+
+def test_pixels_at_an_outline_are_dropped():
+    rays = CAMERA.rays()
+    w = plane_w(rays)
+    weight = np.full(w.shape, 1e6, np.float32)
+    weight[:, 20:] = 0
+    planes, quality = fit(w, rays, weight, limit=1.0)
+    assert (planes[:, 20:] == 0).all()
+    assert np.isnan(quality[:, 20:, 0]).all()
+    assert (planes[5:-5, 19] == 0).all(), "its window is mostly on one side"
+    assert (planes[5:-5, 10:17, 3] > 0).all()
+    loose, _ = fit(w, rays, weight, limit=1.0, fill=0.1, offset=5.0)
+    assert (loose[5:-5, 19, 3] > 0).all(), "the two limits, and nothing else, drop them"
+
+
+def test_a_pixel_off_its_neighbours_plane_has_none():
+    rays = CAMERA.rays()
+    w = plane_w(rays)
+    weight = np.full(w.shape, 1e6, np.float32)
+    w[15, 20] += 0.006  # 6 sigmas; of 25 pixels, that leaves the window's misfit within limits
+    planes, _ = fit(w, rays, weight, limit=1.2)
+    assert planes[15, 20, 3] == 0
+    assert planes[15, 23, 3] > 0
+
+
+# --- albedo --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("power", [0.0, 2.0])
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_light_of_a_matte_plane_gives_one_albedo(power, camera):
+    rays = camera.rays().astype(float)
+    w = plane_w(rays).astype(float)
+    direction = np.concatenate([rays, np.ones((*w.shape, 1))], -1)
+    length = np.linalg.norm(direction, axis=-1)
+    cosine = (direction @ [A, B, C]) / length / np.linalg.norm([A, B, C])
+    distance = length / w
+    light = (0.4 * cosine / distance**power).astype(np.float32)
+    planes = np.broadcast_to(np.float32([A, B, C, 0]), (*w.shape, 4)).copy()
+    planes[..., 3] = w
+    planes[3, 4] = 0
+    light[5, 6] = 0
+    light[5, 7] = np.nan
+    out = np.zeros(w.shape, np.float32)
+    albedo_image(planes, camera.rays(), light, power, out)
+    holes = np.zeros(w.shape, bool)
+    holes[[3, 5, 5], [4, 6, 7]] = True
+    np.testing.assert_array_equal(np.isnan(out), holes)
+    np.testing.assert_allclose(out[~holes], np.log(0.4), atol=1e-5)
+
+
+def test_a_surface_seen_along_itself_has_no_albedo():
+    rays = CAMERA.rays()
+    planes = np.zeros((*rays.shape[:2], 4), np.float32)
+    planes[..., 0], planes[..., 2] = 10.0, 1.0  # nearly contains the optical axis
+    planes[..., 3] = np.maximum(plane_w(rays, 10, 0, 1), 0)
+    out = np.zeros(rays.shape[:2], np.float32)
+    albedo_image(planes, rays, np.ones(out.shape, np.float32), 0.0, out)
+    assert np.isnan(out[15, 20])
+    assert np.isfinite(out[15, 39])
+
+
+# --- slopes --------------------------------------------------------------------------------------
+
+
+def smoothed(image, planes, rays, radius=1, jump=0.05):
+    out = np.zeros((*image.shape, 3), np.float32)
+    for start, stop in ((0, 13), (13, image.shape[0])):
+        smooth_and_slope(image, planes, rays, radius, jump, out, start, stop)
+    return out
+
+
+def flat(rays, w=0.5):
+    planes = np.zeros((*rays.shape[:2], 4), np.float32)
+    planes[..., 2] = planes[..., 3] = w
+    return planes
+
+
+@pytest.mark.parametrize("radius", [0, 1, 2])
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_a_ramp_over_the_rays_gives_its_slope(camera, radius):
+    rays = camera.rays()
+    image = (0.7 + 3 * rays[..., 0] - 2 * rays[..., 1]).astype(np.float32)
+    out = smoothed(image, flat(rays), rays, radius)
+    h = radius + 1
+    inside = out[h:-h, h:-h]
+    assert np.isnan(out[:h]).all()
+    assert np.isnan(out[:, -h:]).all()
+    # Box means of a bent lens's rays are those of the box's centre but for its curvature.
+    atol = 1e-4 if camera is CAMERA else 0.01
+    np.testing.assert_allclose(inside[..., 0], image[h:-h, h:-h], atol=atol)
+    np.testing.assert_allclose(inside[..., 1], 3, atol=5 * atol)
+    np.testing.assert_allclose(inside[..., 2], -2, atol=5 * atol)
+
+
+def test_no_slope_reaches_over_an_edge_in_depth_or_a_hole():
+    rays = CAMERA.rays()
+    planes = flat(rays)
+    planes[:, 20:, 2:] = 1.0  # 1 m from here, 2 m before
+    image = np.where(np.arange(40) < 20, 0, 5).astype(np.float32)[None].repeat(30, 0)
+    out = smoothed(image, planes, rays)
+    assert np.isnan(out[:, 18:22]).all(), "the cross reaches two pixels"
+    assert np.nanmax(np.abs(out[5:-5, 5:17, 1:])) == 0
+    planes = flat(rays)
+    planes[15, 20] = 0
+    out = smoothed(np.zeros((30, 40), np.float32), planes, rays)
+    assert np.isnan(out[15, [18, 20, 22]]).all()
+    assert np.isnan(out[[13, 17], 20]).all()
+    assert np.isfinite(out[14, 19]).all()
+
+
+def test_holes_in_the_image_are_left_out_of_the_means():
+    rays = CAMERA.rays()
+    image = np.ones((30, 40), np.float32)
+    image[10, 10] = np.nan
+    out = smoothed(image, flat(rays), rays)
+    assert np.isnan(out[10, 10]).all()
+    np.testing.assert_allclose(out[10, 11], [1, 0, 0], atol=1e-6)
+    # Nor do they shift the means: a ramp keeps its slope around them.
+    image = (3 * rays[..., 0] - 2 * rays[..., 1]).astype(np.float32)
+    ramp = image.copy()
+    image[10, 10] = image[20, 25:27] = np.nan
+    out = smoothed(image, flat(rays), rays)
+    known = np.isfinite(out[..., 0])
+    assert 0 < np.count_nonzero(known) < 26 * 36
+    np.testing.assert_allclose(out[known][:, 0], ramp[known], atol=1e-5)
+    assert np.abs(out[known][:, 1:] - [3, -2]).max() < 1e-4
+
+
+def test_a_slanted_plane_is_no_edge():
+    rays = CAMERA.rays()
+    planes = np.zeros((30, 40, 4), np.float32)
+    planes[..., :3] = 1.2, 0, 0.8  # by 5 % a pixel and more at the near side
+    planes[..., 3] = plane_w(rays, 1.2, 0, 0.8)
+    out = smoothed(np.ones((30, 40), np.float32), planes, rays, jump=0.02)
+    assert np.isfinite(out[2:-2, 2:-2]).all()
