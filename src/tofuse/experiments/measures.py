@@ -83,12 +83,11 @@ def motions(poses: Float64) -> Float64:
 def turned_deg(poses: Float64, axis: Float64) -> Float64:
     """(N,) angle in degrees turned since the first pose about an axis (3,) of the camera.
 
-    Whole turns are counted; a lost frame counts as not turned.
+    Whole turns are counted. A lost frame is where the one before it was.
     """
-    steps = motions(poses)
-    known = np.isfinite(steps[:, 0, 0])
+    known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     angle = np.zeros(len(poses))
-    angle[1:][known] = se3.so3_log(steps[known, :3, :3]) @ axis
+    angle[known[1:]] = se3.so3_log(motions(poses[known])[:, :3, :3]) @ axis
     return np.degrees(np.cumsum(angle))
 
 
