@@ -539,8 +539,8 @@ def _white_middle(results: Results, method: str) -> Finding:
     ratio = middle / max(rim, 1e-9)
     return graded(
         [1.0 if ratio < 0.1 else 0.5 if ratio < 0.3 else 0.0],
-        f"From above the middle is {ratio:.0%} as dense as the walls; here the camera looks down "
-        "on the top face.",
+        f"From above the middle is {ratio:.0%} as dense as the walls, though the camera "
+        "here sees the top face as well.",
     )
 
 
