@@ -31,6 +31,9 @@ Float64 = NDArray[np.float64]
 _CHUNKS = 4
 # Depths within this share of each other are one surface when an image is halved.
 _HALVING_JUMP = 0.02
+# m. Depths and sigmas beyond are no measurement, and their squares no float32.
+_NEAREST, _FARTHEST = 1e-3, 1e3
+_LEAST_SIGMA = 1e-6
 
 
 @dataclass(frozen=True)
@@ -238,18 +241,20 @@ def _projection(camera: Camera, step: int) -> Projection:
 def _reduced(frame: RangeFrame, columns: int) -> tuple[Float32, Float32, Float32 | None, int]:
     """Rays, z and amplitude at the working resolution, and the step in pixels."""
     rays = frame.camera.rays()
-    z = np.where(frame.valid, frame.z, np.float32(0))
+    z = frame.z
+    z = np.where(frame.valid & (z > _NEAREST) & (z < _FARTHEST), z, np.float32(0))
     light = frame.amplitude_image
     if light is not None:
         light = np.where(light < SATURATED_AMPLITUDE, light, np.float32(0)).astype(np.float32)
     step = 1
-    while z.shape[1] > columns:
+    while z.shape[1] > columns and z.shape[0] > 1:
         rows, cols = z.shape[0] // 2, z.shape[1] // 2
         z_half = np.empty((rows, cols), np.float32)
         light_half = np.empty((rows, cols), np.float32)
         halve(z, light if light is not None else z, _HALVING_JUMP, z_half, light_half)
         blocks = rays[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 2)
         rays = blocks.mean((1, 3))
+        z_half[np.isnan(rays).any(-1)] = 0
         z, light = z_half, light_half if light is not None else None
         step *= 2
     return np.ascontiguousarray(rays), z, light, step
@@ -274,7 +279,8 @@ def _noise_law(
 ) -> Float32:
     """Sigma of z in m up to a factor."""
     if frame.sigma_image is not None and step == 1:
-        return frame.sigma_image
+        known = (frame.sigma_image > _LEAST_SIGMA) & (frame.sigma_image < _FARTHEST)
+        return np.where(known, frame.sigma_image, np.float32(0)).astype(np.float32)
     if light is None or frame.amplitude_kind == "ir":
         return np.float32(0.001) + np.float32(0.003) * z * z
     if frame.amplitude_kind == "raw":

@@ -1,0 +1,233 @@
+"""Views made ready for tracking, on plane scenes of which everything is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable, ray_lengths
+from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import Projection, SurfaceMap, SurfaceOptions, surface_map
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+
+CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
+PLANE = np.array([0.1, -0.15, 0.5])  # a X + b Y + c Z = 1
+OPTIONS = SurfaceOptions()
+
+
+def wall(camera=CAMERA, sigma=0.0, seed=0, *, kind="z", amplitude="raw", spread=0.0, texture=0.0):
+    """A slanted wall with Gaussian noise of the range; `spread` makes the noise uneven."""
+    rays = camera.rays().astype(float)
+    z = 1 / (rays @ PLANE[:2] + PLANE[2])
+    r = z * ray_lengths(camera)
+    cosine = np.abs((rays @ PLANE[:2] + PLANE[2]) / ray_lengths(camera)) / np.linalg.norm(PLANE)
+    light = 1000 * np.exp(texture * rays[..., 0] + spread * np.sin(9 * rays[..., 1])) * cosine
+    raw = light / r**2
+    noise = np.random.default_rng(seed).normal(size=z.shape) * sigma
+    if spread:  # as with shot noise: one over the raw amplitude
+        noise *= np.median(raw) / raw
+    z = z * (1 + noise / z)
+    depth = z if kind == "z" else z * ray_lengths(camera)
+    image = {"raw": raw, "ir": raw, "range_compensated": light, None: None}[amplitude]
+    if image is not None:
+        image = image.astype(np.float32)
+    return RangeFrame(
+        3,
+        0.1,
+        camera,
+        depth.astype(np.float32),
+        kind,
+        amplitude_image=image,
+        amplitude_kind=amplitude or "raw",
+    )
+
+
+def inside(view: SurfaceMap, margin=4):
+    return np.s_[margin:-margin, margin:-margin]
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.004, 0.02])
+@pytest.mark.parametrize("amplitude", ["raw", "range_compensated", "ir", None])
+def test_the_noise_is_measured_on_the_view(sigma, amplitude):
+    view = surface_map(wall(sigma=sigma, amplitude=amplitude), OPTIONS)
+    found = np.median(view.sigma[view.sigma > 0])
+    assert found == pytest.approx(sigma, rel=0.15)
+
+
+@pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
+def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
+    frame = wall(sigma=0.004, amplitude=amplitude, spread=0.5)
+    view = surface_map(frame, OPTIONS)
+    clean = wall(sigma=0.0, amplitude=amplitude, spread=0.5)
+    off = (frame.z - clean.z) / view.sigma
+    raw = wall(amplitude="raw", spread=0.5).amplitude_image
+    for part in (raw < np.quantile(raw, 0.3), raw > np.quantile(raw, 0.7)):
+        assert off[part].std() == pytest.approx(1, rel=0.15)
+
+
+def test_the_cameras_own_noise_is_believed_up_to_a_factor():
+    frame = wall(sigma=0.004)
+    ramp = np.linspace(0.5, 2, 72, dtype=np.float32)[:, None].repeat(88, 1)
+    view = surface_map(replace(frame, sigma_image=0.3 * ramp), OPTIONS)
+    ratio = view.sigma / ramp
+    np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-5)
+
+
+def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
+    offs = []
+    for seed in range(4):
+        view = surface_map(wall(sigma=0.005, seed=seed), OPTIONS)
+        true = view.rays.astype(float) @ PLANE[:2] + PLANE[2]
+        good = view.planes[..., 3] > 0
+        offs.append(((view.planes[..., 3] - true) / np.sqrt(view.plane_variance + 1e-30))[good])
+    assert np.concatenate(offs).std() == pytest.approx(1, rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
+    view = surface_map(wall(kind=kind), OPTIONS)
+    assert view.index == 3
+    assert view.planar_share > 0.9
+    assert np.abs(view.planes[inside(view)][..., :3] - PLANE).max() < 1e-3
+    unit = PLANE / np.linalg.norm(PLANE)
+    assert np.abs(view.normals[inside(view)] - unit).max() < 1e-3
+    assert (view.normals[view.planes[..., 3] == 0] == 0).all()
+
+
+@pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
+def test_albedo_and_its_slopes_are_freed_of_range_and_incidence(amplitude):
+    view = surface_map(wall(amplitude=amplitude, texture=2.0), OPTIONS)
+    assert view.has_photo
+    found = view.photo[np.isfinite(view.photo).all(-1)]
+    assert len(found) > 0.8 * view.z.size
+    assert np.abs(found[:, 1:] - [2, 0]).max() < 0.05
+    level = view.photo[..., 0] - 2 * view.rays[..., 0]
+    assert np.nanmax(level) - np.nanmin(level) < 0.02
+
+
+def test_without_amplitude_there_is_no_albedo_but_all_the_rest():
+    view = surface_map(wall(amplitude=None), OPTIONS)
+    assert not view.has_photo
+    assert np.isnan(view.photo).all()
+    assert view.planar_share > 0.9
+
+
+def test_saturated_pixels_say_nothing_of_the_albedo():
+    frame = wall()
+    light = frame.amplitude_image.copy()
+    light[30:40, 30:40] = SATURATED_AMPLITUDE
+    view = surface_map(replace(frame, amplitude_image=light), OPTIONS)
+    assert np.isnan(view.photo[30:40, 30:40]).all()
+    good = np.isfinite(view.photo[..., 0])
+    assert np.ptp(view.photo[good][:, 0]) < 0.05
+
+
+@pytest.mark.parametrize("columns", [88, 44])
+def test_a_ray_table_with_unknown_rays(columns):
+    lens = BrownConrady(88, 72, 115.0, 115.0, 43.5, 35.5, k1=-0.2)
+    table = lens.rays().copy()
+    table[:6, :6] = np.nan
+    table[41, 50] = np.nan  # one of four, when halved
+    bent = wall(lens)
+    view = surface_map(replace(bent, camera=RayTable(table)), SurfaceOptions(columns=columns))
+    whole = surface_map(bent, SurfaceOptions(columns=columns))
+    step = 88 // columns
+    assert view.z.shape == (72 // step, columns)
+    assert (view.planes[: 4 // step, : 4 // step] == 0).all()
+    for name in ("planes", "plane_variance", "sigma"):
+        assert np.isfinite(getattr(view, name)).all(), name
+    # Far from the holes they change nothing.
+    far = np.s_[-20 // step :, : 60 // step]
+    np.testing.assert_allclose(view.planes[far], whole.planes[far], atol=1e-4)
+    assert view.planar_share > 0.7
+
+
+@pytest.mark.parametrize("columns", [320, 44])
+@pytest.mark.parametrize("amplitude", ["raw", "range_compensated", None])
+def test_a_view_without_a_single_pixel_has_no_surface(columns, amplitude):
+    frame = wall(amplitude=amplitude)
+    blank = replace(frame, depth=np.zeros_like(frame.depth))
+    view = surface_map(blank, SurfaceOptions(columns=columns))
+    assert view.planar_share == 0
+    assert np.isfinite(view.sigma).all()
+    assert np.isnan(view.photo).all()
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 40), (40, 2), (5, 5), (3, 100)])
+def test_tiny_images_give_a_view(shape):
+    camera = Pinhole(shape[1], shape[0], 50.0, 50.0, shape[1] / 2, shape[0] / 2)
+    view = surface_map(wall(camera), SurfaceOptions(columns=16))
+    assert view.planes.shape == (*view.z.shape, 4)
+    assert np.isfinite(view.planes).all()
+    assert 0 <= view.planar_share <= 1
+
+
+def test_a_frame_full_of_nonsense_gives_a_view():
+    rng = np.random.default_rng(5)
+    depth = rng.choice([0, 1e-30, 1e-3, 1.0, 1e4, 1e30, np.inf, np.nan, -1], (72, 88))
+    light = rng.choice([0, -1, 1.0, 1e30, np.inf, np.nan], (72, 88)).astype(np.float32)
+    sigma = rng.choice([0, -1, 1.0, 1e-30, 1e30, np.inf, np.nan], (72, 88)).astype(np.float32)
+    base = RangeFrame(0, 0.0, CAMERA, depth.astype(np.float32), amplitude_image=light)
+    for frame in (base, replace(base, sigma_image=sigma)):
+        view = surface_map(frame, OPTIONS)
+        assert np.isfinite(view.planes).all()
+
+
+def test_vga_is_reduced_to_the_columns_asked_for():
+    camera = Pinhole(640, 480, 570.0, 570.0, 319.5, 239.5)
+    view = surface_map(wall(camera), SurfaceOptions(columns=320))
+    assert view.z.shape == (240, 320)
+    assert np.abs(view.planes[inside(view)][..., :3] - PLANE).max() < 1e-3
+    smaller = Pinhole(320, 240, 285.0, 285.0, 159.5, 119.5)
+    np.testing.assert_allclose(view.rays, smaller.rays(), atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_the_lookup_finds_the_pixel_of_a_ray(step):
+    lens = BrownConrady(88, 72, 115.0, 115.0, 43.5, 35.5, k1=-0.25, k2=0.08, p1=0.01)
+    projection = Projection.of(lens, step)
+    rays = lens.rays()[5:-5:3, 5:-5:3].reshape(-1, 2).astype(float)
+    x0, y0, per_x, per_y = projection.frame
+    f = (rays - [x0, y0]) * [per_x, per_y]
+    base = f.astype(int)
+    (au, av), (iu, iv) = (f - base).T[..., None], base.T
+    L = projection.lookup
+    found = (1 - av) * ((1 - au) * L[iv, iu] + au * L[iv, iu + 1]) + av * (
+        (1 - au) * L[iv + 1, iu] + au * L[iv + 1, iu + 1]
+    )
+    wanted = (lens.project(np.concatenate([rays, np.ones((len(rays), 1))], 1)) + 0.5) / step - 0.5
+    assert np.abs(found - wanted).max() < 0.05
+
+
+def test_threads_change_nothing():
+    frame = wall(sigma=0.005)
+    with threads(1):
+        one = surface_map(frame, OPTIONS)
+    with threads(2):
+        two = surface_map(frame, OPTIONS)
+    for name in ("planes", "plane_variance", "photo", "sigma"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"columns": -1},
+        {"columns": 0},
+        {"radii": ()},
+        {"radii": (5, 2)},
+        {"radii": (0,)},
+        {"radii": (2, 10**9)},
+        {"edge_margin": -1},
+        {"photo_radius": -1},
+        {"edge_jump": float("nan")},
+        {"fill": 0.0},
+        {"offset": -1.0},
+        {"misfit": float("inf")},
+    ],
+)
+def test_options_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        SurfaceOptions(**wrong)
