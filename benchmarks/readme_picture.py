@@ -1,8 +1,9 @@
 """The picture and the figures of the README, from the result of ``tofuse demo``.
 
-    python benchmarks/readme_picture.py [DIR of the demo]
+    python benchmarks/readme_picture.py [DIR of the demo [DIR of another result]]
 
-Prints the verdict and the errors against the simulator's exact poses, and draws
+The other result is that of another method on the demo's recording, and gives figures alone. Prints
+the verdict and the errors against the simulator's exact poses, and draws
 docs/images/room.png: one frame of the recording, and the cloud seen from above at an angle, with
 the path of the camera.
 """
@@ -39,14 +40,15 @@ BACKGROUND_BGR = (96, 78, 66)
 LEVELS = np.uint8(0xF8)  # noise in the lowest bits doubles the file, and nobody sees it
 
 
-def print_figures(folder: Path) -> None:
+def print_figures(folder: Path, recording: Path) -> None:
     run = read_run_json(folder / "run.json")
     closed = sum(loop["accepted"] for loop in run["loops"])
     tracked = sum(frame["status"] == "tracked" for frame in run["frames"])
+    print(f"method: {run['config']['method']}")
     print(f"verdict: {run['verdict']} ({', '.join(r['code'] for r in run['reasons']) or 'none'})")
     print(f"frames tracked: {tracked} of {len(run['frames'])}, loops closed: {closed}")
     error = evaluate_trajectory(
-        *read_tum(folder / "trajectory.txt"), *read_tum(folder / "recording" / "groundtruth.txt")
+        *read_tum(folder / "trajectory.txt"), *read_tum(recording / "groundtruth.txt")
     )
     print(f"ATE rms: {error.ate_rms_m:.3f} m, {np.degrees(error.rotation_rms_rad):.2f} deg")
     for r in error.relative:
@@ -127,7 +129,8 @@ def picture(folder: Path) -> NDArray[np.uint8]:
 
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "demo"
-    print_figures(folder)
+    for result in (folder, *map(Path, sys.argv[2:])):
+        print_figures(result, folder / "recording")
     PICTURE.parent.mkdir(parents=True, exist_ok=True)
     image = picture(folder) & LEVELS
     cv2.imwrite(str(PICTURE), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])

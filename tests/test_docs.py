@@ -22,7 +22,7 @@ from tofuse import parts
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
-from tofuse.pipeline.config import changed, from_method, methods
+from tofuse.pipeline.config import Config, ViewKind, changed, from_method, methods
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.results.output import run_json
 from tofuse.results.verdict import REASONS
@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
 PART_ROOMS = (
-    "tofuse.filters",
+    "tofuse.filters",  # corrections too
     "tofuse.registration",
     "tofuse.odometry",
     "tofuse.posegraph",
@@ -70,7 +70,8 @@ def rows(text: str) -> list[list[str]]:
 
 
 def codes(text: str) -> set[str]:
-    return set(re.findall(r"`([^`]+)`", text))
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return set(re.findall(r"`([^`]+)`", prose))
 
 
 @pytest.mark.parametrize("name", with_blocks("python"))
@@ -206,9 +207,8 @@ def test_choices_are_documented() -> None:
     found = sections("docs/commands.md")
     assert set(DEMO_SCENES) <= codes(found["tofuse demo"])
     assert set(CAMERAS) <= codes(found["tofuse simulate"])
-    assert {row[0].strip("`") for row in rows(sections("docs/methods.md")["Configurations"])} == (
-        set(methods())
-    )
+    named = {row[0].strip("`") for row in rows(sections("docs/methods.md")["Configurations"])}
+    assert set(methods()) <= named
     for action in commands()["run"]._actions:
         if action.choices:
             assert set(action.choices) <= codes(found["tofuse run"])
@@ -280,6 +280,51 @@ def test_every_option_of_a_part_is_listed() -> None:
             fields = {f.name for f in dataclasses.fields(registered[kind][name])}
             missing = fields - codes(" ".join(row[2:]))
             assert not missing, f"{kind} {name}"
+
+
+def test_every_table_of_options_of_a_part_is_listed() -> None:
+    """Options that are plain dataclasses have options themselves, as those of keyframes."""
+    text = codes(text_of("docs/methods.md"))
+    for kind, known in registered_parts().items():
+        for name, cls in known.items():
+            defaults = [
+                f.default if f.default is not dataclasses.MISSING else f.default_factory()
+                for f in dataclasses.fields(cls)
+                if (f.default, f.default_factory) != (dataclasses.MISSING, dataclasses.MISSING)
+            ]
+            for value in defaults:
+                if dataclasses.is_dataclass(value) and not hasattr(value, "part_label"):
+                    missing = {f.name for f in dataclasses.fields(value)} - text
+                    assert not missing, f"{kind} {name}: {type(value).__name__}"
+
+
+def test_every_field_of_a_configuration_is_described() -> None:
+    table = rows(sections("docs/methods.md")["Configurations"])
+    described = {row[0].strip("`") for row in table} - set(methods())
+    fields = {f.name for f in dataclasses.fields(Config)} - {"method"}
+    assert described == fields
+
+
+def parts_named(data: Any) -> set[str]:
+    """Names of the parts of a configuration's data that are not inside another part."""
+    if isinstance(data, dict):
+        return {data["part"]} if "part" in data else set()
+    return set().union(*(parts_named(item) for item in data)) if isinstance(data, list) else set()
+
+
+@pytest.mark.parametrize(
+    ("column", "method", "kind"),
+    [(2, "default", "range"), (3, "default", "cloud"), (4, "thesis", "range")],
+)
+def test_table_of_configurations_tells_their_parts(
+    column: int, method: str, kind: ViewKind
+) -> None:
+    config = from_method(method, kind).to_dict()
+    for row in rows(sections("docs/methods.md")["Configurations"]):
+        field = row[0].strip("`")
+        if field in config and field not in ("loops", "fusion", "method"):
+            names = {code for code in codes(row[column]) if code != "lamp"}
+            assert names == parts_named(config[field]), f"{method}, {kind}: {field}"
 
 
 def test_every_room_is_described_in_the_order_of_imports() -> None:
