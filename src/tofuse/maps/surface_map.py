@@ -34,6 +34,9 @@ _HALVING_JUMP = 0.02
 # m. Depths and sigmas beyond are no measurement, and their squares no float32.
 _NEAREST, _FARTHEST = 1e-3, 1e3
 _LEAST_SIGMA = 1e-6
+# Share of the depth below which no camera's errors are: a view without noise, averaged or made by
+# a program, is not known to a hundredth of a millimetre either.
+_LEAST_NOISE = 3e-4
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     add_rows(sums)
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
-    scale = _noise_scale(w, rays, weight, sums, options.radii[0])
+    scale = max(_noise_scale(w, rays, weight, sums, options.radii[0]), _least_scale(z, sigma))
     radii = np.array(options.radii, np.int64)
     limit = options.misfit * scale
     run_chunks(
@@ -294,6 +297,15 @@ def _noise_law(
     typical = np.float32(np.median(lit))
     law = np.divide(typical, raw, out=np.full_like(z, 20), where=raw > 0)
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
+
+
+def _least_scale(z: Float32, sigma: Float32) -> float:
+    """Scale of the variance at which a typical pixel's sigma is the least share of its depth."""
+    z, sigma = z[::4, ::4], sigma[::4, ::4]
+    known = (z > 0) & (sigma > 0)
+    if not known.any():
+        return 0.0
+    return float(np.median(_LEAST_NOISE * z[known] / sigma[known])) ** 2
 
 
 def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radius: int) -> float:
