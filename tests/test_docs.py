@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import tomllib
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -296,6 +297,43 @@ def test_every_table_of_options_of_a_part_is_listed() -> None:
                 if dataclasses.is_dataclass(value) and not hasattr(value, "part_label"):
                     missing = {f.name for f in dataclasses.fields(value)} - text
                     assert not missing, f"{kind} {name}: {type(value).__name__}"
+
+
+def stated_defaults(text: str) -> Iterator[tuple[str, float]]:
+    """Options with a number in brackets behind them: `points` (1000)."""
+    for name, number, unit in re.findall(r"`(\w+)` \(([\d.]+(?:e-?\d+)?)(\s+degrees)?", text):
+        yield name, np.radians(float(number)) if unit else float(number)
+
+
+def numbers_of(options: Any) -> dict[str, float]:
+    """Defaults of a dataclass that are numbers."""
+    values = {f.name: f.default for f in dataclasses.fields(options)}
+    return {n: v for n, v in values.items() if isinstance(v, int | float)}
+
+
+def test_stated_defaults_are_those_of_the_parts() -> None:
+    checked = 0
+    for kind, known in documented_parts().items():
+        for name, row in known.items():
+            numbers = numbers_of(registered_parts()[kind][name])
+            for option, value in stated_defaults(" ".join(row[2:])):
+                if option in numbers:
+                    assert np.isclose(numbers[option], value), f"{kind} {name}: {option}"
+                    checked += 1
+    assert checked > 40
+
+
+def test_stated_defaults_are_those_of_keyframes() -> None:
+    tracker = registered_parts()["odometry"]["keyframes"]()
+    numbers: dict[str, float] = {}
+    for field in ("uncertainty", "acceptance", "alignment", "surface"):
+        numbers |= numbers_of(getattr(tracker, field))
+    stated = dict(stated_defaults(sections("docs/methods.md")["How `keyframes` works"]))
+    checked = numbers.keys() & stated.keys()
+    assert {option: stated[option] for option in checked} == pytest.approx(
+        {option: numbers[option] for option in checked}
+    )
+    assert len(checked) > 15
 
 
 def test_every_field_of_a_configuration_is_described() -> None:
