@@ -47,9 +47,10 @@ def default(kind: ViewKind) -> Config:
     """Return what `tofuse run` does unless told otherwise.
 
     Range images lose the light that came by way of other surfaces, and are aligned with
-    keyframes, by planes and albedo. Clouds are registered as in the
-    thesis, but with a resolution of 3 cm: two random subsets of 1000 points of a room lie several
-    centimetres apart, so at 1 cm few points find a partner.
+    keyframes, by planes and albedo; only what goes into the model is filtered, and only loops
+    given by hand are closed. Clouds are registered as in the thesis, but with a resolution of
+    3 cm: two random subsets of 1000 points of a room lie several centimetres apart, so at 1 cm
+    few points find a partner.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
