@@ -34,7 +34,9 @@ SQUARES_P = 118
 COUNT_P = 119
 SQUARES_M = 120  # of the inliers' distances, m^2
 RATIO = 121  # sum of target variance / source variance of the inliers
-SIZE = 122
+HISTOGRAM = 122  # of all compared points' distances in unscaled sigmas, quarter octaves from 1/16
+BINS = 48
+SIZE = HISTOGRAM + BINS
 
 
 @kernel
@@ -147,6 +149,9 @@ def accumulate(
         s1 = np.float64(normals[k, 1])
         s2 = np.float64(normals[k, 2])
         known = s0 != 0 or s1 != 0 or s2 != 0
+        own = np.sqrt((source_variance + target_variance) / (scale_g * scale_g))
+        place = 16 + int(np.floor(4 * np.log2(max(abs(r) / own, 1e-9))))
+        out[HISTOGRAM + min(max(place, 0), BINS - 1)] += 1
         if e2 >= limit2:
             # Nearer than what the target saw there: it looked through this point.
             if z * inverse_z < 1 and r * r > 4 * limit2 * variance:

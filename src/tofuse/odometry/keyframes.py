@@ -48,15 +48,15 @@ class Acceptance:
         Largest share of the compared points that lie where the target saw through.
     inliers
         Fewest points that fit, of those the finest level used.
-    scale
-        Largest rms of the residuals in sigmas of the noise.
+    rms_m
+        Largest rms of the distances of the points that fit.
     """
 
     inlier_share: float = 0.5
     overlap: float = 0.15
     in_front: float = 0.25
     inliers: int = 150
-    scale: float = 8.0
+    rms_m: float = 0.05
 
     def objection(self, a: Aligned) -> str:
         """Return why an alignment is not believed, or nothing if it is."""
@@ -68,8 +68,8 @@ class Acceptance:
             return f"only {a.inlier_share:.0%} of the points fit, not {self.inlier_share:.0%}"
         if a.in_front > self.in_front * a.compared:
             return f"{a.in_front / a.compared:.0%} of the points lie where the keyframe saw through"
-        if a.scale > self.scale:
-            return f"the points lie {a.scale:.1f} times further apart than the noise allows"
+        if a.rms_m > self.rms_m:
+            return f"the points that fit lie {a.rms_m * 1e3:.0f} mm from the surfaces"
         return ""
 
 
@@ -107,7 +107,7 @@ class Keyframes(Odometry):
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     acceptance: Acceptance = Acceptance()
-    relocated: Acceptance = Acceptance(0.75, 0.3, 0.1, 300, 4.0)
+    relocated: Acceptance = Acceptance(0.75, 0.3, 0.1, 300, 0.03)
     guess: Guess = "previous"
     keyframe_angle: float = 0.2
     keyframe_distance: float = 0.1
@@ -214,9 +214,14 @@ class _KeyframeTracker(Tracker):
         # Nothing tells how the camera moves: try some turns of it, and of what it sees.
         coarse = replace(self._options.alignment, levels=_PATIENT[:1])
         starts = [self._T @ motion for motion in _turns(view)]
-        tried = [align(view, targets, self._T, coarse, start=start) for start in starts]
-        best = max(tried, key=lambda aligned: aligned.score)
-        yield self._T, best.T_world_source, replace(self._options.alignment, levels=_PATIENT)
+        still, *turned = [align(view, targets, start, coarse) for start in starts]
+        best = max(turned, key=lambda aligned: aligned.score)
+        # A motion must explain more than standing still does: a flat wall fits any.
+        chosen = best if best.score > 1.03 * still.score else still
+        T = self._T if chosen is still else chosen.T_world_source
+        # With no prediction to keep to, what little the data tells is the better guess.
+        how = replace(self._options.alignment, levels=_PATIENT, common_tilt=0.0, common_slope=0.0)
+        yield T, chosen.T_world_source, how
 
     def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe] | None:
         """Look for the view among the keyframes, the newest first."""

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.geometry import se3
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
@@ -40,6 +41,15 @@ class Level:
     slack_m: float
     photo_slack: float
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.stride <= 64:
+            raise ValueError(f"stride is {self.stride}, not 1 to 64")
+        if not 1 <= self.iterations <= 1000:
+            raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
+        for name in ("slack_m", "photo_slack"):
+            if not 0 <= getattr(self, name) < 1e3:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
+
 
 @dataclass(frozen=True)
 class ProjectiveOptions:
@@ -63,6 +73,9 @@ class ProjectiveOptions:
     common_tilt, common_slope
         Errors fixed to the camera, which bend both views alike and so fake information: standard
         deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
+    most_sigma_m
+        What the sigma of a typical distance may become where the views disagree, m. Noise that
+        neighbouring pixels share is not seen by the fits of planes, but by this.
     tolerance
         A level ends when a step is smaller, in units of 1 cm and 1 degree.
     settled
@@ -82,8 +95,19 @@ class ProjectiveOptions:
     held: float = 1.0
     common_tilt: float = 0.03
     common_slope: float = 0.1
+    most_sigma_m: float = 0.02
     tolerance: float = 0.01
     settled: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.levels) <= 20:
+            raise ValueError(f"levels holds {len(self.levels)}; give 1 to 20")
+        for name in ("robust", "prior_m", "prior_rad", "held", "most_sigma_m"):
+            if not 1e-6 <= getattr(self, name) <= 1e6:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+        for name in ("max_angle", "common_tilt", "common_slope", "tolerance", "settled"):
+            if not 0 <= getattr(self, name) <= 1e6:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +222,7 @@ class _State:
     exposure: float = 0.0
     scale_g: float = 1.0
     scale_p: float = 0.1
+    most: float = 10.0  # what scale_g may become
     total: Float64 = field(default_factory=lambda: np.zeros(kernels.SIZE))
 
 
@@ -208,7 +233,7 @@ def align(
     options: ProjectiveOptions,
     *,
     start: Float64 | None = None,
-    exposure: float = 0.0,
+    exposure: float | None = None,
 ) -> Aligned:
     """Align a view with one or more others.
 
@@ -218,10 +243,12 @@ def align(
         (4, 4) where the source is expected; what the data leaves open stays there.
     start
         (4, 4) where the iterations begin; the prediction unless given.
+    exposure
+        Log albedo of the targets minus the source's to begin with; seen at the start unless given.
     """
     T_world_predicted = np.ascontiguousarray(T_world_predicted)
     T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
-    state = _State(T0.copy(), exposure)
+    state = _State(T0.copy())
     photometric = (
         options.photometric and source.has_photo and all(t.view.has_photo for t in targets)
     )
@@ -229,15 +256,19 @@ def align(
     converged = False
     weak = np.zeros((0, 6))
     points = Points.of(source, options.levels[0].stride)
+    if photometric:
+        state.exposure = _seen_exposure(points, targets, T0) if exposure is None else exposure
+    if len(points.sigma):
+        state.most = max(3.0, options.most_sigma_m / float(np.median(points.sigma)))
     for number, level in enumerate(options.levels):
         if number:
             points = Points.of(source, level.stride)
         doubt = None
-        for k in range(level.iterations):
+        for _ in range(level.iterations):
             state.total = _sum(points, targets, state, level, options, photometric)
             iterations += 1
             H, g, C = kernels.normal_equations(state.total, photometric)
-            if number > 0 or k >= level.iterations // 2:
+            if number > 0:  # at the coarsest level the views are not yet where they belong
                 if doubt is None:
                     doubt = _doubt(points, state, level, options, photometric)
                 weak = _weak_directions(_without_exposure(C) - doubt, options.held)
@@ -317,6 +348,29 @@ def _sum(
     return total
 
 
+def _seen_exposure(points: Points, targets: Sequence[Target], T: Float64) -> float:
+    """Median difference in log albedo, from some of the points, before they are aligned."""
+    some = slice(None, None, max(1, len(points.points) // _DOUBT_POINTS))
+    seen = []
+    for target in targets:
+        view = target.view
+        moved = se3.transform(target.T_target_world @ T, points.points[some])
+        ahead = moved[:, 2] > 0.02
+        moved, light = moved[ahead], points.photo[some][ahead, 0]
+        x0, y0, per_x, per_y = view.projection.frame
+        nodes = np.rint((moved[:, :2] / moved[:, 2:] - [x0, y0]) * [per_x, per_y])
+        lookup = view.projection.lookup
+        u, v = np.clip(nodes, 0, [lookup.shape[1] - 1, lookup.shape[0] - 1]).astype(int).T
+        pixel = np.rint(lookup[v, u])
+        rows, columns = view.z.shape
+        inside = (pixel >= 0).all(1) & (pixel[:, 0] < columns) & (pixel[:, 1] < rows)
+        j, i = pixel[inside].astype(int).T
+        found = view.photo[i, j, 0] - light[inside]
+        seen.append(found[np.isfinite(found)])
+    both = np.concatenate(seen) if seen else np.zeros(0)
+    return float(np.median(both)) if len(both) else 0.0
+
+
 def _without_exposure(H: Float64) -> Float64:
     """Marginalise the seventh unknown."""
     if H[6, 6] <= 0:
@@ -379,10 +433,14 @@ def _step(
 def _rescale(state: _State, level: Level, photometric: bool) -> None:
     """Take the sigmas from the residuals: the views show only their own noise, not their bias."""
     t = state.total
-    if t[kernels.WEIGHT_G] > 0:
-        # A biweight at 3.5 sigmas cuts the variance of a Gaussian to about 0.72 of itself.
-        seen = np.sqrt(t[kernels.SQUARES_G] / t[kernels.WEIGHT_G] / 0.72)
-        state.scale_g = float(np.clip(state.scale_g * seen, 0.7, 10.0))
+    counts = t[kernels.HISTOGRAM : kernels.HISTOGRAM + kernels.BINS]
+    if counts.sum() > 0:
+        # Of all that was compared, not of what fitted: a scale from inliers would confirm itself.
+        share = np.cumsum(counts) / counts.sum()
+        k = int(np.searchsorted(share, 0.5))
+        below = share[k - 1] if k else 0.0
+        median = 2 ** ((k - 16 + (0.5 - below) / max(share[k] - below, 1e-9)) / 4)
+        state.scale_g = float(np.clip(1.48 * median, 0.7, state.most))
     if photometric and t[kernels.WEIGHT_P] > 0:
         seen = np.sqrt(t[kernels.SQUARES_P] / t[kernels.WEIGHT_P] / 0.72)
         state.scale_p = float(np.clip(np.hypot(seen, level.photo_slack), 0.005, 0.5))
