@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.filters.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Acceptance
@@ -160,12 +161,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--camera", default="sr4000")
     parser.add_argument("--cache", type=Path, help="folder to keep the simulated views in")
+    parser.add_argument("--compensate", action="store_true", help="multipath first, as by default")
     arguments = parser.parse_args()
     for noise in arguments.noise:
         found: list[Outcome] = []
         refused = 0
         for kind, seed, made in chains(arguments, noise):
-            views = [surface_map(frame, SurfaceOptions()) for frame in made.frames]
+            frames = made.frames
+            if arguments.compensate:
+                compensation = Multipath(lamp=1.0).start()
+                frames = [compensation.apply(frame) for frame in frames]  # type: ignore[misc]
+            views = [surface_map(frame, SurfaceOptions()) for frame in frames]
             for pair in PAIRS:
                 got = outcome(kind, seed, views, made.T_room_camera, pair)
                 if got is None:
