@@ -74,7 +74,7 @@ class _Kind:
     title: str
     open: Callable[[Path], Recording]
     exact: bool
-    object: bool = False
+    farthest_m: float | None = None  # the object is nearer, the background is not
 
 
 def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = False) -> Sequence:
@@ -84,7 +84,7 @@ def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = Fals
         shutil.rmtree(OUT / "recordings" / name, ignore_errors=True)
     recording = kind.open(data).select(end=frames)
     config = fitted(default("range"), recording)
-    cut = (Foreground(),) if kind.object else ()
+    cut = () if kind.farthest_m is None else (Foreground(kind.farthest_m),)
     correctors = [correction.start() for correction in config.corrections]
     past: deque[Frame] = deque(maxlen=config.window - 1)
     tracked, cleaned, bare = [], [], []
@@ -185,8 +185,8 @@ KINDS = {
         True,
     ),
     "rail": _Kind(f"Rail, {_SR4000}", _simulated("rail", "rail"), True),
-    "torso": _Kind(f"Torso, turned, {_SR4000}", _simulated("torso", "torso"), True, object=True),
-    "box": _Kind(f"Box, turned, {_SR4000}", _simulated("box", "box"), True, object=True),
+    "torso": _Kind(f"Torso, turned, {_SR4000}", _simulated("torso", "torso"), True, 2.2),
+    "box": _Kind(f"Box, turned, {_SR4000}", _simulated("box", "box"), True, 1.8),
 }
 
 
