@@ -336,6 +336,14 @@ def test_stated_defaults_are_those_of_keyframes() -> None:
     assert len(checked) > 15
 
 
+def test_constants_of_the_covariance_are_those_of_the_tracker() -> None:
+    numbers = numbers_of(registered_parts()["odometry"]["keyframes"]().uncertainty)
+    table = [row for row in rows(text_of("docs/uncertainty.md")) if codes(row[0]) & set(numbers)]
+    stated = {option: float(row[1]) for row in table for option in codes(row[0])}
+    assert stated == pytest.approx({option: numbers[option] for option in stated})
+    assert len(stated) == 6
+
+
 def test_every_field_of_a_configuration_is_described() -> None:
     table = rows(sections("docs/methods.md")["Configurations"])
     described = {row[0].strip("`") for row in table} - set(methods())
