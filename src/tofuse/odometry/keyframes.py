@@ -52,11 +52,11 @@ class Acceptance:
         Largest rms of the distances of the points that fit.
     """
 
-    inlier_share: float = 0.5
-    overlap: float = 0.15
-    in_front: float = 0.25
+    inlier_share: float = 0.75
+    overlap: float = 0.2
+    in_front: float = 0.1
     inliers: int = 150
-    rms_m: float = 0.05
+    rms_m: float = 0.03
 
     def objection(self, a: Aligned) -> str:
         """Return why an alignment is not believed, or nothing if it is."""
@@ -91,7 +91,7 @@ class Keyframes(Odometry):
     uncertainty
         How its covariance is told.
     acceptance
-        When an alignment is believed; `relocated` when it was found again.
+        When an alignment is believed; `relocated` when nothing predicted it.
     guess
         Where an alignment starts: "previous" (the last motion goes on), "identity" (the camera
         stands still), "odometry" (the motion between the poses of an odometry file).
@@ -107,7 +107,7 @@ class Keyframes(Odometry):
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     acceptance: Acceptance = Acceptance()
-    relocated: Acceptance = Acceptance(0.75, 0.3, 0.1, 300, 0.03)
+    relocated: Acceptance = Acceptance(0.85, 0.4, 0.05, 300, 0.02)
     guess: Guess = "previous"
     keyframe_angle: float = 0.2
     keyframe_distance: float = 0.1
@@ -192,7 +192,8 @@ class _KeyframeTracker(Tracker):
         targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
         for predicted, start, how in self._predictions(view, targets, T_odometry):
             aligned = align(view, targets, predicted, how, start=start)
-            objection = options.acceptance.objection(aligned)
+            known = how is options.alignment
+            objection = (options.acceptance if known else options.relocated).objection(aligned)
             if not objection:
                 return aligned, newest[-1]
             reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
