@@ -1,0 +1,241 @@
+"""Alignment of prepared views with known motions, and what is said of directions left open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.registration.projective import UNITS, Level, Points, ProjectiveOptions, Target, align
+from tofuse.sensor.models import camera_model
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.render import render
+from tofuse.simulation.scene import FRAME_RATE_HZ, build
+
+OPTIONS = ProjectiveOptions()
+MODEL = camera_model("sr4000")
+GEOMETRY = replace(OPTIONS, photometric=False)
+
+
+class Pair:
+    """Frames of a scene and where they truly were; the first is the world."""
+
+    def __init__(self, name, *indices, noise=False, texture=True):
+        scene, sequence = build(name, texture=texture)
+        effects = Effects.none(shot_noise=noise)
+        self.frames = [render(scene, sequence, MODEL, k, effects=effects).frame for k in indices]
+        self.views = [surface_map(frame, SurfaceOptions()) for frame in self.frames]
+        rate = FRAME_RATE_HZ
+        self.poses = [sequence.T_world_camera(k / rate, indices[0] / rate) for k in indices]
+        self.target = Target(self.views[0], np.eye(4))
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Pair("room", 0, 3, 6)
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return Pair("corner", 0, 6)
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """With noise: what geometry seems to hold of a wall is noise, and has to be seen through."""
+    return Pair("wall", 0, 3, noise=True)
+
+
+def error(found, true):
+    off = se3.inverse(true) @ found.T_world_source
+    return float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+
+
+def assert_near(found, true, metres=0.001, degrees=0.02):
+    off = error(found, true)
+    assert off[0] < metres, off
+    assert off[1] < degrees, off
+
+
+@pytest.mark.parametrize("options", [OPTIONS, GEOMETRY], ids=["albedo", "geometry"])
+@pytest.mark.parametrize("scene", ["room", "corner"])
+def test_a_known_motion_is_found(request, scene, options):
+    pair = request.getfixturevalue(scene)
+    found = align(pair.views[1], [pair.target], np.eye(4), options)
+    assert se3.angle(pair.poses[1]) + np.linalg.norm(pair.poses[1][:3, 3]) > 0.01
+    assert_near(found, pair.poses[1])
+    assert found.converged
+    assert len(found.unobservable) == 0
+    assert found.inlier_share > 0.95
+    assert found.in_front < 0.01 * found.compared
+    assert 0.8 < found.overlap <= 1
+    assert found.rms_m < 0.002
+
+
+@pytest.mark.parametrize("size", [0.02, 0.05])
+def test_the_start_does_not_matter_within_the_reach_of_the_coarse_level(room, size):
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        off = size * rng.uniform(-1, 1, 6)
+        start = room.poses[1] @ se3.exp(off)
+        found = align(room.views[1], [room.target], start, OPTIONS)
+        assert_near(found, room.poses[1], 0.002, 0.04)
+
+
+def test_albedo_holds_what_a_flat_wall_leaves_open(wall):
+    true = wall.poses[1]
+    assert np.linalg.norm(true[:3, 3]) > 0.005
+    found = align(wall.views[1], [wall.target], np.eye(4), OPTIONS)
+    assert len(found.unobservable) == 0
+    assert_near(found, true, 0.001, 0.03)
+
+
+def test_without_albedo_a_flat_wall_holds_three_directions_and_the_rest_stays(wall):
+    true = wall.poses[1]
+    predicted = true @ se3.exp([0.03, -0.02, 0.015, 0.01, -0.015, 0.02])
+    found = align(wall.views[1], [wall.target], predicted, GEOMETRY)
+    assert found.unobservable.shape == (3, 6)
+    np.testing.assert_allclose(found.unobservable @ found.unobservable.T, np.eye(3), atol=1e-9)
+    # The camera slides along the wall and turns about its normal: these are the three.
+    R = found.T_world_source[:3, :3]
+    normal = R.T @ np.median(wall.views[0].normals.reshape(-1, 3), axis=0)
+    normal /= np.linalg.norm(normal)
+    tangents = np.linalg.svd(normal[None])[2][1:]
+    free = np.zeros((3, 6))
+    free[:2, :3] = tangents
+    free[2, 3:] = normal
+    free /= UNITS
+    basis = np.linalg.qr(free.T)[0]
+    overlap = np.linalg.svd(found.unobservable @ basis)[1]
+    assert overlap.min() > 0.98
+    # They stay where they were predicted ...
+    moved = se3.log(se3.inverse(predicted) @ found.T_world_source) / UNITS
+    assert np.abs(found.unobservable @ moved).max() < 0.1
+    # ... and the held ones are found: distance and tilt of the wall.
+    left = se3.log(se3.inverse(true) @ found.T_world_source)
+    assert abs(left[:3] @ normal) < 0.002
+    tilt = left[3:] - (left[3:] @ normal) * normal
+    assert np.degrees(np.linalg.norm(tilt)) < 0.05
+
+
+def test_a_corridor_leaves_its_length_open():
+    pair = Pair("corridor", 0, 6, texture=False)
+    found = align(pair.views[1], [pair.target], np.eye(4), GEOMETRY)
+    assert len(found.unobservable) == 1
+    along = np.abs(found.unobservable[0] * UNITS)
+    assert np.argmax(along[:3]) == 2
+    assert np.abs(found.unobservable[0, 2]) > 0.9
+
+
+def test_outliers_do_not_move_it(room):
+    frame = room.frames[1]
+    depth = frame.depth.copy()
+    depth[40:90, 60:110] *= 0.7  # somebody walks in: a tenth of the image
+    depth[100:130, 20:60] += 0.3
+    light = frame.amplitude_image.copy()
+    light[10:40, 30:90] *= 4
+    view = surface_map(replace(frame, depth=depth, amplitude_image=light), SurfaceOptions())
+    found = align(view, [room.target], np.eye(4), OPTIONS)
+    assert_near(found, room.poses[1], 0.003, 0.05)
+    assert found.inlier_share < 0.95
+
+
+@pytest.mark.parametrize("gain", [1.5, 0.5])
+def test_an_exposure_that_changed_is_allowed_for(room, wall, gain):
+    for pair in (room, wall):
+        frame = pair.frames[1]
+        brighter = replace(frame, amplitude_image=frame.amplitude_image * np.float32(gain))
+        view = surface_map(brighter, SurfaceOptions())
+        found = align(view, [pair.target], np.eye(4), OPTIONS)
+        assert found.exposure == pytest.approx(-np.log(gain), abs=0.01)
+        assert_near(found, pair.poses[1], 0.001, 0.03)
+
+
+def test_several_targets_add_up(room):
+    targets = [room.target, Target(room.views[1], se3.inverse(room.poses[1]))]
+    both = align(room.views[2], targets, room.poses[1], OPTIONS)
+    assert_near(both, room.poses[2])
+    one = align(room.views[2], targets[:1], room.poses[1], OPTIONS)
+    other = align(room.views[2], targets[1:], room.poses[1], OPTIONS)
+    assert both.points == one.points + other.points
+    assert abs(both.inliers - one.inliers - other.inliers) < 0.02 * both.inliers
+
+
+def test_the_world_may_be_anywhere(room):
+    T = se3.exp([3, -2, 1, 0.4, -0.8, 1.2])
+    found = align(room.views[1], [Target(room.views[0], se3.inverse(T))], T, OPTIONS)
+    assert_near(found, T @ room.poses[1])
+
+
+def test_threads_change_nothing(room):
+    results = []
+    for count in (1, 2):
+        with threads(count):
+            results.append(align(room.views[1], [room.target], np.eye(4), OPTIONS))
+    one, two = results
+    np.testing.assert_array_equal(one.T_world_source, two.T_world_source)
+    np.testing.assert_array_equal(one.information, two.information)
+    assert one.rms_m == two.rms_m
+
+
+def test_a_view_of_nothing_holds_nothing_and_stays_at_the_prediction(room):
+    frame = room.frames[1]
+    blank = surface_map(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
+    T = se3.exp([0.1, 0, 0, 0, 0.1, 0])
+    for source, target in ((blank, room.target), (room.views[1], Target(blank, np.eye(4)))):
+        found = align(source, [target], T, OPTIONS)
+        assert found.inliers == 0
+        assert len(found.unobservable) == 6
+        np.testing.assert_allclose(found.T_world_source, T, atol=1e-9)
+
+
+def test_points_lie_on_the_fitted_surface(room):
+    view = room.views[0]
+    some = Points.of(view, 4)
+    every = Points.of(view, 1)
+    assert len(every.points) == np.count_nonzero(view.planes[..., 3])
+    assert len(some.points) == pytest.approx(len(every.points) / 16, rel=0.1)
+    z = np.float32(1) / view.planes[view.planes[..., 3] > 0][:, 3]
+    np.testing.assert_allclose(every.points[:, 2], z, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"levels": ()},
+        {"robust": 0.0},
+        {"robust": float("nan")},
+        {"max_angle": -0.1},
+        {"prior_m": 0.0},
+        {"prior_rad": -1.0},
+        {"held": 0.0},
+        {"common_tilt": -1.0},
+        {"common_slope": float("inf")},
+        {"most_sigma_m": 0.0},
+        {"tolerance": -1.0},
+        {"settled": float("nan")},
+    ],
+)
+def test_options_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ProjectiveOptions(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"stride": 0},
+        {"iterations": 0},
+        {"iterations": 10**9},
+        {"slack_m": -1.0},
+        {"photo_slack": float("nan")},
+    ],
+)
+def test_levels_that_make_no_sense_are_refused(wrong):
+    good = {"stride": 2, "iterations": 4, "slack_m": 0.0, "photo_slack": 0.0}
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Level(**(good | wrong))
