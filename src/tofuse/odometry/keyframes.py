@@ -33,6 +33,9 @@ Guess = Literal["identity", "previous", "odometry"]
 _PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 3, 0.0, 0.0))
 _WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
+# Keyframes that are kept, so that memory stays flat.
+_REMEMBERED = 40
+
 
 @dataclass(frozen=True)
 class Acceptance:
@@ -50,6 +53,11 @@ class Acceptance:
         Fewest points that fit, of those the finest level used.
     rms_m
         Largest rms of the distances of the points that fit.
+    fit
+        Least score of the points that land in the target: what lies where the target has no
+        surface speaks against a view as well.
+    albedo
+        Largest standard deviation of what the log albedo differs by, where it takes part.
     """
 
     inlier_share: float = 0.75
@@ -57,6 +65,16 @@ class Acceptance:
     in_front: float = 0.1
     inliers: int = 150
     rms_m: float = 0.03
+    fit: float = 0.5
+    albedo: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("inlier_share", "overlap", "in_front", "fit"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
+        for name in ("inliers", "rms_m", "albedo"):
+            if not 0 <= getattr(self, name) < 1e9:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
     def objection(self, a: Aligned) -> str:
         """Return why an alignment is not believed, or nothing if it is."""
@@ -70,6 +88,10 @@ class Acceptance:
             return f"{a.in_front / a.compared:.0%} of the points lie where the keyframe saw through"
         if a.rms_m > self.rms_m:
             return f"the points that fit lie {a.rms_m * 1e3:.0f} mm from the surfaces"
+        if a.score < self.fit * a.overlap:
+            return f"only {max(a.score / a.overlap, 0):.0%} of what is seen fits well"
+        if a.photometric and a.photo_scale > self.albedo:
+            return f"the surfaces reflect otherwise, by {a.photo_scale:.0%}"
         return ""
 
 
@@ -117,8 +139,10 @@ class Keyframes(Odometry):
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def __post_init__(self) -> None:
-        if self.targets < 1:
-            raise ValueError(f"targets is {self.targets}, not 1 or more")
+        if not 1 <= self.targets <= _REMEMBERED:
+            raise ValueError(f"targets is {self.targets}, not 1 to {_REMEMBERED}")
+        if self.minimum_points < 1:
+            raise ValueError(f"minimum_points is {self.minimum_points}, not 1 or more")
         if not (self.keyframe_angle > 0 and self.keyframe_distance > 0):
             raise ValueError("keyframe_angle and keyframe_distance must be above 0")
 
@@ -228,7 +252,7 @@ class _KeyframeTracker(Tracker):
         """Look for the view among the keyframes, the newest first."""
         options = self._options
         wide = replace(options.alignment, levels=_WIDE, prior_m=3.0, prior_rad=3.0)
-        for keyframe in reversed(self._keyframes[-40:]):
+        for keyframe in reversed(self._keyframes):
             target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
             coarse = align(view, target, keyframe.T_world_camera, wide)
             if options.relocated.objection(coarse):
@@ -250,6 +274,7 @@ class _KeyframeTracker(Tracker):
     def _keep(self, view: SurfaceMap, T: Float64) -> None:
         depth = float(np.median(view.z[view.z > 0]))
         self._keyframes.append(_Keyframe(view, T, depth))
+        del self._keyframes[:-_REMEMBERED]
 
 
 def _turns(view: SurfaceMap) -> list[Float64]:

@@ -181,6 +181,8 @@ class Aligned:
         The same of the log albedo's, as a standard deviation.
     exposure
         Log albedo of the targets minus the source's.
+    photometric
+        Whether the albedo took part.
     score
         How much of the view fits, for comparing alignments of one view: robust weights of both
         terms, less twice the points in free space, as a share of the points.
@@ -202,6 +204,7 @@ class Aligned:
     photo_scale: float
     score: float
     exposure: float = 0.0
+    photometric: bool = False
 
     @cached_property
     def inlier_share(self) -> float:
@@ -300,6 +303,7 @@ def align(
         scale=state.scale_g,
         photo_scale=state.scale_p,
         exposure=state.exposure,
+        photometric=photometric and bool(total[kernels.COUNT_P] > 0),
         score=float(
             (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
             / max(len(points.points), 1)

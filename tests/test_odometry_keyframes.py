@@ -1,0 +1,261 @@
+"""Odometry against keyframes: follows, notices what it can't follow, and finds its way back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.odometry import keyframes as module
+from tofuse.odometry.keyframes import Acceptance, Keyframes
+from tofuse.pipeline.config import changed, from_method
+from tofuse.recordings.frames import CloudFrame
+from tofuse.sensor.models import camera_model
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.render import render
+from tofuse.simulation.scene import FRAME_RATE_HZ, build
+
+MODEL = camera_model("sr4000")
+BAD = 4  # which frame is spoilt
+
+
+class Sequence:
+    def __init__(self, name, indices, texture=True):
+        scene, path = build(name, texture=texture)
+        effects = Effects.none(shot_noise=True)
+        taken = [render(scene, path, MODEL, k, effects=effects).frame for k in indices]
+        self.frames = [replace(frame, index=n) for n, frame in enumerate(taken)]
+        rate = FRAME_RATE_HZ
+        self.poses = [path.T_world_camera(k / rate, indices[0] / rate) for k in indices]
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Sequence("room", range(0, 24, 3))
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return Sequence("corner", range(0, 24, 3))
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    return Sequence("rail", [0, 5, 10]).frames
+
+
+def run(frames, options=None, odometry=None):
+    tracker = (options or Keyframes()).start(0)
+    guesses = odometry or [None] * len(frames)
+    return [tracker.push(frame, T) for frame, T in zip(frames, guesses, strict=True)]
+
+
+def error(step, true):
+    off = se3.inverse(true) @ step.T_world_camera
+    return float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+
+
+def assert_near(step, true, metres=0.015, degrees=0.6):
+    assert step.T_world_camera is not None, step.reason
+    off = error(step, true)
+    assert off[0] < metres, off
+    assert off[1] < degrees, off
+
+
+def assert_marked(step):
+    assert step.status == "lost"
+    assert step.reason
+    assert step.T_world_camera is None
+    assert step.registration is None
+
+
+@pytest.mark.parametrize("amplitude", [True, False])
+@pytest.mark.parametrize("scene", ["room", "corner"])
+def test_it_follows_the_camera(request, scene, amplitude):
+    sequence = request.getfixturevalue(scene)
+    frames = sequence.frames
+    if not amplitude:
+        frames = [replace(frame, amplitude_image=None) for frame in frames]
+    steps = run(frames)
+    np.testing.assert_array_equal(steps[0].T_world_camera, np.eye(4))
+    assert steps[0].reference is None
+    for step, true in zip(steps, sequence.poses, strict=True):
+        assert step.status == "tracked"
+        assert_near(step, true)
+    for step in steps[1:]:
+        found = step.registration
+        reference = steps[step.reference].T_world_camera
+        np.testing.assert_allclose(
+            reference @ found.T_target_source, step.T_world_camera, atol=1e-9
+        )
+        assert np.linalg.eigvalsh(found.information).min() > 0
+
+
+def test_a_frame_far_from_the_keyframe_becomes_one(room):
+    never = run(room.frames, Keyframes(keyframe_angle=3.0, keyframe_distance=9.0))
+    assert {step.reference for step in never[1:]} == {0}
+    always = run(room.frames, Keyframes(keyframe_angle=0.001))
+    assert [step.reference for step in always[1:]] == list(range(7))
+
+
+def test_memory_does_not_grow_with_the_keyframes(room, monkeypatch):
+    monkeypatch.setattr(module, "_REMEMBERED", 3)
+    tracker = Keyframes(keyframe_angle=0.001).start(0)
+    for frame, true in zip(room.frames, room.poses, strict=True):
+        assert_near(tracker.push(frame), true)
+    assert len(tracker._keyframes) == 3
+
+
+def test_the_last_motion_goes_on(room, monkeypatch):
+    asked = []
+    align = module.align
+
+    def watched(view, targets, predicted, options, **more):
+        asked.append((view.index, np.array(predicted)))
+        return align(view, targets, predicted, options, **more)
+
+    monkeypatch.setattr(module, "align", watched)
+    steps = run(room.frames[:4])
+    T = [step.T_world_camera for step in steps]
+    first = next(predicted for index, predicted in asked if index == 3)
+    np.testing.assert_allclose(first, T[2] @ se3.inverse(T[1]) @ T[2], atol=1e-9)
+
+
+def test_odometry_is_used_where_nothing_else_tells():
+    sequence = Sequence("wall", range(0, 15, 3))
+    frames = [replace(frame, amplitude_image=None) for frame in sequence.frames]
+    # In a frame of its own, as odometry files are.
+    T_odometry = [se3.exp([3, 1, -2, 0.3, 0.7, -1]) @ T for T in sequence.poses]
+    steps = run(frames, Keyframes(guess="odometry"), T_odometry)
+    for step, true in zip(steps, sequence.poses, strict=True):
+        assert_near(step, true, 0.004, 0.2)
+    for step in steps[1:]:
+        assert len(step.registration.unobservable) == 3
+
+
+RNG = np.random.default_rng(3)
+SPARSE = RNG.random((144, 176)) < 0.01
+
+
+def scaled(frame, factor):
+    return replace(frame, depth=frame.depth * np.float32(factor))
+
+
+def mirrored(frame):
+    light = frame.amplitude_image
+    return replace(
+        frame,
+        depth=np.ascontiguousarray(frame.depth[:, ::-1]),
+        amplitude_image=None if light is None else np.ascontiguousarray(light[:, ::-1]),
+    )
+
+
+SPOILT = {
+    "blank": lambda f: scaled(f, 0),
+    "sparse": lambda f: f.keep(SPARSE),
+    "noise": lambda f: replace(f, depth=RNG.uniform(0.5, 8, f.depth.shape).astype(np.float32)),
+    "ten times too far": lambda f: scaled(f, 10),
+    "ten times too near": lambda f: scaled(f, 0.1),
+    "thousand times too far": lambda f: scaled(f, 1000),
+    "mirrored": mirrored,
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT.keys())
+@pytest.mark.parametrize("scene", ["room", "corner"])
+def test_a_spoilt_frame_is_lost_and_the_next_is_found(request, scene, spoil):
+    sequence = request.getfixturevalue(scene)
+    frames = list(sequence.frames)
+    frames[BAD] = spoil(frames[BAD])
+    steps = run(frames)
+    assert_marked(steps[BAD])
+    for k, (step, true) in enumerate(zip(steps, sequence.poses, strict=True)):
+        if k != BAD:
+            assert_near(step, true)
+
+
+@pytest.mark.parametrize("spoil", [SPOILT["blank"], SPOILT["sparse"]], ids=["blank", "sparse"])
+def test_a_recording_may_begin_with_spoilt_frames(room, spoil):
+    steps = run([spoil(room.frames[0]), spoil(room.frames[1]), *room.frames[2:]])
+    for step in steps[:2]:
+        assert_marked(step)
+    np.testing.assert_array_equal(steps[2].T_world_camera, np.eye(4))
+    for step, true in zip(steps[2:], room.poses[2:], strict=True):
+        assert_near(step, se3.inverse(room.poses[2]) @ true)
+
+
+def test_a_camera_that_stands_still_stands_still(room):
+    steps = run([*room.frames[:4], *[room.frames[3]] * 4])
+    for step in steps[3:]:
+        assert step.status == "tracked"
+        assert_near(step, room.poses[3])
+
+
+def test_a_camera_that_jumps_elsewhere_is_lost_until_it_returns(corner, elsewhere):
+    frames = [*corner.frames[:4], *elsewhere, *corner.frames[2:5]]
+    poses = [*corner.poses[:4], *[None] * 3, *corner.poses[2:5]]
+    for step, true in zip(run(frames), poses, strict=True):
+        if true is None:
+            assert_marked(step)
+        else:
+            assert_near(step, true)
+
+
+def test_threads_change_nothing(room):
+    results = []
+    for count in (1, 2):
+        with threads(count):
+            results.append(run(room.frames[:4]))
+    for one, two in zip(*results, strict=True):
+        np.testing.assert_array_equal(one.T_world_camera, two.T_world_camera)
+
+
+def test_clouds_are_refused():
+    with pytest.raises(InputError, match="needs images"):
+        Keyframes().start(0).push(CloudFrame.of(np.zeros((500, 3))))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("surface.columns", -1),
+        ("surface.columns", "wide"),
+        ("surface.radii", []),
+        ("surface.radii", [2, 1000000]),
+        ("surface.fill", float("nan")),
+        ("alignment.levels", []),
+        ("alignment.levels", [{"stride": 0, "iterations": 1, "slack_m": 0, "photo_slack": 0}]),
+        ("alignment.robust", 0),
+        ("alignment.prior_m", -1),
+        ("acceptance.inlier_share", 2),
+        ("acceptance.rms_m", -1),
+        ("relocated.albedo", float("nan")),
+        ("targets", 0),
+        ("targets", 1000000),
+        ("minimum_points", -5),
+        ("keyframe_angle", float("nan")),
+        ("keyframe_distance", 0),
+        ("guess", "luck"),
+        ("speed", 9),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_with_their_name(path, value):
+    options = value
+    for name in reversed(path.split(".")):
+        options = {name: options}
+    with pytest.raises(InputError, match=path.split(".")[-1]) as refused:
+        changed(from_method("default"), {"odometry": options}, where="my.toml")
+    assert "my.toml: odometry" in str(refused.value)
+
+
+def test_what_is_refused_is_told():
+    strict = replace(Acceptance(), inliers=10**6)
+    scene = Sequence("corner", [0, 3])
+    steps = run(scene.frames, Keyframes(acceptance=strict, relocated=strict))
+    assert_marked(steps[1])
+    assert "1000000 are needed" in steps[1].reason
+    assert "keyframe 0" in steps[1].reason
