@@ -205,6 +205,21 @@ def test_a_camera_that_jumps_elsewhere_is_lost_until_it_returns(corner, elsewher
             assert_near(step, true)
 
 
+def test_after_a_loss_a_view_that_could_be_anywhere_is_not_believed():
+    """A flat wall without albedo fits wherever the camera may have gone meanwhile."""
+    frames = [
+        replace(f, amplitude_image=None) for f in Sequence("wall", range(0, 12, 3), False).frames
+    ]
+    before = run(frames)
+    assert all(step.status == "tracked" for step in before)
+    frames[1] = scaled(frames[1], 0)
+    steps = run(frames)
+    assert steps[0].status == "tracked"
+    for step in steps[1:]:
+        assert_marked(step)
+    assert "in every direction" in steps[2].reason
+
+
 def test_threads_change_nothing(room):
     results = []
     for count in (1, 2):

@@ -129,7 +129,7 @@ class Keyframes(Odometry):
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     acceptance: Acceptance = Acceptance()
-    relocated: Acceptance = Acceptance(0.85, 0.4, 0.05, 300, 0.02)
+    relocated: Acceptance = Acceptance(0.85, 0.4, 0.05, 300, 0.02, 0.62)
     guess: Guess = "previous"
     keyframe_angle: float = 0.2
     keyframe_distance: float = 0.1
@@ -216,12 +216,23 @@ class _KeyframeTracker(Tracker):
         targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
         for predicted, start, how in self._predictions(view, targets, T_odometry):
             aligned = align(view, targets, predicted, how, start=start)
-            known = how is options.alignment
-            objection = (options.acceptance if known else options.relocated).objection(aligned)
+            if how is options.alignment:
+                objection = options.acceptance.objection(aligned)
+            else:
+                objection = options.relocated.objection(aligned) or self._doubt(aligned)
             if not objection:
                 return aligned, newest[-1]
             reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
         return None
+
+    def _doubt(self, aligned: Aligned) -> str:
+        """Why an alignment that nothing predicted is not believed though it fits."""
+        if not aligned.converged:
+            return "the search does not settle"
+        if self._lost and len(aligned.unobservable):
+            # A flat wall fits anywhere.
+            return "the camera was lost, and this view does not hold it in every direction"
+        return ""
 
     def _predictions(
         self, view: SurfaceMap, targets: list[Target], T_odometry: Float64 | None
@@ -259,7 +270,8 @@ class _KeyframeTracker(Tracker):
                 continue
             aligned = align(view, target, coarse.T_world_source, options.alignment)
             # A flat wall fits anywhere: only a view that is held in every direction is found again.
-            if not options.relocated.objection(aligned) and not len(aligned.unobservable):
+            objection = options.relocated.objection(aligned)
+            if not objection and aligned.converged and not len(aligned.unobservable):
                 return aligned, keyframe
         return None
 
