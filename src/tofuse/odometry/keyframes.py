@@ -30,7 +30,7 @@ Float64 = NDArray[np.float64]
 Guess = Literal["identity", "previous", "odometry"]
 
 # A relocalisation starts far off: coarser, and with more patience, than tracking.
-_PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 3, 0.0, 0.0))
+_PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
 _WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 # Keyframes that are kept, so that memory stays flat.
@@ -268,7 +268,8 @@ class _KeyframeTracker(Tracker):
             coarse = align(view, target, keyframe.T_world_camera, wide)
             if options.relocated.objection(coarse):
                 continue
-            aligned = align(view, target, coarse.T_world_source, options.alignment)
+            fine = replace(options.alignment, levels=_PATIENT)
+            aligned = align(view, target, coarse.T_world_source, fine)
             # A flat wall fits anywhere: only a view that is held in every direction is found again.
             objection = options.relocated.objection(aligned)
             if not objection and aligned.converged and not len(aligned.unobservable):
