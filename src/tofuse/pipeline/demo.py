@@ -21,8 +21,8 @@ from tofuse.simulation.record import simulate
 
 # What the thesis set differently for a scene (section 4.1): points beyond the object are cut.
 _SCENE_OPTIONS: dict[str, dict[str, Any]] = {
-    "torso": {"object": True},
-    "box": {"object": True},
+    "torso": {"object": True, "max_depth": 2.2},
+    "box": {"object": True, "max_depth": 1.8},
 }
 
 
