@@ -14,6 +14,7 @@ from tofuse.odometry import keyframes as module
 from tofuse.odometry.keyframes import Acceptance, Keyframes
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import CloudFrame
+from tofuse.recordings.open import open_recording
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
@@ -274,3 +275,15 @@ def test_what_is_refused_is_told():
     assert_marked(steps[1])
     assert "1000000 are needed" in steps[1].reason
     assert "keyframe 0" in steps[1].reason
+
+
+def test_a_real_camera_that_was_carried_on_is_found_again(shared_data):
+    """Two positions 305 mm apart along a corridor; what is between was not recorded."""
+    recording = open_recording(shared_data / "sr4000_corridor")
+    steps = run([recording[k] for k in range(len(recording))])
+    for step in steps[:4]:
+        assert np.linalg.norm(step.T_world_camera[:3, 3]) < 0.01
+    for step in steps[4:]:
+        if step.T_world_camera is not None:
+            assert step.T_world_camera[2, 3] == pytest.approx(0.305, abs=0.02)
+    assert steps[-1].status == "tracked"
