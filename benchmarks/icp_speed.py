@@ -116,7 +116,7 @@ def filtered_views(path: str | None, frames: int) -> tuple[list[Frame], Float64 
         from tofuse.recordings.open import open_recording
 
         recording = open_recording(path).select(end=frames)
-    views = [apply_filters(thesis().filters, frame)[0] for frame in recording]
+    views = [apply_filters(thesis("range").filters, frame)[0] for frame in recording]
     return views, recording.reference
 
 
