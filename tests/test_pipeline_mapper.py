@@ -13,6 +13,7 @@ import tofuse
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
 from tofuse.filters.temporal import TemporalDeviation
+from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
 from tofuse.parts import part
 from tofuse.pipeline.config import changed, from_method
@@ -21,6 +22,7 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.simulation.peaks import peaks_views
 
 # Fine enough for few frames, and quick.
 CONFIG = changed(
@@ -244,3 +246,28 @@ def test_odometry_is_used_where_it_is_asked_for(frames, recording) -> None:
     assert with_odometry.trajectory.tobytes() != without.trajectory.tobytes()
     odometry[3] = np.nan
     assert reconstruct(in_memory(frames, odometry=odometry), config).has_pose.all()
+
+
+def test_the_model_before_optimisation_is_kept_where_a_loop_moved_it() -> None:
+    views, poses = peaks_views(0.06, 0)
+    recording = Recording.of(ArraySource(views, poses), "peaks", "peaks")
+    changes = {
+        "filters": [],
+        "odometry": {
+            "registration": {
+                "resolution": 1.0,
+                "source": {"part": "all"},
+                "target": {"part": "all"},
+            }
+        },
+        "loops": {"per_frame": 0},
+    }
+    config = changed(from_method("thesis", "cloud"), changes, where="test")
+    closing = se3.inverse(poses[0]) @ poses[-1]
+    closed = reconstruct(recording, config, loops=[GivenLoop(0, len(views) - 1, closing)])
+    opened = reconstruct(recording, config)
+    before = closed.diagnostics.cloud_before
+    assert opened.diagnostics.cloud_before is None
+    assert before is not None
+    np.testing.assert_array_equal(before.points, opened.cloud.points)
+    assert len(closed.cloud) != len(before)

@@ -238,9 +238,11 @@ class Mapper:
             with self._watch.timing("optimisation"):
                 optimisation = self.config.optimiser.optimise(graph)
         graph = optimisation.graph
-        self._progress.stage("fusing", len(graph.ids))
+        moved = bool(graph.loop.any())
+        self._progress.stage("fusing", len(graph.ids) * (2 if moved else 1))
         with self._watch.timing("fusion"):
             cloud = self._fuse(graph)
+            before = self._fuse(graph.with_poses(sequential)) if moved else None
         self._progress.stage("checking")
         with self._watch.timing("checking"):
             evidence = Evidence(
@@ -267,6 +269,7 @@ class Mapper:
                 optimisation.objective,
                 {n: self._removed[n] / max(self._seen[n], 1) for n in self._seen},
                 dict(self._watch.seconds),
+                before,
             ),
             config=self.config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(self._records)},

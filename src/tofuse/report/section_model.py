@@ -59,6 +59,14 @@ def views(s: Subject) -> Values:
         )
         for view, name in (("above", "From above"), ("side", "From the side"))
     ]
+    before = s.result.diagnostics.cloud_before
+    if before is not None and len(before):
+        earlier = (before.points[np.isfinite(before.points).all(1)] + before.offset) @ R.T
+        name = "From above, before optimisation"
+        extents = np.percentile(earlier, [OUTER, 100 - OUTER], axis=0)
+        start = s.scene.before[:, :3, 3] @ R.T
+        drawn = plots.model(earlier, start, true, "above", measured=extents, label=f"Model, {name}")
+        figures.insert(0, Figure(drawn, name))
     legend = [("after", "", "measured extents")]
     if len(path):
         legend.append(("ink", "", "path of the camera, a dot where it begins"))

@@ -55,6 +55,8 @@ class Diagnostics:
         Share of points that each filter removed, by name.
     seconds
         Wall time of each stage.
+    cloud_before
+        The model as the sequential poses give it; None where no loop was closed.
     """
 
     verdict: Verdict
@@ -65,6 +67,7 @@ class Diagnostics:
     objective: tuple[float, ...]
     removed: dict[str, float]
     seconds: dict[str, float]
+    cloud_before: Cloud | None = None
 
 
 @dataclass(frozen=True, eq=False)
