@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.kernels.jit import kernel
+from tofuse.kernels.projection import jacobian_row, landing
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -33,8 +34,7 @@ WEIGHT_P = 117
 SQUARES_P = 118
 COUNT_P = 119
 SQUARES_M = 120  # of the inliers' distances, m^2
-RATIO = 121  # sum of target variance / source variance of the inliers
-HISTOGRAM = 122  # of all compared points' distances in unscaled sigmas, quarter octaves from 1/16
+HISTOGRAM = 121  # of all compared points' distances in unscaled sigmas, quarter octaves from 1/16
 BINS = 48
 SIZE = HISTOGRAM + BINS
 
@@ -86,7 +86,6 @@ def accumulate(
     """
     out = np.zeros(SIZE)
     rows, columns = planes.shape[0], planes.shape[1]
-    nodes_v, nodes_u = lookup.shape[0], lookup.shape[1]
     J = np.empty(7)
     K = np.empty(7)
     limit2 = robust * robust
@@ -104,20 +103,9 @@ def accumulate(
         y = r10 * px + r11 * py + r12 * pz + t1
         xn = x / z
         yn = y / z
-        fu = (xn - lookup_frame[0]) * lookup_frame[2]
-        fv = (yn - lookup_frame[1]) * lookup_frame[3]
-        if not (fu >= 0 and fv >= 0 and fu < nodes_u - 1 and fv < nodes_v - 1):
+        u, v, iu, iv = landing(xn, yn, lookup, lookup_frame)
+        if iu < 0:
             continue
-        iu = int(fu)
-        iv = int(fv)
-        au = fu - iu
-        av = fv - iv
-        u = (1 - av) * ((1 - au) * lookup[iv, iu, 0] + au * lookup[iv, iu + 1, 0]) + av * (
-            (1 - au) * lookup[iv + 1, iu, 0] + au * lookup[iv + 1, iu + 1, 0]
-        )
-        v = (1 - av) * ((1 - au) * lookup[iv, iu, 1] + au * lookup[iv, iu + 1, 1]) + av * (
-            (1 - au) * lookup[iv + 1, iu, 1] + au * lookup[iv + 1, iu + 1, 1]
-        )
         if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
         i = int(v + 0.5)
@@ -165,21 +153,10 @@ def accumulate(
         out[SQUARES_M] += r * r
         out[WEIGHT_G] += weight
         out[SQUARES_G] += weight * e2
-        out[RATIO] += target_variance / max(source_variance, 1e-12)
         g = weight / variance
-        J[0] = m0
-        J[1] = m1
-        J[2] = m2
-        J[3] = py * m2 - pz * m1
-        J[4] = pz * m0 - px * m2
-        J[5] = px * m1 - py * m0
+        jacobian_row(J, m0, m1, m2, px, py, pz)
         if known:
-            K[0] = s0
-            K[1] = s1
-            K[2] = s2
-            K[3] = py * s2 - pz * s1
-            K[4] = pz * s0 - px * s2
-            K[5] = px * s1 - py * s0
+            jacobian_row(K, s0, s1, s2, px, py, pz)
             q = 0
             for p in range(6):
                 for o in range(p, 6):
@@ -222,12 +199,7 @@ def accumulate(
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        J[0] = m0
-        J[1] = m1
-        J[2] = m2
-        J[3] = py * m2 - pz * m1
-        J[4] = pz * m0 - px * m2
-        J[5] = px * m1 - py * m0
+        jacobian_row(J, m0, m1, m2, px, py, pz)
         J[6] = -1.0
         gx = np.float64(source_photo[k, 1])
         gy = np.float64(source_photo[k, 2])
@@ -235,12 +207,7 @@ def accumulate(
             s0 = gx / pz
             s1 = gy / pz
             s2 = -(gx * px + gy * py) / (pz * pz)
-            K[0] = s0
-            K[1] = s1
-            K[2] = s2
-            K[3] = py * s2 - pz * s1
-            K[4] = pz * s0 - px * s2
-            K[5] = px * s1 - py * s0
+            jacobian_row(K, s0, s1, s2, px, py, pz)
             K[6] = -1.0
             q = 0
             for p in range(7):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.kernels.jit import kernel
+from tofuse.kernels.projection import jacobian_row, landing
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -60,7 +61,6 @@ def tile_sums(
     rows, columns = z.shape
     out = np.zeros((stop - start, tiles_x, 2, SIZE))
     height, width = planes.shape[0], planes.shape[1]
-    nodes_v, nodes_u = lookup.shape[0], lookup.shape[1]
     limit2 = robust * robust
     J = np.zeros(7)
     K = np.zeros(7)
@@ -82,20 +82,9 @@ def tile_sums(
             qy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
             xn = qx / qz
             yn = qy / qz
-            fu = (xn - lookup_frame[0]) * lookup_frame[2]
-            fv = (yn - lookup_frame[1]) * lookup_frame[3]
-            if not (fu >= 0 and fv >= 0 and fu < nodes_u - 1 and fv < nodes_v - 1):
+            u, v, iu, iv = landing(xn, yn, lookup, lookup_frame)
+            if iu < 0:
                 continue
-            iu = int(fu)
-            iv = int(fv)
-            au = fu - iu
-            av = fv - iv
-            u = (1 - av) * ((1 - au) * lookup[iv, iu, 0] + au * lookup[iv, iu + 1, 0]) + av * (
-                (1 - au) * lookup[iv + 1, iu, 0] + au * lookup[iv + 1, iu + 1, 0]
-            )
-            v = (1 - av) * ((1 - au) * lookup[iv, iu, 1] + au * lookup[iv, iu + 1, 1]) + av * (
-                (1 - au) * lookup[iv + 1, iu, 1] + au * lookup[iv + 1, iu + 1, 1]
-            )
             if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
                 continue
             i = int(v + 0.5)
@@ -125,9 +114,9 @@ def tile_sums(
             if known and s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
                 continue
             f = 1 - e2 / limit2
-            _jacobian(J, m0, m1, m2, px, py, pz)
+            jacobian_row(J, m0, m1, m2, px, py, pz)
             J[6] = 0.0
-            _jacobian(K, s0, s1, s2, px, py, pz)
+            jacobian_row(K, s0, s1, s2, px, py, pz)
             K[6] = 0.0
             slope = f * (f - 4 * e2 / limit2) / variance
             _add(tile[GEOMETRY], J, K, r, f * f / variance, slope)
@@ -152,29 +141,18 @@ def tile_sums(
             m0 = T[0, 0] * d0 + T[1, 0] * d1 + T[2, 0] * d2
             m1 = T[0, 1] * d0 + T[1, 1] * d1 + T[2, 1] * d2
             m2 = T[0, 2] * d0 + T[1, 2] * d1 + T[2, 2] * d2
-            _jacobian(J, m0, m1, m2, px, py, pz)
+            jacobian_row(J, m0, m1, m2, px, py, pz)
             J[6] = -1.0
             gx = np.float64(source_photo[row, column, 1])
             gy = np.float64(source_photo[row, column, 2])
             if np.isnan(gx):
                 gx = np.float64(0)
                 gy = np.float64(0)
-            _jacobian(K, gx / pz, gy / pz, -(gx * px + gy * py) / (pz * pz), px, py, pz)
+            jacobian_row(K, gx / pz, gy / pz, -(gx * px + gy * py) / (pz * pz), px, py, pz)
             K[6] = -1.0
             p2 = scale_p * scale_p
             _add(tile[PHOTO], J, K, r, f * f / p2, f * (f - 4 * e2 / limit2) / p2)
     return out
-
-
-@kernel
-def _jacobian(J: Float64, m0: float, m1: float, m2: float, px: float, py: float, pz: float) -> None:
-    """Derivative of m . p by the right perturbation, into J[:6]."""
-    J[0] = m0
-    J[1] = m1
-    J[2] = m2
-    J[3] = py * m2 - pz * m1
-    J[4] = pz * m0 - px * m2
-    J[5] = px * m1 - py * m0
 
 
 @kernel
