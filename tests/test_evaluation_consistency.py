@@ -19,7 +19,6 @@ from tofuse.evaluation.consistency import (
     Consistency,
     SurfaceImage,
     consistency_of_frames,
-    evenly,
     map_consistency,
     poses_of_frames,
 )
@@ -28,7 +27,7 @@ from tofuse.geometry.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rati
 from tofuse.kernels.threads import threads
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.native import NativeSource
-from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.recordings.recording import ArraySource, Recording, evenly
 
 Float64 = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
 from tofuse.kernels.consistency import agreement_sums, move_points, project_by_lens
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.recording import Recording
+from tofuse.recordings.recording import Recording, evenly
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -307,14 +307,6 @@ def consistency_of_frames(
     T = np.asarray(poses, float)
     chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), limit)
     return agreement([SurfaceImage.of(frames[k]) for k in chosen], T[chosen])
-
-
-def evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Choose at most `count` of the items, evenly spaced, the first and last among them."""
-    if len(items) == 0:
-        return items
-    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round()
-    return items[np.unique(positions.astype(np.intp))]
 
 
 def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -> Float64:

@@ -39,14 +39,10 @@ def inspect_recording(recording: Recording) -> Inspection:
     InputError
         If none of them can be read.
     """
-    chosen = np.unique(np.linspace(0, len(recording) - 1, _SAMPLE).round().astype(int))
-    frames: list[Frame] = []
+    sample = recording.sample(_SAMPLE)
+    frames = [item for item in sample if not isinstance(item, UnreadableFrameError)]
     warnings = list(recording.warnings)
-    for k in chosen:
-        try:
-            frames.append(recording[int(k)])
-        except UnreadableFrameError as error:
-            warnings.append(str(error))
+    warnings += [str(item) for item in sample if isinstance(item, UnreadableFrameError)]
     if not frames:
         raise InputError("no frame can be read", where=recording.path, remedy=warnings[-1])
     facts = {

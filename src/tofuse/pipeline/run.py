@@ -166,7 +166,8 @@ def _report(recording: Recording, config: Config, result: Reconstruction, folder
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
 
-    frames = _sample(recording)
+    sample = recording.sample(_THUMBNAILS)
+    frames = [item for item in sample if not isinstance(item, UnreadableFrameError)]
     extras = ReportExtras(
         title=Path(recording.path).name or recording.path,
         filter_steps=_filter_steps(config, recording, result),
@@ -175,17 +176,6 @@ def _report(recording: Recording, config: Config, result: Reconstruction, folder
         thumbnails=tuple(frames),
     )
     write_report(result, folder / "report.html", extras)
-
-
-def _sample(recording: Recording) -> list[Frame]:
-    chosen = np.unique(np.linspace(0, len(recording) - 1, _THUMBNAILS).round().astype(int))
-    frames = []
-    for k in chosen:
-        try:
-            frames.append(recording[int(k)])
-        except UnreadableFrameError:
-            continue
-    return frames
 
 
 def _filter_steps(

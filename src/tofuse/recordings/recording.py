@@ -151,6 +151,19 @@ class Recording:
             )
         return Recording(self.source, self.path, self.format, chosen)
 
+    def sample(self, count: int) -> list[Frame | UnreadableFrameError]:
+        """Read up to `count` evenly spaced frames, the first and the last among them.
+
+        The error stands in the place of each that can't be read.
+        """
+        items: list[Frame | UnreadableFrameError] = []
+        for k in evenly(np.arange(len(self)), count):
+            try:
+                items.append(self[int(k)])
+            except UnreadableFrameError as error:
+                items.append(error)
+        return items
+
     def read_all(self, ahead: int = 8) -> Iterator[Frame | UnreadableFrameError]:
         """Iterate over the frames, with the error in place of each that can't be read.
 
@@ -191,3 +204,11 @@ class Recording:
         finally:
             stop.set()
             thread.join()
+
+
+def evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Choose at most `count` of the items, evenly spaced, the first and last among them."""
+    if len(items) == 0:
+        return items
+    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round()
+    return items[np.unique(positions.astype(np.intp))]
