@@ -83,6 +83,17 @@ def test_pixels_that_no_ray_reaches_are_nan() -> None:
     np.testing.assert_allclose(rays[72, 88], [0.005, 0.005], rtol=1e-3)
 
 
+def test_equal_ray_tables_share_what_is_kept_for_a_camera() -> None:
+    rays = np.array(PINHOLE.rays())
+    rays[0, 0], rays[3, 3] = np.nan, 0.0
+    other = rays.copy()
+    other[3, 3] = -0.0
+    kept = {RayTable(rays): "kept"}
+    assert kept.get(RayTable(other)) == "kept"
+    other[0, 1] = np.nan
+    assert kept.get(RayTable(other)) is None
+
+
 @given(st.floats(0.2, 12), st.integers(0, 175), st.integers(0, 143))
 def test_eqs_2_3_to_2_5(radial_range: float, column: int, row: int) -> None:
     depth = np.zeros((144, 176), np.float32)

@@ -241,11 +241,17 @@ class RayTable:
         return int(self.table.shape[0])
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, RayTable) and np.array_equal(
-            self.table, other.table, equal_nan=True
+        return self is other or (
+            isinstance(other, RayTable) and np.array_equal(self.table, other.table, equal_nan=True)
         )
 
-    __hash__ = None  # type: ignore[assignment]
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # -0 and 0 are equal, and so must their hashes be; so must those of all NaN.
+        return hash((self.table.shape, np.nan_to_num(self.table + np.float32(0)).tobytes()))
 
     def rays(self) -> Float32:
         """See `Camera.rays`."""

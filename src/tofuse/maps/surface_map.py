@@ -89,16 +89,19 @@ class SurfaceOptions:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Where rays land on a grid of pixels, for any camera: a lookup over ray coordinates.
+    """The rays of a grid of pixels, and where rays land on it, for any camera.
 
     Attributes
     ----------
+    rays
+        (H, W, 2) float32 ray coordinates x/z, y/z of the pixels.
     lookup
         (A, B, 2) float32 pixel (u, v) of each node, far outside the image where it sees nothing.
     frame
         (x0, y0, 1/dx, 1/dy) of the nodes.
     """
 
+    rays: Float32
     lookup: Float32
     frame: Float64
 
@@ -118,7 +121,15 @@ class Projection:
         pixels = (camera.project(nodes) + 0.5) / step - 0.5
         lookup = np.where(np.isfinite(pixels), pixels, -1e6).astype(np.float32)
         scale = np.array([x[0], y[0], 1 / (x[1] - x[0]), 1 / (y[1] - y[0])])
-        return cls(lookup, scale)
+        return cls(_halved_rays(rays, step), lookup, scale)
+
+
+def _halved_rays(rays: Float32, step: int) -> Float32:
+    while step > 1:
+        rows, columns = rays.shape[0] // 2, rays.shape[1] // 2
+        rays = rays[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 2).mean((1, 3))
+        step //= 2
+    return np.ascontiguousarray(rays)
 
 
 _projections: WeakKeyDictionary[Camera, dict[int, Projection]] = WeakKeyDictionary()
@@ -182,7 +193,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     sensor family (one over the amplitude, or the square of the depth); its scale is measured on
     the view itself, as the median misfit of small planes.
     """
-    rays, z, light, step = _reduced(frame, options.columns)
+    projection, z, light, step = _reduced(frame, options.columns)
+    rays = projection.rays
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
     sigma = _noise_law(frame, z, light, rays, step)
     # d(1/z) = dz / z^2
@@ -226,24 +238,20 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         planes,
         quality[..., 1] * np.float32(scale),
         photo,
-        _projection(frame.camera, step),
+        projection,
         has_photo,
     )
 
 
 def _projection(camera: Camera, step: int) -> Projection:
-    try:
-        known = _projections.setdefault(camera, {})
-    except TypeError:  # a ray table, which has no hash
-        return Projection.of(camera, step)
+    known = _projections.setdefault(camera, {})
     if step not in known:
         known[step] = Projection.of(camera, step)
     return known[step]
 
 
-def _reduced(frame: RangeFrame, columns: int) -> tuple[Float32, Float32, Float32 | None, int]:
-    """Rays, z and amplitude at the working resolution, and the step in pixels."""
-    rays = frame.camera.rays()
+def _reduced(frame: RangeFrame, columns: int) -> tuple[Projection, Float32, Float32 | None, int]:
+    """Grid, z and amplitude at the working resolution, and the step in pixels."""
     z = frame.z
     z = np.where(frame.valid & (z > _NEAREST) & (z < _FARTHEST), z, np.float32(0))
     light = frame.amplitude_image
@@ -255,12 +263,13 @@ def _reduced(frame: RangeFrame, columns: int) -> tuple[Float32, Float32, Float32
         z_half = np.empty((rows, cols), np.float32)
         light_half = np.empty((rows, cols), np.float32)
         halve(z, light if light is not None else z, _HALVING_JUMP, z_half, light_half)
-        blocks = rays[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 2)
-        rays = blocks.mean((1, 3))
-        z_half[np.isnan(rays).any(-1)] = 0
         z, light = z_half, light_half if light is not None else None
         step *= 2
-    return np.ascontiguousarray(rays), z, light, step
+    projection = _projection(frame.camera, step)
+    if step > 1:
+        # The mean of a block of rays that holds an unknown one is unknown.
+        z[np.isnan(projection.rays).any(-1)] = 0
+    return projection, z, light, step
 
 
 def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
