@@ -582,7 +582,30 @@ def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
 def test_optimize_a_graph(plain_run, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
     assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0
-    assert re.match(r"8 poses, \d+ edges: objective", capsys.readouterr().out)
+    told = capsys.readouterr().out
+    assert re.match(r"8 poses, \d+ edges: squared error", told)
+    # A chain without loops has nothing to spread.
+    assert "the poses are those of the input" in told
     assert read_g2o(out).ids.tolist() == list(range(8))
     assert main(["optimize", str(out), "--out", str(out)]) == 2
-    assert main(["optimize", str(out), "--out", str(out), "--overwrite"]) == 0
+    words = ["optimize", str(out), "--out", str(out), "--overwrite", "--optimiser"]
+    assert main([*words, "castellani"]) == 0
+    capsys.readouterr()
+    assert main([*words, "guesswork"]) == 2
+    assert "castellani" in capsys.readouterr().err
+
+
+def test_optimize_tells_of_false_loops_and_of_parts(tmp_path, capsys) -> None:
+    unit = " ".join(str(v) for v in 1e4 * np.eye(6)[np.triu_indices(6)])
+    lines = [f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1" for k in (0, 1, 2, 3, 4, 9)]
+    edges = [(0, 1, 1.01), (1, 2, 0.99), (2, 3, 1.0), (3, 4, 1.0)]
+    edges += [(0, 2, 2.01), (0, 3, 3.0), (1, 4, 3.01), (0, 4, -7.0)]
+    lines += [f"EDGE_SE3:QUAT {i} {j} {x} 0 0 0 0 0 1 {unit}" for i, j, x in edges]
+    (tmp_path / "in.g2o").write_text("\n".join(lines) + "\n")
+    words = ["optimize", str(tmp_path / "in.g2o"), "--out", str(tmp_path / "out.g2o")]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "1 edge does not fit the others" in told
+    assert re.search(r"part from vertex 0: 5 poses, 8 edges", told)
+    assert re.search(r"part from vertex 9: 1 poses, 0 edges", told)
+    assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)

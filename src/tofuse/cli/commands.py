@@ -236,22 +236,40 @@ def evaluate(arguments: argparse.Namespace) -> int:
 def optimize(arguments: argparse.Namespace) -> int:
     """``tofuse optimize``."""
     from tofuse.errors import OutputError
-    from tofuse.pipeline.config import from_method
+    from tofuse.pipeline.config import changed, from_method
     from tofuse.posegraph.g2o import read_g2o, write_g2o
 
     if arguments.out.exists() and not arguments.overwrite:
         raise OutputError(
             "is there already", where=arguments.out, remedy="give --overwrite to replace it"
         )
+    config = from_method("default", "range")
+    if arguments.optimiser is not None:
+        part = {"part": arguments.optimiser}
+        config = changed(config, {"optimiser": part}, where="--optimiser")
     graph = read_g2o(arguments.input)
-    done = from_method("default").optimiser.optimise(graph)
+    done = config.optimiser.optimise(graph)
     write_g2o(arguments.out, done.graph)
-    start, end = (done.objective[0], done.objective[-1]) if done.objective else (0.0, 0.0)
     print(
-        f"{len(graph.ids)} poses, {len(graph.edges)} edges: objective {start:.6g} to {end:.6g} "
-        f"in {max(len(done.objective) - 1, 0)} iterations"
+        f"{len(graph.ids)} poses, {len(graph.edges)} edges: squared error {graph.chi2():.6g} "
+        f"to {done.graph.chi2():.6g} in {max(len(done.objective) - 1, 0)} iterations"
         + ("" if done.converged else " (not converged)")
     )
+    if done.weights is not None and (done.weights < 0.5).any():
+        left_out = done.weights < 0.5
+        count = int(left_out.sum())
+        before, after = graph.chi2(~left_out), done.graph.chi2(~left_out)
+        print(
+            f"{count} edge{' does' if count == 1 else 's do'} not fit the others and counted "
+            f"little or nothing; squared error of the others {before:.6g} to {after:.6g}"
+        )
+    for piece in done.parts if len(done.parts) > 1 else ():
+        print(
+            f"part from vertex {piece.first}: {piece.vertices} poses, {piece.edges} edges, "
+            f"objective {piece.before:.6g} to {piece.after:.6g}"
+        )
+    if done.parts and not any(p.improved for p in done.parts):
+        print("nothing better was found: the poses are those of the input")
     return 0
 
 

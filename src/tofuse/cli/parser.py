@@ -193,6 +193,9 @@ def _optimize(commands: Any) -> None:
     p = _command(commands, "optimize", "optimise a pose graph")
     p.add_argument("input", type=Path, metavar="IN.g2o")
     p.add_argument("--out", required=True, type=Path, metavar="OUT.g2o")
+    p.add_argument(
+        "--optimiser", metavar="NAME", help="how (default: levenberg-marquardt; castellani, ...)"
+    )
     p.add_argument("--overwrite", action="store_true", help="replace OUT.g2o if it is there")
 
 

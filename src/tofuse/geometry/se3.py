@@ -108,6 +108,61 @@ def log(T: ArrayLike) -> Array:
     return np.concatenate([t, w], axis=-1)
 
 
+def jacobian_inverse(xi: ArrayLike) -> Array:
+    """Inverse right Jacobian J (..., 6, 6): ``log(exp(xi) exp(d)) = xi + J d + O(d^2)``.
+
+    In the (t, r) order, from the left one at ``-xi`` (Barfoot, eqs 7.86 and 7.95). Singular where
+    the rotation is a full turn.
+    """
+    xi = -np.asarray(xi, float)
+    J = left_jacobian_inverse(xi[..., 3:])
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = J
+    out[..., 3:, 3:] = J
+    out[..., :3, 3:] = -J @ _coupling(xi) @ J
+    return out
+
+
+def jacobian(xi: ArrayLike) -> Array:
+    """Right Jacobian J (..., 6, 6): ``exp(xi + d) = exp(xi) exp(J d + O(d^2))``."""
+    xi = -np.asarray(xi, float)
+    J = left_jacobian(xi[..., 3:])
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = J
+    out[..., 3:, 3:] = J
+    out[..., :3, 3:] = _coupling(xi)
+    return out
+
+
+def _coupling(xi: Array) -> Array:
+    """Block Q (..., 3, 3) of the left Jacobian, by which a rotation moves a translation."""
+    V, W = hat(xi[..., :3]), hat(xi[..., 3:])
+    angle = np.linalg.norm(xi[..., 3:], axis=-1)
+    _, s2, s3 = _coefficients(angle)
+    # The last two coefficients cancel to nothing at small angles, long before s2 and s3 do.
+    small = angle < 0.1
+    a = np.where(small, 1.0, angle)
+    a2 = angle * angle
+    c2 = np.where(
+        small,
+        1 / 24 - a2 / 720 + a2 * a2 / 40320 - a2**3 / 3628800,
+        (0.5 - s2) / (a * a),
+    )
+    c3 = np.where(
+        small,
+        1 / 120 - a2 / 2520 + a2 * a2 / 120960 - a2**3 / 9979200,
+        (c2 - 3 * (1 / 6 - s3) / (a * a)) / 2,
+    )
+    WV, VW = W @ V, V @ W
+    WVW = WV @ W
+    return (
+        0.5 * V
+        + s3[..., None, None] * (WV + VW + WVW)
+        + c2[..., None, None] * (W @ WV + VW @ W - 3 * WVW)
+        + c3[..., None, None] * (WVW @ W + W @ WVW)
+    )
+
+
 def inverse(T: ArrayLike) -> Array:
     """Inverse of rigid motions (..., 4, 4): ``T_b_a`` from ``T_a_b``."""
     T = np.asarray(T, float)

@@ -13,6 +13,7 @@ from tofuse.odometry.keyframes import Keyframes
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.config import Config, ViewKind
 from tofuse.posegraph.castellani import Castellani
+from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.loops import Confirmation
 from tofuse.posegraph.nearby import Nearby
 from tofuse.registration.icp import algorithm_1
@@ -65,4 +66,6 @@ def default(kind: ViewKind) -> Config:
         # Point-to-point ICP measures a loop less well than this odometry drifts in a turn, so
         # only loops given by hand are closed.
         loops=Nearby(per_frame=0),
+        # Not for clouds: it believes what a registration says of its errors, and ICP's is too good.
+        optimiser=LevenbergMarquardt(),
     )

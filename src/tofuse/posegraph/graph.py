@@ -18,6 +18,49 @@ EdgeKind = Literal["odometry", "loop"]
 
 
 @dataclass(frozen=True, eq=False)
+class Gravity:
+    """Which way is down, as cameras measured it: weighted edges to the world's vertical.
+
+    Attributes
+    ----------
+    vertices
+        (g,) positions of the poses.
+    directions
+        (g, 3) unit vectors, each in the frame of its camera.
+    sigma
+        (g,) standard deviation of each, rad.
+    world
+        (3,) the same direction in the world, or None where it is to be found too.
+    """
+
+    vertices: Integers
+    directions: Float64
+    sigma: Float64
+    world: Float64 | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Anchors:
+    """Poses in another frame, such as that of odometry: weighted edges to its origin.
+
+    The pose of that frame in the world is not known; it is found with the others.
+
+    Attributes
+    ----------
+    vertices
+        (a,) positions of the poses.
+    poses
+        (a, 4, 4) T_frame_vertex.
+    information
+        (a, 6, 6) of the right perturbation, order (tx ty tz rx ry rz).
+    """
+
+    vertices: Integers
+    poses: Float64
+    information: Float64
+
+
+@dataclass(frozen=True, eq=False)
 class PoseGraph:
     """Poses and measured relative poses, in columns.
 
@@ -35,6 +78,8 @@ class PoseGraph:
         (M, 6, 6) information of ``log(Z^-1 T_i^-1 T_j)``, order (tx ty tz rx ry rz), SI units.
     loop
         (M,) True for edges that close a loop, False for odometry.
+    gravity, anchors
+        What is known of single poses, or None. g2o files don't hold it.
     """
 
     ids: Integers
@@ -43,6 +88,8 @@ class PoseGraph:
     measurements: Float64
     information: Float64
     loop: NDArray[np.bool_]
+    gravity: Gravity | None = None
+    anchors: Anchors | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.ids), len(self.edges)
@@ -58,6 +105,9 @@ class PoseGraph:
                 raise InputError(
                     f"{name} has shape {getattr(self, name).shape}, not {shape}", where="pose graph"
                 )
+        for single in (self.gravity, self.anchors):
+            if single is not None and not np.isin(single.vertices, np.arange(n)).all():
+                raise InputError("a direction or anchor names no vertex", where="pose graph")
         if m and (self.edges.min() < 0 or self.edges.max() >= n):
             raise InputError("an edge names a vertex that is not there", where="pose graph")
 
@@ -83,10 +133,41 @@ class PoseGraph:
         T_i_j = se3.inverse(self.poses[i]) @ self.poses[j]
         return se3.log(se3.inverse(self.measurements) @ T_i_j)
 
-    def chi2(self) -> float:
-        """Return the sum of squared errors weighted by the information."""
+    def chi2(self, edges: NDArray[np.bool_] | None = None) -> float:
+        """Return the sum of squared errors weighted by the information, of some edges or all."""
         r = self.residuals()
-        return float(np.einsum("mi,mij,mj->", r, self.information, r))
+        each = np.einsum("mi,mij,mj->m", r, self.information, r)
+        return float(each.sum() if edges is None else each[edges].sum())
+
+
+@dataclass(frozen=True)
+class GraphPart:
+    """A part of the graph that no edge joins to the rest, optimised by itself.
+
+    Attributes
+    ----------
+    first
+        Id of its first vertex, which has not moved.
+    vertices, edges
+        How many there are in it.
+    before, after
+        The method's objective. Where it could not be lowered they are equal, and the poses are
+        those of the input.
+    converged
+        Whether the stopping rule was met.
+    """
+
+    first: int
+    vertices: int
+    edges: int
+    before: float
+    after: float
+    converged: bool
+
+    @property
+    def improved(self) -> bool:
+        """Whether the optimiser found something better than the input."""
+        return self.after < self.before
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +182,18 @@ class Optimisation:
         The method's own objective at the start and after every iteration.
     converged
         Whether the stopping rule was met before the iterations ran out.
+    weights
+        (M,) share of its information with which each edge counted in the end, 0 for one that was
+        left out; None where the method counts all in full.
+    parts
+        The connected parts of the graph, where the method tells them apart.
     """
 
     graph: PoseGraph
     objective: tuple[float, ...]
     converged: bool
+    weights: Float64 | None = None
+    parts: tuple[GraphPart, ...] = ()
 
 
 class Optimiser(Protocol):

@@ -1,0 +1,120 @@
+"""Rotations as unknowns of least squares: by local tangent, by quaternion, by direction cosines.
+
+A chart says how many numbers stand for a pose, how a small change of them moves the pose, and how
+the pose is rebuilt after a step. The position is treated alike by all.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import quaternion, se3
+
+Float64 = NDArray[np.float64]
+
+Rotation = Literal["tangent", "quaternion", "cosines"]
+
+
+class Chart(Protocol):
+    """Numbers that stand for a pose."""
+
+    size: int
+
+    def basis(self, poses: Float64) -> tuple[Float64, Float64] | None:
+        """Derivatives of a pose's right perturbation by its numbers, and what they must not do.
+
+        Returns (n, 6, size), and the (n, size, size) projectors on the directions that leave the
+        rotations; None where the numbers are the perturbation.
+        """
+        ...
+
+    def retract(self, poses: Float64, step: Float64) -> Float64:
+        """Poses after (n, size) steps, proper rotations again."""
+        ...
+
+
+class Tangent:
+    """Six numbers, the right perturbation itself: T exp(d)."""
+
+    size = 6
+
+    def basis(self, poses: Float64) -> None:
+        """See `Chart.basis`."""
+        return
+
+    def retract(self, poses: Float64, step: Float64) -> Float64:
+        """See `Chart.retract`."""
+        return poses @ se3.exp(step)
+
+
+class Quaternion:
+    """Three numbers and a quaternion that is made a unit again after every step (eq 2.11)."""
+
+    size = 7
+
+    def basis(self, poses: Float64) -> tuple[Float64, Float64]:
+        """See `Chart.basis`: a change dq turns by twice the vector part of q* dq."""
+        q = quaternion.from_matrix(poses[:, :3, :3])
+        v, s = q[:, :3], q[:, 3]
+        P = np.zeros((len(q), 6, 7))
+        P[:, :3, :3] = np.eye(3)
+        P[:, 3:, 3:6] = 2 * (s[:, None, None] * np.eye(3) - se3.hat(v))
+        P[:, 3:, 6] = -2 * v
+        off = np.zeros((len(q), 7, 7))
+        off[:, 3:, 3:] = q[:, :, None] * q[:, None]
+        return P, off
+
+    def retract(self, poses: Float64, step: Float64) -> Float64:
+        """See `Chart.retract`."""
+        q = quaternion.from_matrix(poses[:, :3, :3]) + step[:, 3:]
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        return _moved(poses, step[:, :3], quaternion.to_matrix(q))
+
+
+class Cosines:
+    """Three numbers and the nine direction cosines; the nearest rotation after every step."""
+
+    size = 12
+
+    def basis(self, poses: Float64) -> tuple[Float64, Float64]:
+        """See `Chart.basis`: a change dR turns by the antisymmetric part of R^T dR."""
+        n = len(poses)
+        P = np.zeros((n, 6, 12))
+        P[:, :3, :3] = np.eye(3)
+        turned = np.zeros((n, 3, 3, 9))  # R^T dR as a function of the nine numbers of dR
+        for k in range(9):
+            unit = np.zeros((3, 3))
+            unit.flat[k] = 1
+            turned[..., k] = np.swapaxes(poses[:, :3, :3], 1, 2) @ unit
+        for axis, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
+            P[:, 3 + axis, 3:] = (turned[:, a, b] - turned[:, b, a]) / 2
+        symmetric = ((turned + np.swapaxes(turned, 1, 2)) / 2).reshape(n, 9, 9)
+        off = np.zeros((n, 12, 12))
+        off[:, 3:, 3:] = np.swapaxes(symmetric, 1, 2) @ symmetric
+        return P, off
+
+    def retract(self, poses: Float64, step: Float64) -> Float64:
+        """See `Chart.retract`."""
+        out = poses.copy()
+        out[:, :3, :3] += step[:, 3:].reshape(-1, 3, 3)
+        return _moved(poses, step[:, :3], se3.orthonormalise(out)[:, :3, :3])
+
+
+def _moved(poses: Float64, slide: Float64, R: Float64) -> Float64:
+    """Poses with new rotations; the camera moves along a screw meanwhile, as by `se3.exp`."""
+    out = poses.copy()
+    turn = se3.so3_log(np.swapaxes(poses[:, :3, :3], 1, 2) @ R)
+    along = se3.left_jacobian(turn) @ slide[..., None]
+    out[:, :3, 3] += (poses[:, :3, :3] @ along)[..., 0]
+    out[:, :3, :3] = R
+    return out
+
+
+CHARTS: dict[Rotation, type[Chart]] = {
+    "tangent": Tangent,
+    "quaternion": Quaternion,
+    "cosines": Cosines,
+}

@@ -1,0 +1,187 @@
+"""The default optimiser: all that is known of the poses, each by its full information."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.parts import part
+from tofuse.posegraph.charts import Rotation
+from tofuse.posegraph.graph import GraphPart, Gravity, Optimisation, Optimiser, PoseGraph
+from tofuse.posegraph.robust import Robust
+from tofuse.posegraph.solve import Settings, Solution, solve
+from tofuse.posegraph.sparse import parts_of
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+_NEGATIVE = -1e-9  # of the largest eigenvalue: below it information is not positive
+
+
+@part("optimiser", "levenberg-marquardt", label="validated")
+@dataclass(frozen=True)
+class LevenbergMarquardt(Optimiser):
+    """Weighted least squares on SE(3), in which single loops can be wrong.
+
+    Edges of odometry, gravity and anchors count in full; loop edges as the kernel says. The search
+    starts from the poses in the graph. Connected parts are solved by themselves; the first vertex
+    of each stays where it is. Where a part can't be improved, its poses stay as they are.
+
+    Attributes
+    ----------
+    robust
+        Kernel of the loop edges. "truncated": all in full, unless they contradict each other;
+        then graduated non-convexity chooses (Yang et al. 2020). Others, see
+        `tofuse.posegraph.robust`.
+    gate
+        A loop edge is in doubt where its squared error is above this, in units of its
+        information: 100 is ten standard deviations.
+    slack
+        By so much the information of the loops may overstate their standard deviations before
+        "truncated" takes them for wrong.
+    rotation
+        Numbers that stand for a rotation in a step: "tangent", "quaternion" or "cosines".
+    tolerance
+        Stop when a step lowers the objective by less than this share of it.
+    max_iterations
+        At most so many steps.
+    """
+
+    robust: Robust = "truncated"
+    gate: float = 100.0
+    slack: float = 3.0
+    rotation: Rotation = "tangent"
+    tolerance: float = 1e-6
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        if not self.gate > 0:
+            raise ValueError(f"gate is {self.gate}, not above 0")
+        if not self.slack >= 1:
+            raise ValueError(f"slack is {self.slack}, not 1 or more")
+
+    def optimise(self, graph: PoseGraph) -> Optimisation:
+        """See `Optimiser.optimise`.
+
+        Raises
+        ------
+        InputError
+            If a pose or a measurement is not finite, or information not positive semidefinite.
+        """
+        check_graph(graph)
+        poses = graph.poses.copy()
+        weights = np.ones(len(graph.edges))
+        parts, histories = [], []
+        for vertices, edges in pieces(graph):
+            solution = self._solve(graph, vertices, edges)
+            before, after = solution.history[0], solution.history[-1]
+            history = solution.history if after < before else (before,)
+            if after < before:
+                poses[vertices] = se3.orthonormalise(solution.poses[: len(vertices)])
+                # Not even by rounding.
+                poses[vertices[0]] = graph.poses[vertices[0]]
+            weights[edges] = solution.weights[: len(edges)]
+            histories.append(history)
+            parts.append(
+                GraphPart(
+                    int(graph.ids[vertices[0]]), len(vertices), len(edges),
+                    before, history[-1], solution.converged,
+                )
+            )  # fmt: skip
+        return Optimisation(
+            graph.with_poses(poses),
+            added_up(histories),
+            all(p.converged for p in parts),
+            weights,
+            tuple(parts),
+        )
+
+    def _solve(self, graph: PoseGraph, vertices: Integers, edges: Integers) -> Solution:
+        """Solve one part; anchors are edges to one more vertex, behind the others."""
+        number = np.full(len(graph.ids), -1)
+        number[vertices] = np.arange(len(vertices))
+        poses, pairs = graph.poses[vertices], number[graph.edges[edges]]
+        measured, information = graph.measurements[edges], graph.information[edges]
+        loop = graph.loop[edges]
+        if graph.anchors is not None and (number[graph.anchors.vertices] >= 0).any():
+            here = number[graph.anchors.vertices] >= 0
+            ends, Z = number[graph.anchors.vertices[here]], graph.anchors.poses[here]
+            frame = poses[ends[0]] @ se3.inverse(Z[0])
+            poses = np.concatenate([poses, frame[None]])
+            more = np.stack([np.full(len(ends), len(vertices)), ends], axis=1)
+            pairs = np.concatenate([pairs, more])
+            measured = np.concatenate([measured, Z])
+            information = np.concatenate([information, graph.anchors.information[here]])
+            loop = np.append(loop, np.zeros(len(ends), bool))
+        fixed = np.zeros(len(poses), bool)
+        fixed[0] = True
+        return solve(
+            poses, pairs, measured, information,
+            loop=loop, fixed=fixed, gravity=_gravity_of(graph, number),
+            settings=Settings(
+                self.robust, self.gate, self.slack, self.rotation, self.tolerance,
+                self.max_iterations,
+            ),
+        )  # fmt: skip
+
+
+def _gravity_of(graph: PoseGraph, number: Integers) -> Gravity | None:
+    gravity = graph.gravity
+    if gravity is None:
+        return None
+    here = number[gravity.vertices] >= 0
+    if not here.any():
+        return None
+    return Gravity(
+        number[gravity.vertices[here]],
+        gravity.directions[here],
+        gravity.sigma[here],
+        gravity.world,
+    )
+
+
+def pieces(graph: PoseGraph) -> list[tuple[Integers, Integers]]:
+    """Positions of the vertices and of the edges of each connected part.
+
+    Anchors join what they hold; gravity does not, as it leaves four of six directions free.
+    """
+    n = len(graph.ids)
+    pairs = graph.edges
+    if graph.anchors is not None and len(graph.anchors.vertices):
+        first = np.full(len(graph.anchors.vertices), graph.anchors.vertices[0])
+        pairs = np.concatenate([pairs, np.stack([first, graph.anchors.vertices], axis=1)])
+    label = parts_of(n, pairs)
+    of_edge = label[graph.edges[:, 0]]
+    count = int(label.max()) + 1 if n else 0
+    return [(np.flatnonzero(label == k), np.flatnonzero(of_edge == k)) for k in range(count)]
+
+
+def added_up(histories: list[tuple[float, ...]]) -> tuple[float, ...]:
+    """Objective of all parts together at every step; those that are done keep their last value."""
+    length = max((len(h) for h in histories), default=1)
+    padded = [[*h, *[h[-1]] * (length - len(h))] for h in histories]
+    return tuple(float(sum(column)) for column in zip(*padded, strict=True)) if padded else (0.0,)
+
+
+def check_graph(graph: PoseGraph) -> None:
+    """Raise InputError where poses or measurements are not finite, or information not positive."""
+    for name, values in (
+        ("pose", graph.poses),
+        ("measurement", graph.measurements),
+        ("information", graph.information),
+    ):
+        bad = np.flatnonzero(~np.isfinite(values).all((1, 2)))
+        if len(bad):
+            raise InputError(f"{name} {bad[0]} is not finite", where="pose graph")
+    eigenvalues = np.linalg.eigvalsh(graph.information)
+    if len(eigenvalues):
+        bad = np.flatnonzero(eigenvalues[:, 0] < _NEGATIVE * np.abs(eigenvalues).max(axis=1))
+        if len(bad):
+            i, j = graph.ids[graph.edges[bad[0]]]
+            raise InputError(
+                "the information matrix is not positive", where=f"pose graph, edge {i} {j}"
+            )

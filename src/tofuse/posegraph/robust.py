@@ -1,0 +1,53 @@
+"""Robust kernels: how much an edge counts when its error is larger than its information allows.
+
+A kernel is a function of an edge's squared error ``x = e^T Omega e`` and a threshold c: its cost
+rho(x), which replaces x in the objective, and its weight w(x) = rho'(x), by which the edge's
+information is multiplied in the next step.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+Robust = Literal["none", "huber", "cauchy", "geman-mcclure", "dcs", "switchable", "truncated"]
+
+
+def cost(kernel: Robust, x: Float64, c: float) -> Float64:
+    """rho(x) of squared errors x and a threshold c on x.
+
+    "huber", "cauchy", "geman-mcclure" (Zhang 1997); "dcs", dynamic covariance scaling (Agarwal et
+    al. 2013); "switchable", switchable constraints (Suenderhauf and Protzel 2012) with a linear
+    switch, which at its best value s = c / (c + x) costs ``s^2 x + c (1 - s)^2``, the cost of
+    Geman and McClure; "truncated": an edge counts in full or not at all.
+    """
+    if kernel == "huber":
+        return np.where(x <= c, x, 2 * np.sqrt(c * np.maximum(x, c)) - c)
+    if kernel == "cauchy":
+        return c * np.log1p(x / c)
+    if kernel in ("geman-mcclure", "switchable"):
+        return c * x / (c + x)
+    if kernel == "dcs":
+        return np.where(x <= c, x, c * (3 * x - c) / (x + c))
+    if kernel == "truncated":
+        return np.minimum(x, c)
+    return x
+
+
+def weight(kernel: Robust, x: Float64, c: float) -> Float64:
+    """w(x) = rho'(x), 0 to 1."""
+    if kernel == "huber":
+        return np.sqrt(c / np.maximum(x, c))
+    if kernel == "cauchy":
+        return c / (c + x)
+    if kernel in ("geman-mcclure", "switchable"):
+        return (c / (c + x)) ** 2
+    if kernel == "dcs":
+        return np.minimum(1.0, 2 * c / (c + x)) ** 2
+    if kernel == "truncated":
+        return (x <= c).astype(float)
+    return np.ones_like(x)

@@ -1,0 +1,283 @@
+"""Normal equations of poses that are joined in pairs, and their sparse solution.
+
+A pair (i, j) has a relative pose T_i_j = T_i^-1 T_j. Whatever is known of it is a quadratic in
+its right perturbation, ``T_i_j exp(xi)``: half ``xi^T H xi + 2 g^T xi`` with a (6, 6) H and a (6,)
+g. When the poses themselves are perturbed, ``T_k exp(d_k)``, the relative pose moves by::
+
+    xi = d_j - Ad(T_j_i) d_i
+
+so four blocks and two gradients of the whole system follow from H, g and T_i_j alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from tofuse.geometry import se3
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+Bool = NDArray[np.bool_]
+
+_FLAT = 1e-12  # of the largest diagonal entry: the least damping that a direction gets
+
+
+class PairSystem:
+    """The sparse system of n poses and m pairs; its pattern and ordering are worked out once.
+
+    Parameters
+    ----------
+    n
+        Number of poses.
+    pairs
+        (m, 2) positions i (target) and j (source), i != j.
+    fixed
+        (n,) mask of poses that don't move; the first of each connected part unless given.
+    size
+        Unknowns of each pose; 6 wherever H and g are those of a relative pose.
+    """
+
+    def __init__(
+        self, n: int, pairs: Integers, fixed: Bool | None = None, *, size: int = 6
+    ) -> None:
+        self.n, self.size = n, size
+        self.pairs = np.asarray(pairs, np.intp).reshape(-1, 2)
+        self.fixed = first_of_parts(n, self.pairs) if fixed is None else np.asarray(fixed, bool)
+        i, j = self.pairs.T
+        self.free = np.flatnonzero(~self.fixed)
+        both = np.flatnonzero(~(self.fixed[i] | self.fixed[j]))
+        number = np.full(n, -1)
+        number[self.free] = np.arange(len(self.free))
+        order = _elimination_order(len(self.free), number[i[both]], number[j[both]])
+        # `free` in the order of elimination: block k of the system is pose free[k].
+        self.free = self.free[order]
+        number[self.free] = np.arange(len(self.free))
+        self.number = number
+        self._sums(i, j, both)
+        self._layout()
+
+    def _sums(self, i: Integers, j: Integers, both: Integers) -> None:
+        """Make the matrices that add up what several pairs say of one block."""
+        n, m = len(self.free), len(self.pairs)
+        self._sum_i = _indicator(self.number[i], n, m)
+        self._sum_j = _indicator(self.number[j], n, m)
+        a, b = self.number[i[both]], self.number[j[both]]
+        self._both, self._swapped = both, a > b
+        lower, upper = np.maximum(a, b), np.minimum(a, b)
+        keys, where = np.unique(upper * max(n, 1) + lower, return_inverse=True)
+        self._columns, self._rows = np.divmod(keys, max(n, 1))
+        self._sum_off = _indicator(where, len(keys), len(both))
+
+    def _layout(self) -> None:
+        """Find where each entry of each block lies in the data of the CSC matrix."""
+        n, k, off = len(self.free), self.size, len(self._rows)
+        rows = np.concatenate([np.arange(n), self._rows, self._columns])
+        columns = np.concatenate([np.arange(n), self._columns, self._rows])
+        order = np.lexsort((rows, columns))
+        height = np.bincount(columns, minlength=n)
+        start = np.concatenate([[0], np.cumsum(height)])
+        rank = np.empty(len(rows), np.intp)
+        rank[order] = np.arange(len(rows))
+        within = rank - start[columns]
+        first = k * k * start[columns] + k * within
+        # Entry (a, b) of a block lies b columns on, each k * height long, and a rows down.
+        place = first[:, None, None] + (
+            np.arange(k)[:, None] + (k * height[columns])[:, None, None] * np.arange(k)
+        )
+        self._place = place[:n], place[n : n + off], place[n + off :]
+        self._indptr = np.concatenate([[0], np.cumsum(np.repeat(k * height, k))]).astype(np.int32)
+        indices = np.empty(k * k * len(rows), np.int32)
+        indices[place] = (k * rows[:, None, None] + np.arange(k)[:, None]).astype(np.int32)
+        self._indices = indices
+
+    def assemble(
+        self,
+        ii: Float64,
+        ij: Float64,
+        jj: Float64,
+        g_i: Float64,
+        g_j: Float64,
+        single: tuple[Float64, Float64] | None = None,
+    ) -> tuple[Any, Float64]:
+        """Return the matrix (CSC) and the gradient (free poses x size) of the whole system.
+
+        Parameters
+        ----------
+        ii, ij, jj
+            (m, k, k) blocks of each pair, rows by the first index.
+        g_i, g_j
+            (m, k) gradients of each pair.
+        single
+            (n, k, k) blocks and (n, k) gradients of what is known of single poses.
+        """
+        n, k = len(self.free), self.size
+        diagonal = self._sum_i @ ii.reshape(-1, k * k) + self._sum_j @ jj.reshape(-1, k * k)
+        diagonal = diagonal.reshape(n, k, k)
+        gradient = self._sum_i @ g_i + self._sum_j @ g_j
+        if single is not None:
+            diagonal = diagonal + single[0][self.free]
+            gradient = gradient + single[1][self.free]
+        # Blocks below the diagonal: rows belong to the pose that is eliminated later.
+        blocks = ij[self._both]
+        low = np.where(self._swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
+        low = (self._sum_off @ low.reshape(-1, k * k)).reshape(-1, k, k)
+        data = np.empty(len(self._indices))
+        for place, values in zip(self._place, (diagonal, low, np.swapaxes(low, 1, 2)), strict=True):
+            data[place] = values
+        shape = (k * n, k * n)
+        return sparse.csc_matrix((data, self._indices, self._indptr), shape=shape), gradient
+
+    def relative(
+        self,
+        H: Float64,
+        g: Float64,
+        T_i_j: Float64,
+        single: tuple[Float64, Float64] | None = None,
+    ) -> tuple[Any, Float64]:
+        """Assemble from (m, 6, 6) H and (m, 6) g of the right perturbations of (m, 4, 4) T_i_j."""
+        A = se3.adjoint(se3.inverse(T_i_j))
+        At = np.swapaxes(A, 1, 2)
+        AtH = At @ H
+        return self.assemble(AtH @ A, -AtH, H, -(At @ g[..., None])[..., 0], g, single)
+
+    def solve(
+        self,
+        H: Float64,
+        g: Float64,
+        T_i_j: Float64,
+        damping: float = 0.0,
+        single: tuple[Float64, Float64] | None = None,
+    ) -> Float64 | None:
+        """One damped Gauss-Newton step.
+
+        Parameters
+        ----------
+        H, g
+            (m, 6, 6) and (m, 6): half the second, and the first derivative of half the objective
+            by the right perturbation of each pair's relative pose: ``J^T W J`` and ``J^T W r``.
+        T_i_j
+            (m, 4, 4) relative poses where H and g were taken.
+        damping
+            Share of the diagonal that is added to it (Levenberg-Marquardt).
+        single
+            Blocks and gradients of single poses, see `assemble`.
+
+        Returns
+        -------
+        (n, 6) steps d, to be applied as ``T_k exp(d_k)``; zero for fixed poses. None where the
+        system is singular.
+        """
+        factor = self.factor(*self.relative(H, g, T_i_j, single), damping)
+        return None if factor is None else factor.step()
+
+    def factor(self, matrix: Any, gradient: Float64, damping: float = 0.0) -> Factor | None:
+        """Factorise an assembled system; None where it is singular."""
+        if matrix.shape[0] and damping:
+            diagonal = matrix.diagonal()
+            added = damping * np.maximum(diagonal, _FLAT * diagonal.max())
+            matrix = matrix.copy()
+            ends = self._place[0].diagonal(axis1=1, axis2=2).ravel()
+            matrix.data[ends] += added
+        try:
+            return Factor(self, matrix, gradient)
+        except RuntimeError:
+            return None
+
+
+class Factor:
+    """A factorised system. Raises RuntimeError where it is singular."""
+
+    def __init__(self, system: PairSystem, matrix: Any, gradient: Float64) -> None:
+        self.system, self.gradient = system, gradient
+        # The blocks are in a good order already; the matrix is symmetric, so no pivoting.
+        options = {"SymmetricMode": True}
+        self._lu = (
+            splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
+            if matrix.shape[0]
+            else None
+        )
+
+    def step(self) -> Float64 | None:
+        """(n, k) solution of ``matrix x = -gradient``; None if it is not finite."""
+        system = self.system
+        out = np.zeros((system.n, system.size))
+        if self._lu is not None:
+            x = self._lu.solve(-self.gradient.ravel())
+            if not np.isfinite(x).all():
+                return None
+            out[system.free] = x.reshape(-1, system.size)
+        return out
+
+    def joint_covariance(self, vertices: Integers) -> Float64:
+        """(v k, v k) covariance of some poses' perturbations together; zero for fixed ones."""
+        system, k = self.system, self.system.size
+        vertices = np.asarray(vertices, np.intp)
+        out = np.zeros((len(vertices), k, len(vertices), k))
+        moving = np.flatnonzero(~system.fixed[vertices])
+        if self._lu is None or not len(moving):
+            return out.reshape(len(vertices) * k, -1)
+        at = (k * system.number[vertices[moving]][:, None] + np.arange(k)).ravel()
+        for start in range(0, len(moving), 64):  # bounds the memory
+            these = moving[start : start + 64]
+            columns = at[k * start : k * (start + 64)]
+            unit = np.zeros((k * len(system.free), len(columns)))
+            unit[columns, np.arange(len(columns))] = 1
+            found = self._lu.solve(unit)[at].reshape(len(moving), k, len(these), k)
+            out[moving[:, None], :, these, :] = np.swapaxes(found, 1, 2)
+        C = out.reshape(len(vertices) * k, -1)
+        return (C + C.T) / 2
+
+    def covariances(self, vertices: Integers | None = None) -> Float64:
+        """(v, k, k) marginal covariances of single poses, all unless given; zero for fixed ones."""
+        system, k = self.system, self.system.size
+        vertices = np.arange(system.n) if vertices is None else np.asarray(vertices, np.intp)
+        out = np.zeros((len(vertices), k, k))
+        for start in range(0, len(vertices), 32):
+            C = self.joint_covariance(vertices[start : start + 32])
+            count = len(C) // k
+            blocks = C.reshape(count, k, count, k)
+            out[start : start + 32] = blocks[np.arange(count), :, np.arange(count), :]
+        return out
+
+
+def parts_of(n: int, pairs: Integers) -> Integers:
+    """(n,) number of the connected part that each vertex is in, counted by their first vertices."""
+    i, j = np.asarray(pairs, np.intp).reshape(-1, 2).T
+    adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
+    _, label = connected_components(adjacency, directed=False)
+    _, first, where = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[where]
+
+
+def first_of_parts(n: int, pairs: Integers) -> Bool:
+    """(n,) mask of the first vertex of each connected part."""
+    first = np.zeros(n, bool)
+    if n:
+        first[np.unique(parts_of(n, pairs), return_index=True)[1]] = True
+    return first
+
+
+def _indicator(rows: Integers, n: int, m: int) -> Any:
+    """Make an (n, m) matrix that adds column k to row rows[k]; rows below 0 are left out."""
+    used = np.flatnonzero(rows >= 0)
+    ones = np.ones(len(used))
+    return sparse.csr_matrix((ones, (rows[used], used)), shape=(n, m))
+
+
+def _elimination_order(n: int, i: Integers, j: Integers) -> Integers:
+    """Order of elimination with little fill-in: minimum degree on the graph of the poses."""
+    if n < 2:
+        return np.arange(n)
+    links = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    links = links + links.T
+    degree = np.asarray(links.sum(axis=1)).ravel()
+    laplacian = (sparse.diags(degree + 1) - links).tocsc()
+    options = {"SymmetricMode": True}
+    found = splu(laplacian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return np.argsort(found.perm_c)
