@@ -8,6 +8,7 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole
 from tofuse.kernels import alignment as kernels
+from tofuse.kernels import motion, steps
 from tofuse.maps.surface_map import Projection
 
 CAMERA = Pinhole(24, 18, 30.0, 30.0, 11.5, 8.5)
@@ -48,13 +49,23 @@ def source(n=60, noise=0.004, seed=1):
     return points, normals, np.full(n, 0.003, np.float32), photo
 
 
+def packed(points, normals, sigma, photo):
+    """The source's points as the kernel takes them."""
+    z = points[:, 2:]
+    slopes = photo[:, 1:] / z
+    third = -(slopes * points[:, :2]).sum(1, keepdims=True) / z
+    columns = [points, normals, sigma[:, None] / z, photo[:, :1], slopes, third]
+    return np.concatenate(columns, 1).astype(np.float32)
+
+
 def accumulate(view, of, T=MOTION, *, exposure=0.0, scale_g=1.0, scale_p=SCALE_P, slack=0.01,
                min_cosine=0.5, robust=ROBUST, start=0, stop=None):  # fmt: skip
     planes, variance, photo, projection = of
-    stop = len(view[0]) if stop is None else stop
+    points = view if isinstance(view, np.ndarray) else packed(*view)
     return kernels.accumulate(
-        *view, planes, variance, photo, projection.lookup, projection.frame,
-        np.ascontiguousarray(T), exposure, scale_g, scale_p, slack, robust, min_cosine, start, stop,
+        points, kernels.make_target(projection.rays, planes, variance, photo), projection.lookup,
+        projection.frame, np.ascontiguousarray(T), exposure, scale_g, scale_p, slack, robust,
+        min_cosine, start, len(points) if stop is None else stop,
     )  # fmt: skip
 
 
@@ -113,13 +124,14 @@ def test_sums_are_those_of_numpy(exposure):
     got, want = accumulate(view, of, exposure=exposure), twin(view, of, exposure=exposure)
     assert got[kernels.LANDED] == got[kernels.COMPARED] == 60
     assert got[kernels.INLIERS] == want["inliers"] > 30
+    H, g, C = kernels.normal_equations(got)
+    for matrix in (want["HP"], want["CP"]):
+        matrix[:6, :6] += want["H"] if matrix is want["HP"] else want["C"]
+    want["gP"][:6] += want["g"]
     pairs = [
-        (got[kernels.GEOMETRY_H :][:21], want["H"][UPPER6]),
-        (got[kernels.GEOMETRY_G :][:6], want["g"]),
-        (got[kernels.CROSS_G :][:21], want["C"][UPPER6]),
-        (got[kernels.PHOTO_H :][:28], want["HP"][UPPER7]),
-        (got[kernels.PHOTO_G :][:7], want["gP"]),
-        (got[kernels.CROSS_P :][:28], want["CP"][UPPER7]),
+        (H[UPPER7], want["HP"][UPPER7]),
+        (g, want["gP"]),
+        (C[UPPER7], want["CP"][UPPER7]),
         (got[kernels.SQUARES_G], want["squares"]),
         (got[kernels.WEIGHT_G], want["weight"]),
         (got[kernels.SQUARES_M], want["metres"]),
@@ -132,31 +144,32 @@ def test_sums_are_those_of_numpy(exposure):
 
 def test_the_gradient_is_that_of_the_cost_by_finite_differences():
     """With equal normals and slopes on both sides, and next to no robust weighting."""
-    view, of = list(source(noise=0.004)), target()
+    view, of = packed(*source(noise=0.004)), target()
     wide = {"robust": 1e3, "slack": 0.02}
     # Exactly the target's normal and slopes where the points land, so that both Jacobians agree.
-    view[1] = np.zeros_like(view[1])
-    view[3][:, 1:] = np.nan
-    found = accumulate(view, of, **wide)
+    view[:, 3:6] = MOTION[:3, :3].T @ NORMAL / np.linalg.norm(NORMAL)
+    there = se3.transform(MOTION, view[:, :3])
+    third = -(there[:, :2] @ SLOPES) / there[:, 2]
+    slopes = np.column_stack([np.tile(SLOPES, (len(there), 1)), third]) / there[:, 2:]
+    view[:, 8:] = slopes @ MOTION[:3, :3]
+    together = kernels.normal_equations(accumulate(view, of, **wide))[1]
+    alone = kernels.normal_equations(accumulate(view, of, scale_p=0.0, **wide))[1]
 
-    def cost(xi):
+    def cost(xi, exposure=0.0):
         T = MOTION @ se3.exp(xi)
-        sums = accumulate(view, of, T, **wide)
-        return sums[kernels.SQUARES_G], sums[kernels.SQUARES_P] / SCALE_P**2
+        sums = accumulate(view, of, T, exposure=exposure, **wide)
+        return np.array([sums[kernels.SQUARES_G], sums[kernels.SQUARES_P] / SCALE_P**2])
 
     step = 1e-4
     for k in range(6):
         xi = np.zeros(6)
         xi[k] = step
-        slopes = (np.array(cost(xi)) - cost(-xi)) / (2 * step) / 2
-        geometry, photo = found[kernels.GEOMETRY_G + k], found[kernels.PHOTO_G + k]
-        scale_g = np.abs(found[kernels.GEOMETRY_G :][:6]).max()
-        scale_p = np.abs(found[kernels.PHOTO_G :][:6]).max()
-        assert slopes[0] == pytest.approx(geometry, abs=0.03 * scale_g)
-        assert slopes[1] == pytest.approx(photo, abs=0.03 * scale_p)
-    up, down = (accumulate(view, of, exposure=e, **wide)[kernels.SQUARES_P] for e in (step, -step))
-    slope = (up - down) / SCALE_P**2 / (2 * step) / 2
-    assert slope == pytest.approx(found[kernels.PHOTO_G + 6], rel=1e-3)
+        slopes = (cost(xi) - cost(-xi)) / (2 * step) / 2
+        photo = together - alone
+        assert slopes[0] == pytest.approx(alone[k], abs=0.03 * np.abs(alone[:6]).max())
+        assert slopes[1] == pytest.approx(photo[k], abs=0.03 * np.abs(photo[:6]).max())
+    up, down = (cost(np.zeros(6), e)[1] for e in (step, -step))
+    assert (up - down) / (2 * step) / 2 == pytest.approx(together[6], rel=1e-3)
 
 
 @pytest.mark.parametrize("step", [1, 2])
@@ -172,7 +185,8 @@ def test_a_point_lands_on_the_pixel_that_sees_it(camera, step):
     planes[..., 2] = planes[..., 3] = w
     points = np.concatenate([rays, np.ones((rows, columns, 1))], -1) / w[..., None]
     n = rows * columns
-    view = (points.reshape(n, 3).astype(np.float32), np.zeros((n, 3), np.float32),
+    ahead = np.tile(np.float32([0, 0, 1]), (n, 1))
+    view = (points.reshape(n, 3).astype(np.float32), ahead,
             np.full(n, 1e-4, np.float32), np.full((n, 3), np.nan, np.float32))  # fmt: skip
     photo = np.full((rows, columns, 3), np.nan, np.float32)
     of = (planes, np.full((rows, columns), 1e-8, np.float32), photo, Projection.of(camera, step))
@@ -192,7 +206,8 @@ def test_what_can_not_be_compared_is_told_apart():
         [5, 0, 1.0],  # out of view
     ])  # fmt: skip
     n = len(points)
-    view = (points, np.zeros((n, 3), np.float32), np.full(n, 0.003, np.float32),
+    normals = np.tile(NORMAL.astype(np.float32) / np.linalg.norm(NORMAL), (n, 1))
+    view = (points, normals, np.full(n, 0.003, np.float32),
             np.full((n, 3), np.nan, np.float32))  # fmt: skip
     sums = accumulate(view, of, np.eye(4))
     assert sums[kernels.LANDED] == 3
@@ -208,8 +223,6 @@ def test_points_whose_normal_turns_away_are_no_inliers():
     view[1][:30] = [1, 0, 0]
     sums = accumulate(view, of)
     assert sums[kernels.INLIERS] == 30
-    view[1][:30] = 0  # unknown: nothing speaks against them
-    assert accumulate(view, of)[kernels.INLIERS] == 60
 
 
 def test_outliers_count_nothing():
@@ -235,13 +248,13 @@ def test_moved_is_the_exponential_map(size):
     rng = np.random.default_rng(5)
     T = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
-    np.testing.assert_allclose(kernels.moved(T, xi), T @ se3.exp(xi), atol=1e-9)
+    np.testing.assert_allclose(motion.moved(T, xi), T @ se3.exp(xi), atol=1e-9)
 
 
 def test_moved_takes_rounding_out_of_rotations():
     T = se3.exp([1, 2, 3, 0.5, -0.2, 0.3])
     T[:3, :3] *= 1 + 1e-5
-    out = kernels.moved(T, np.zeros(6))
+    out = motion.moved(T, np.zeros(6))
     np.testing.assert_allclose(out[:3, :3].T @ out[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(out[3], [0, 0, 0, 1])
 
@@ -252,28 +265,90 @@ def test_twist_between_is_the_logarithm(size):
     A = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
     B = A @ se3.exp(xi)
-    np.testing.assert_allclose(kernels.twist_between(A, B), xi, atol=1e-9)
+    np.testing.assert_allclose(motion.twist_between(A, B), xi, atol=1e-9)
 
 
 @pytest.mark.parametrize("photometric", [True, False])
 def test_normal_equations_unpack_the_sums(photometric):
-    total = np.random.default_rng(7).uniform(1, 2, kernels.SIZE)
-    H, g, C = kernels.normal_equations(total, photometric)
-    wanted_H, wanted_C, wanted_g = np.zeros((7, 7)), np.zeros((7, 7)), np.zeros(7)
-    wanted_H[UPPER6] = total[kernels.GEOMETRY_H :][:21]
-    wanted_C[UPPER6] = total[kernels.CROSS_G :][:21]
-    wanted_g[:6] = total[kernels.GEOMETRY_G :][:6]
-    if photometric:
-        wanted_H[UPPER7] += total[kernels.PHOTO_H :][:28]
-        wanted_C[UPPER7] += total[kernels.CROSS_P :][:28]
-        wanted_g += total[kernels.PHOTO_G :][:7]
-    for M in (wanted_H, wanted_C):
-        M.T[UPPER7] = M[UPPER7]
+    rng = np.random.default_rng(7)
+    J, D = rng.normal(size=(9, 8)), np.zeros((9, 8))
+    D[:, :6] = rng.normal(size=(9, 6))
     if not photometric:
-        wanted_H[6, 6] = 1
-    np.testing.assert_array_equal(H, wanted_H)
-    np.testing.assert_array_equal(C, wanted_C)
-    np.testing.assert_array_equal(g, wanted_g)
+        J[:, 6] = 0
+    total = np.zeros(kernels.SIZE)
+    total[kernels.H :][:36] = (J.T @ J)[np.triu_indices(8)]
+    total[kernels.D :][:21] = (D.T @ D)[UPPER6]
+    H, g, C = kernels.normal_equations(total)
+    wanted = (J.T @ J)[:7, :7]
+    np.testing.assert_allclose(C, wanted - (D.T @ D)[:7, :7], atol=1e-12)
+    np.testing.assert_allclose(g, J[:, :7].T @ J[:, 7], atol=1e-12)
+    pose = wanted[:6, :6]
+    if photometric:
+        pose = np.linalg.inv(np.linalg.inv(wanted)[:6, :6])
+    else:
+        wanted[6, 6] = 1
+    np.testing.assert_allclose(H, wanted, atol=1e-12)
+    np.testing.assert_allclose(steps.information(total), pose, atol=1e-9)
+    np.testing.assert_allclose(steps.cross_information(total), pose - (D.T @ D)[:6, :6], atol=1e-9)
+
+
+@pytest.mark.parametrize("unheld", [0, 2])
+def test_a_step_solves_the_normal_equations(unheld):
+    """Without weak directions they and the prior decide, along weak ones the prediction alone."""
+    rng = np.random.default_rng(9)
+    total = np.zeros(kernels.SIZE)
+    J = rng.normal(size=(40, 8)) * ([1] * 7 + [0.01])
+    total[kernels.H :][:36] = (J.T @ J)[np.triu_indices(8)]
+    units, prior = np.array([0.01] * 3 + [0.02] * 3), np.full(6, 0.3)
+    T = se3.exp(rng.normal(size=6))
+    predicted = T @ se3.exp([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])
+    weak = np.linalg.qr(rng.normal(size=(6, 6)))[0][:unheld]
+    after, step = steps.advance(total, T, predicted, weak, prior, units)
+    np.testing.assert_allclose(after, T @ se3.exp(step[:6]), atol=1e-9)
+    if unheld:
+        left = se3.log(se3.inverse(predicted) @ after) / units
+        np.testing.assert_allclose(weak @ left, 0, atol=0.05)
+        return
+    A, b = (J.T @ J)[:7, :7], J[:, :7].T @ J[:, 7]
+    A[:6, :6] += np.eye(6) / 0.3**2
+    b[:6] += se3.log(se3.inverse(predicted) @ T) / 0.3**2
+    np.testing.assert_allclose(step, -np.linalg.solve(A, b), rtol=1e-9)
+
+
+def test_weak_directions_are_those_with_little_information():
+    basis = np.linalg.qr(np.random.default_rng(10).normal(size=(6, 6)))[0]
+    units = np.array([0.01] * 3 + [0.02] * 3)
+    cross = (basis * [0.1, 0.3, 0.9, 1.1, 5.0, 20.0]) @ basis.T / np.outer(units, units)
+    found = steps.weak_directions(cross, units, 1.0)
+    np.testing.assert_allclose(found.T @ found, basis[:, :3] @ basis[:, :3].T, atol=1e-9)
+    assert steps.weak_directions(cross, units, 0.5).shape == (4, 6)
+    assert steps.weak_directions(cross, units, 10.0).shape == (0, 6)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 1.0, 7.0])
+def test_the_scale_of_distances_is_that_of_normal_deviates(sigma):
+    """A third of outliers moves a median, but does not break it."""
+    view, of = list(source(3000, noise=0.0)), target()
+    unit = NORMAL / np.linalg.norm(NORMAL)
+    view[2][:] = 0.0
+    off = sigma * np.sqrt(1e-6 / (NORMAL @ NORMAL)) * np.random.default_rng(11).normal(size=3000)
+    view[0] += (off[:, None] * (MOTION[:3, :3].T @ unit)).astype(np.float32)
+    found = steps.scale_of_distances(accumulate(view, of))
+    assert found == pytest.approx(sigma, rel=0.08)
+    assert np.isnan(steps.scale_of_distances(np.zeros(kernels.SIZE)))
+
+
+def test_the_difference_in_exposure_is_seen_where_points_land():
+    view, of = list(source()), target()
+    view[3][:, 0] -= 0.4
+    view[3][5, 0] = np.nan
+    projection = of[3]
+    pixels = kernels.make_target(projection.rays, *of[:3])
+    found = kernels.exposure_differences(
+        packed(*view), 2, pixels, projection.lookup, projection.frame, MOTION
+    )
+    assert len(found) == 30
+    assert np.median(found) == pytest.approx(0.4, abs=0.05)
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 4])
@@ -282,20 +357,16 @@ def test_gather_takes_every_strideth_pixel_with_a_plane(stride):
     planes[3:9, 5:11] = 0
     variance[...] = np.random.default_rng(8).uniform(1e-6, 4e-6, variance.shape)
     rays = CAMERA.rays()
-    most = planes.shape[0] * planes.shape[1]
-    points, normals, light = (np.full((most, 3), 7, np.float32) for _ in range(3))
-    sigma = np.full(most, 7, np.float32)
-    n = kernels.gather(rays, planes, variance, photo, stride, points, normals, sigma, light)
+    points = kernels.gather(rays, planes, variance, photo, stride)
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     w = planes[pick][..., 3]
     good = w > 0
-    assert n == np.count_nonzero(good)
-    assert (sigma[n:] == 7).all()
+    n = np.count_nonzero(good)
+    assert points.shape == (n, kernels.POINT_SIZE)
     z = 1 / w[good]
     wanted = np.concatenate([rays[pick][good], np.ones((n, 1))], 1) * z[:, None]
-    np.testing.assert_allclose(points[:n], wanted, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(points[:n] @ NORMAL, 1, rtol=1e-5)
-    unit = np.broadcast_to(NORMAL / np.linalg.norm(NORMAL), (n, 3))
-    np.testing.assert_allclose(normals[:n], unit, rtol=1e-5)
-    np.testing.assert_allclose(sigma[:n], np.sqrt(variance[pick][good]) * z**2, rtol=1e-5)
-    np.testing.assert_array_equal(light[:n], photo[pick][good])
+    np.testing.assert_allclose(points[:, :3] @ NORMAL, 1, rtol=1e-5)
+    unit = np.tile(NORMAL / np.linalg.norm(NORMAL), (n, 1))
+    sigma = np.sqrt(variance[pick][good]) * z**2
+    light = photo[pick][good]
+    np.testing.assert_allclose(points, packed(wanted, unit, sigma, light), rtol=1e-5, atol=1e-6)

@@ -4,9 +4,10 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import tiles
+from tofuse.kernels.alignment import POINT_SIZE
+from tofuse.kernels.doubt import faked_information
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.doubt import faked_information
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import (
     Patches,
@@ -184,9 +185,9 @@ def test_tile_sums_match_numpy():
 
     def run(a, b):
         return tiles.tile_sums(
-            z, source.rays, source.normals, sigma, source.photo, target.planes,
-            target.plane_variance, target.photo, target.projection.lookup,
-            target.projection.frame, T, 0.0, 1.0, 0.0, 3.5, np.cos(0.7), 2, 4, 3, a, b,
+            source.rays, source.planes, source.plane_variance, source.photo, target.target,
+            target.projection.lookup, target.projection.frame, T, 0.0, 1.0, 0.0, 3.5,
+            np.cos(0.7), 2, 4, 3, a, b,
         )  # fmt: skip
 
     whole = run(0, 3)
@@ -243,16 +244,24 @@ def test_faked_information_is_what_random_tilts_give():
     points = rng.uniform([-1, -1, 1], [1, 1, 3], (300, 3)).astype(np.float32)
     normals = rng.normal(size=(300, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    variance = np.full(300, 1e-4)
-    tilt = 0.03
-    found = faked_information(points, normals, variance, 0.0, np.zeros(300, bool), tilt, slope=0.1)
+    tilt, slope, sigma, slack, photo_sigma = 0.03, 0.1, 0.005, 0.004, 0.2
+    rows = np.zeros((300, POINT_SIZE), np.float32)
+    rows[:, :3], rows[:, 3:6], rows[:, 6] = points, normals, sigma / points[:, 2]
+    rows[::3, 7] = np.nan  # no albedo
+    found = faked_information(rows, 1, 1.5, slack, photo_sigma**2, tilt, slope)
+    along = (points * normals).sum(1) / points[:, 2]
+    variance = 2 * (along * 1.5 * sigma) ** 2 + slack**2
+    lit = np.isfinite(rows[:, 7])
     total = np.zeros((6, 6))
     rounds = 300
     for _ in range(rounds):
         off = tilt * rng.normal(size=(300, 3))
         off -= (off * normals).sum(1, keepdims=True) * normals
-        J = np.concatenate([off, np.cross(points, off)], 1)
-        total += J.T @ J / 1e-4 / rounds
+        sloped = slope * rng.normal(size=(300, 3)) / points[:, 2:]
+        sloped[:, 2] = -(sloped[:, :2] * points[:, :2]).sum(1) / points[:, 2]
+        for m, per in ((off, 1 / variance), (sloped, lit / photo_sigma**2)):
+            J = np.concatenate([m, np.cross(points, m)], 1)
+            total += (J * per[:, None]).T @ J / rounds / 300
     np.testing.assert_allclose(found, total, atol=0.02 * np.abs(total).max())
 
 

@@ -1,9 +1,14 @@
 """Normal equations of projective point-to-plane alignment with a photometric term.
 
 Source points p are moved into the target by T, projected, and compared with the plane and the
-albedo at the pixel they land on. With the plane a X + b Y + c Z = 1 of the target the residual is
-its distance (a X + b Y + c Z - 1) / |(a, b, c)|, and its Jacobian by the right perturbation of T
-is (m, p x m), with m = R^T n.
+albedo at the pixel they land on. With the plane n . X = d of the target the residual is its
+distance n . X - d, and its Jacobian by the right perturbation of T is (m, p x m), with m = R^T n.
+The log albedo of the target is linear in the rays near a pixel.
+
+Either residual has such a Jacobian by the target, with m from its normal or the slope of its
+albedo, and one by the source, with the source's own s in place of m. With J their mean and D half
+their difference the symmetrised product of the two is J J^T - D D^T: independent noise cancels in
+it.
 """
 
 from __future__ import annotations
@@ -12,42 +17,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import jacobian_row, landing
+from tofuse.kernels.projection import landing
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+# Columns of a source point: position in m, unit normal, sigma of z as a share of z, log albedo
+# (NaN where unknown) and its slope by the position, 1/m.
+POINT = 0
+NORMAL = 3
+SIGMA = 6
+LIGHT = 7
+LIGHT_SLOPE = 8
+POINT_SIZE = 11
+
+# Columns of a target's pixel: unit normal and distance of the plane (0: there is none), variance
+# of the distance, and log albedo of the ray (0, 0) with its slopes by x/z and y/z (NaN where
+# unknown), were it linear in the rays everywhere.
+PLANE = 0
+DISTANCE = 3
+VARIANCE = 4
+ALBEDO = 5
+ALBEDO_SLOPE = 6
+PIXEL_SIZE = 8
+
 # Layout of what `accumulate` returns.
-GEOMETRY_H = 0  # 21: upper triangle of the 6x6
-GEOMETRY_G = 21  # 6
-PHOTO_H = 27  # 28: upper triangle of the 7x7; the seventh unknown is the exposure
-PHOTO_G = 55  # 7
-CROSS_G = 62  # 21: symmetrised product of the Jacobians of target and source, geometry
-CROSS_P = 83  # 28: the same of the photometric term
-LANDED = 111  # points that land on a pixel of the target
-COMPARED = 112  # of those, points at which the target has a plane
-INLIERS = 113  # of those, points within the reach and with a compatible normal
-IN_FRONT = 114  # points in free space of the target
-WEIGHT_G = 115  # sums of the robust weights and of weighted squared residuals, in sigmas
-SQUARES_G = 116
-WEIGHT_P = 117
-SQUARES_P = 118
-COUNT_P = 119
-SQUARES_M = 120  # of the inliers' distances, m^2
-HISTOGRAM = 121  # of all compared points' distances in unscaled sigmas, quarter octaves from 1/16
-BINS = 48
+H = 0  # 36: upper triangle of the 8x8 sum of w (J, r) (J, r)^T; J[6] is that of the exposure
+D = 36  # 21: upper triangle of the 6x6 sum of w D D^T
+LANDED = 57  # points that land on a pixel of the target
+COMPARED = 58  # of those, points at which the target has a plane
+INLIERS = 59  # of those, points within the reach and with a compatible normal
+IN_FRONT = 60  # points in free space of the target
+WEIGHT_G = 61  # sums of the robust weights and of weighted squared residuals, in sigmas
+SQUARES_G = 62
+WEIGHT_P = 63
+SQUARES_P = 64
+COUNT_P = 65
+SQUARES_M = 66  # of the inliers' distances, m^2
+# Of all compared points' squared distances in unscaled variances: bins of a quarter of an octave
+# (between two powers of 2 all are equally wide), the first from 0 to 2^-8.
+HISTOGRAM = 67
+BINS = 96
 SIZE = HISTOGRAM + BINS
+
+# Residuals wait in blocks, each weighted by the root of its w: a column of J (7), r, and D (6).
+_BLOCK = 32
+_J, _R, _D, _COLUMN = 0, 7, 8, 14
 
 
 @kernel
 def accumulate(
     points: Float32,
-    normals: Float32,
-    depth_sigma: Float32,
-    source_photo: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    target_photo: Float32,
+    target: Float32,
     lookup: Float32,
     lookup_frame: Float64,
     T: Float64,
@@ -64,19 +85,17 @@ def accumulate(
 
     Parameters
     ----------
-    points, normals, depth_sigma, source_photo
-        (N, 3) m; (N, 3) unit, 0 where unknown; (N,) sigma of z, m; (N, 3) log albedo and its
-        slopes by ray coordinate, NaN where unknown.
-    planes, plane_variance, target_photo
-        Of the target: (H, W, 4), (H, W) variance of 1/z, (H, W, 3).
+    points, target
+        (N, POINT_SIZE) and (H, W, PIXEL_SIZE), see above.
     lookup, lookup_frame
-        (A, B, 2) pixel of each node of a grid over ray coordinates, and (x0, y0, 1/dx, 1/dy).
+        As in `landing`.
     T
         (4, 4) T_target_source.
     exposure
         Target log albedo minus the source's.
     scale_g, scale_p
-        Sigmas are multiplied by the first; the second is the sigma of the log albedo.
+        Sigmas are multiplied by the first; the second is the sigma of the log albedo, 0 if it takes
+        no part.
     slack
         Added in quadrature to the sigma of a distance, m: forgives what is still misaligned.
     robust
@@ -85,265 +104,200 @@ def accumulate(
         Smallest cosine between the normals.
     """
     out = np.zeros(SIZE)
-    rows, columns = planes.shape[0], planes.shape[1]
-    J = np.empty(7)
-    K = np.empty(7)
-    limit2 = robust * robust
+    rows, columns = target.shape[0], target.shape[1]
+    inverse_limit2 = 1 / (robust * robust)
+    per_p = 1 / scale_p if scale_p > 0 else 0.0
+    scale_g2 = scale_g * scale_g
+    slack2 = slack * slack
+    block = np.empty((_COLUMN, _BLOCK))
+    sums = np.zeros((LANDED, _BLOCK))
+    waiting = 0
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for k in range(start, stop):
-        px = np.float64(points[k, 0])
-        py = np.float64(points[k, 1])
-        pz = np.float64(points[k, 2])
+        if waiting > _BLOCK - 2:
+            _add_block(sums, block, waiting)
+            waiting = 0
+        px = np.float64(points[k, POINT])
+        py = np.float64(points[k, POINT + 1])
+        pz = np.float64(points[k, POINT + 2])
         z = r20 * px + r21 * py + r22 * pz + t2
         if z <= 0.02:
             continue
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
-        xn = x / z
-        yn = y / z
-        u, v, iu, iv = landing(xn, yn, lookup, lookup_frame)
+        per_z = 1 / z
+        xn = x * per_z
+        yn = y * per_z
+        u, v, iu, _ = landing(xn, yn, lookup, lookup_frame)
         if iu < 0:
             continue
         if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
-        i = int(v + 0.5)
-        j = int(u + 0.5)
+        pixel = target[int(v + 0.5), int(u + 0.5)]
         out[LANDED] += 1
-        inverse_z = np.float64(planes[i, j, 3])
-        if inverse_z <= 0:
+        distance = np.float64(pixel[DISTANCE])
+        if distance == 0:
             continue
-        a = np.float64(planes[i, j, 0])
-        b = np.float64(planes[i, j, 1])
-        c = np.float64(planes[i, j, 2])
         out[COMPARED] += 1
-        length = np.sqrt(a * a + b * b + c * c)
-        na = a / length
-        nb = b / length
-        nc = c / length
-        r = (a * x + b * y + c * z - 1.0) / length
-        # m = R^T n, the target's normal in the source frame (away from the camera).
-        m0 = r00 * na + r10 * nb + r20 * nc
-        m1 = r01 * na + r11 * nb + r21 * nc
-        m2 = r02 * na + r12 * nb + r22 * nc
-        along = (m0 * px + m1 * py + m2 * pz) / pz
-        sz = np.float64(depth_sigma[k]) * scale_g
-        source_variance = along * along * sz * sz
-        target_variance = plane_variance[i, j] * scale_g * scale_g / (length * length)
-        variance = source_variance + target_variance + slack * slack
-        e2 = r * r / variance
-        s0 = np.float64(normals[k, 0])
-        s1 = np.float64(normals[k, 1])
-        s2 = np.float64(normals[k, 2])
-        known = s0 != 0 or s1 != 0 or s2 != 0
-        own = np.sqrt((source_variance + target_variance) / (scale_g * scale_g))
-        place = 16 + int(np.floor(4 * np.log2(max(abs(r) / own, 1e-9))))
-        out[HISTOGRAM + min(max(place, 0), BINS - 1)] += 1
-        if e2 >= limit2:
+        n0 = np.float64(pixel[PLANE])
+        n1 = np.float64(pixel[PLANE + 1])
+        n2 = np.float64(pixel[PLANE + 2])
+        across = n0 * x + n1 * y + n2 * z
+        r = across - distance
+        # How an error along the source's ray, relative to z, moves the point across the plane.
+        along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(points[k, SIGMA])
+        own = along * along + np.float64(pixel[VARIANCE])
+        r2 = r * r
+        out[HISTOGRAM + _bin(r2 / own)] += 1
+        per_variance = 1 / (scale_g2 * own + slack2)
+        e2 = r2 * per_variance * inverse_limit2
+        if e2 >= 1:
             # Nearer than what the target saw there: it looked through this point.
-            if z * inverse_z < 1 and r * r > 4 * limit2 * variance:
+            if r < 0 and e2 > 4:
                 out[IN_FRONT] += 1
             continue
-        if known and s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
+        # m = R^T n, the target's normal in the source frame (away from the camera).
+        m0 = r00 * n0 + r10 * n1 + r20 * n2
+        m1 = r01 * n0 + r11 * n1 + r21 * n2
+        m2 = r02 * n0 + r12 * n1 + r22 * n2
+        s0 = np.float64(points[k, NORMAL])
+        s1 = np.float64(points[k, NORMAL + 1])
+        s2 = np.float64(points[k, NORMAL + 2])
+        if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
-        f = 1 - e2 / limit2
-        weight = f * f
+        weight = (1 - e2) * (1 - e2)
         out[INLIERS] += 1
-        out[SQUARES_M] += r * r
+        out[SQUARES_M] += r2
         out[WEIGHT_G] += weight
-        out[SQUARES_G] += weight * e2
-        g = weight / variance
-        jacobian_row(J, m0, m1, m2, px, py, pz)
-        if known:
-            jacobian_row(K, s0, s1, s2, px, py, pz)
-            q = 0
-            for p in range(6):
-                for o in range(p, 6):
-                    out[CROSS_G + q] += 0.5 * g * (J[p] * K[o] + K[p] * J[o])
-                    q += 1
-            for p in range(6):
-                J[p] = 0.5 * (J[p] + K[p])
-        q = 0
-        for p in range(6):
-            gj = g * J[p]
-            out[GEOMETRY_G + p] += gj * r
-            for o in range(p, 6):
-                out[GEOMETRY_H + q] += gj * J[o]
-                q += 1
+        out[SQUARES_G] += weight * r2 * per_variance
+        root = (1 - e2) * np.sqrt(per_variance)
+        _put(block, waiting, root, r, 0.0, px, py, pz, m0, m1, m2, s0, s1, s2)
+        waiting += 1
 
-        tx = np.float64(target_photo[i, j, 1])
-        ty = np.float64(target_photo[i, j, 2])
-        level = np.float64(source_photo[k, 0])
-        if scale_p <= 0 or np.isnan(tx) or np.isnan(level):
+        tx = np.float64(pixel[ALBEDO_SLOPE])
+        level = np.float64(points[k, LIGHT])
+        if per_p == 0 or np.isnan(tx) or np.isnan(level):
             continue
-        # To first order the albedo where the point lands exactly, not at the pixel's centre. The
-        # pixel's own ray follows from the lookup's local slope.
-        xu = 1.0 / (lookup_frame[2] * (lookup[iv, iu + 1, 0] - lookup[iv, iu, 0]))
-        yv = 1.0 / (lookup_frame[3] * (lookup[iv + 1, iu, 1] - lookup[iv, iu, 1]))
-        here = target_photo[i, j, 0] + tx * (u - j) * xu + ty * (v - i) * yv
-        rp = here - level - exposure
-        e2 = rp * rp / (scale_p * scale_p)
+        ty = np.float64(pixel[ALBEDO_SLOPE + 1])
+        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - level - exposure
         out[COUNT_P] += 1
-        if e2 >= limit2:
+        r2 = r * r
+        e2 = r2 * per_p * per_p * inverse_limit2
+        if e2 >= 1:
             continue
-        f = 1 - e2 / limit2
-        weight = f * f
+        weight = (1 - e2) * (1 - e2)
         out[WEIGHT_P] += weight
-        out[SQUARES_P] += weight * rp * rp
-        g = weight / (scale_p * scale_p)
+        out[SQUARES_P] += weight * r2
         # d(x/z, y/z) by the moved point, then back into the source frame.
-        d0 = tx / z
-        d1 = ty / z
-        d2 = -(tx * xn + ty * yn) / z
+        d0 = tx * per_z
+        d1 = ty * per_z
+        d2 = -(tx * xn + ty * yn) * per_z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        jacobian_row(J, m0, m1, m2, px, py, pz)
-        J[6] = -1.0
-        gx = np.float64(source_photo[k, 1])
-        gy = np.float64(source_photo[k, 2])
-        if not np.isnan(gx):
-            s0 = gx / pz
-            s1 = gy / pz
-            s2 = -(gx * px + gy * py) / (pz * pz)
-            jacobian_row(K, s0, s1, s2, px, py, pz)
-            K[6] = -1.0
-            q = 0
-            for p in range(7):
-                for o in range(p, 7):
-                    out[CROSS_P + q] += 0.5 * g * (J[p] * K[o] + K[p] * J[o])
-                    q += 1
-            for p in range(6):
-                J[p] = 0.5 * (J[p] + K[p])
-        q = 0
-        for p in range(7):
-            gj = g * J[p]
-            out[PHOTO_G + p] += gj * rp
-            for o in range(p, 7):
-                out[PHOTO_H + q] += gj * J[o]
-                q += 1
+        s0 = np.float64(points[k, LIGHT_SLOPE])
+        s1 = np.float64(points[k, LIGHT_SLOPE + 1])
+        s2 = np.float64(points[k, LIGHT_SLOPE + 2])
+        root = (1 - e2) * per_p
+        _put(block, waiting, root, r, -1.0, px, py, pz, m0, m1, m2, s0, s1, s2)
+        waiting += 1
+    _add_block(sums, block, waiting)
+    for q in range(LANDED):
+        for lane in range(_BLOCK):
+            out[q] += sums[q, lane]
     return out
 
 
 @kernel
-def moved(T: Float64, xi: Float64) -> Float64:
-    """T * exp(xi), (4, 4), with the rotation brought back to orthogonality to first order."""
-    t = xi[:3]
-    w = xi[3:]
-    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    angle = np.sqrt(angle2)
-    if angle < 1e-4:
-        s1 = 1 - angle2 / 6
-        s2 = 0.5 - angle2 / 24
-        s3 = 1.0 / 6 - angle2 / 120
-    else:
-        s1 = np.sin(angle) / angle
-        s2 = (1 - np.cos(angle)) / angle2
-        s3 = (angle - np.sin(angle)) / (angle2 * angle)
-    W = np.zeros((3, 3))
-    W[0, 1], W[0, 2] = -w[2], w[1]
-    W[1, 0], W[1, 2] = w[2], -w[0]
-    W[2, 0], W[2, 1] = -w[1], w[0]
-    R = np.eye(3)
-    V = np.eye(3)
-    for i in range(3):
-        for j in range(3):
-            square = 0.0
-            for k in range(3):
-                square += W[i, k] * W[k, j]
-            R[i, j] += s1 * W[i, j] + s2 * square
-            V[i, j] += s2 * W[i, j] + s3 * square
-    out = np.zeros((4, 4))
-    for i in range(3):
-        out[i, 3] = T[i, 3]
-        for j in range(3):
-            step = 0.0
-            for k in range(3):
-                out[i, j] += T[i, k] * R[k, j]
-                step += V[j, k] * t[k]
-            out[i, 3] += T[i, j] * step
-    # One Newton step towards orthogonality: R (3 - R^T R) / 2.
-    G = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                G[i, j] += out[k, i] * out[k, j]
-    fixed = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                h = (3.0 if k == j else 0.0) - G[k, j]
-                fixed[i, j] += 0.5 * out[i, k] * h
-    out[:3, :3] = fixed
-    out[3, 3] = 1
-    return out
+def _bin(ratio: float) -> int:
+    """Bin of a squared distance: the exponent of the number and two bits of its mantissa."""
+    bits = np.float32(ratio).view(np.int32)
+    place = int(bits >> 21) - ((127 - 8) << 2)
+    return min(max(place, 0), BINS - 1)
 
 
 @kernel
-def normal_equations(total: Float64, photometric: bool) -> tuple[Float64, Float64, Float64]:
+def bin_edge(place: int) -> float:
+    """Squared distance, in unscaled variances, at which a bin of the histogram begins."""
+    return 2.0 ** ((place >> 2) - 8) * (1 + (place & 3) / 4) if place > 0 else 0.0
+
+
+@kernel
+def _put(
+    block: Float64,
+    k: int,
+    root: float,
+    r: float,
+    j6: float,
+    px: float,
+    py: float,
+    pz: float,
+    m0: float,
+    m1: float,
+    m2: float,
+    s0: float,
+    s1: float,
+    s2: float,
+) -> None:
+    """Write a residual into column k of a block, weighted; m and s are the sides' directions."""
+    half = 0.5 * root
+    a0, a1, a2 = half * (m0 + s0), half * (m1 + s1), half * (m2 + s2)
+    block[_J, k], block[_J + 1, k], block[_J + 2, k] = a0, a1, a2
+    block[_J + 3, k] = py * a2 - pz * a1
+    block[_J + 4, k] = pz * a0 - px * a2
+    block[_J + 5, k] = px * a1 - py * a0
+    block[_J + 6, k] = root * j6
+    block[_R, k] = root * r
+    a0, a1, a2 = half * (m0 - s0), half * (m1 - s1), half * (m2 - s2)
+    block[_D, k], block[_D + 1, k], block[_D + 2, k] = a0, a1, a2
+    block[_D + 3, k] = py * a2 - pz * a1
+    block[_D + 4, k] = pz * a0 - px * a2
+    block[_D + 5, k] = px * a1 - py * a0
+
+
+@kernel
+def _add_block(sums: Float64, block: Float64, count: int) -> None:
+    """Add the products of a block's rows, lane by lane: several at a time in the processor."""
+    q = 0
+    for p in range(_COLUMN):
+        for o in range(p, _D if p < _D else _COLUMN):
+            for lane in range(count):
+                sums[q, lane] += block[p, lane] * block[o, lane]
+            q += 1
+
+
+@kernel
+def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
     """Unpack what `accumulate` summed: H (7, 7), g (7,) and the cross-information (7, 7).
 
     The seventh unknown is the exposure; without the photometric term its row is that of the unit
     matrix in H and 0 in the cross-information.
     """
-    H = np.zeros((7, 7))
+    A = np.zeros((7, 7))
     C = np.zeros((7, 7))
     g = np.zeros(7)
-    q = 0
-    for p in range(6):
-        g[p] = total[GEOMETRY_G + p]
-        for o in range(p, 6):
-            H[p, o] = total[GEOMETRY_H + q]
-            C[p, o] = total[CROSS_G + q]
+    q = H
+    for p in range(7):
+        for o in range(p, 7):
+            A[p, o] = total[q]
+            C[p, o] = total[q]
             q += 1
-    if photometric:
-        q = 0
-        for p in range(7):
-            g[p] += total[PHOTO_G + p]
-            for o in range(p, 7):
-                H[p, o] += total[PHOTO_H + q]
-                C[p, o] += total[CROSS_P + q]
-                q += 1
+        g[p] = total[q]
+        q += 1
+    q = D
+    for p in range(6):
+        for o in range(p, 6):
+            C[p, o] -= total[q]
+            q += 1
     for p in range(7):
         for o in range(p):
-            H[p, o] = H[o, p]
+            A[p, o] = A[o, p]
             C[p, o] = C[o, p]
-    if H[6, 6] <= 0:
-        H[6, 6] = 1.0
-    return H, g, C
-
-
-@kernel
-def twist_between(A: Float64, B: Float64) -> Float64:
-    """Logarithm (6,) of A^-1 B, for rotations well below half a turn."""
-    R = np.zeros((3, 3))
-    t = np.zeros(3)
-    for i in range(3):
-        for k in range(3):
-            t[i] += A[k, i] * (B[k, 3] - A[k, 3])
-            for j in range(3):
-                R[i, j] += A[k, i] * B[k, j]
-    w = np.empty(3)
-    w[0] = R[2, 1] - R[1, 2]
-    w[1] = R[0, 2] - R[2, 0]
-    w[2] = R[1, 0] - R[0, 1]
-    sine = 0.5 * np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
-    w *= 0.5 * (angle / sine if sine > 1e-9 else 1.0)
-    if angle < 0.02:
-        c = 1.0 / 12 + angle * angle / 720
-    else:
-        c = 1.0 / (angle * angle) - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    out = np.empty(6)
-    out[3:] = w
-    # The inverse left Jacobian: 1 - W / 2 + c W^2.
-    wt = np.array([w[1] * t[2] - w[2] * t[1], w[2] * t[0] - w[0] * t[2], w[0] * t[1] - w[1] * t[0]])
-    wwt = np.array(
-        [w[1] * wt[2] - w[2] * wt[1], w[2] * wt[0] - w[0] * wt[2], w[0] * wt[1] - w[1] * wt[0]]
-    )
-    out[:3] = t - 0.5 * wt + c * wwt
-    return out
+    if A[6, 6] <= 0:
+        A[6, 6] = 1.0
+    return A, g, C
 
 
 @kernel
@@ -353,35 +307,82 @@ def gather(
     plane_variance: Float32,
     photo: Float32,
     stride: int,
-    points: Float32,
-    normals: Float32,
-    sigma: Float32,
-    light: Float32,
-) -> int:
-    """Take every `stride`-th pixel of every `stride`-th row that has a plane; returns how many.
+) -> Float32:
+    """Take every `stride`-th pixel of every `stride`-th row that has a plane, row by row.
 
-    Writes points on the fitted surface (N, 3), unit normals (N, 3), sigma of z (N,) and the
-    photometric values (N, 3), row by row.
+    Returns (N, POINT_SIZE) points on the fitted surface.
     """
+    rows, columns = planes.shape[0], planes.shape[1]
+    most = ((rows + stride - 1) // stride) * ((columns + stride - 1) // stride)
+    out = np.empty((most, POINT_SIZE), np.float32)
     n = 0
-    for i in range(stride // 2, planes.shape[0], stride):
-        for j in range(stride // 2, planes.shape[1], stride):
+    for i in range(stride // 2, rows, stride):
+        for j in range(stride // 2, columns, stride):
             v = planes[i, j, 3]
             if v <= 0:
                 continue
-            z = 1 / v
-            points[n, 0] = rays[i, j, 0] * z
-            points[n, 1] = rays[i, j, 1] * z
-            points[n, 2] = z
-            a = planes[i, j, 0]
-            b = planes[i, j, 1]
-            c = planes[i, j, 2]
+            x, y = rays[i, j, 0], rays[i, j, 1]
+            a, b, c = planes[i, j, 0], planes[i, j, 1], planes[i, j, 2]
             length = np.sqrt(a * a + b * b + c * c)
-            normals[n, 0] = a / length
-            normals[n, 1] = b / length
-            normals[n, 2] = c / length
-            sigma[n] = np.sqrt(plane_variance[i, j]) * z * z
-            for k in range(3):
-                light[n, k] = photo[i, j, k]
+            gx, gy = photo[i, j, 1], photo[i, j, 2]
+            point = out[n]
+            point[POINT], point[POINT + 1], point[POINT + 2] = x / v, y / v, 1 / v
+            point[NORMAL], point[NORMAL + 1], point[NORMAL + 2] = a / length, b / length, c / length
+            point[SIGMA] = np.sqrt(plane_variance[i, j]) / v
+            point[LIGHT] = photo[i, j, 0]
+            point[LIGHT_SLOPE], point[LIGHT_SLOPE + 1] = gx * v, gy * v
+            point[LIGHT_SLOPE + 2] = -(gx * x + gy * y) * v
             n += 1
-    return n
+    return out[:n]
+
+
+@kernel
+def make_target(rays: Float32, planes: Float32, plane_variance: Float32, photo: Float32) -> Float32:
+    """Return a view as (H, W, PIXEL_SIZE), as a target is compared with."""
+    rows, columns = planes.shape[0], planes.shape[1]
+    out = np.zeros((rows, columns, PIXEL_SIZE), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            if planes[i, j, 3] <= 0:
+                continue
+            a, b, c = planes[i, j, 0], planes[i, j, 1], planes[i, j, 2]
+            length2 = a * a + b * b + c * c
+            length = np.sqrt(length2)
+            gx, gy = photo[i, j, 1], photo[i, j, 2]
+            pixel = out[i, j]
+            pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2] = a / length, b / length, c / length
+            pixel[DISTANCE] = 1 / length
+            pixel[VARIANCE] = plane_variance[i, j] / length2
+            pixel[ALBEDO] = photo[i, j, 0] - gx * rays[i, j, 0] - gy * rays[i, j, 1]
+            pixel[ALBEDO_SLOPE], pixel[ALBEDO_SLOPE + 1] = gx, gy
+    return out
+
+
+@kernel
+def exposure_differences(
+    points: Float32, every: int, target: Float32, lookup: Float32, lookup_frame: Float64, T: Float64
+) -> Float64:
+    """Log albedo of the target minus the source's, where every so manieth point lands."""
+    out = np.empty(points.shape[0] // every + 1)
+    n = 0
+    for k in range(0, points.shape[0], every):
+        px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if z <= 0.02:
+            continue
+        x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / z
+        y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
+        u, v, iu, _ = landing(x, y, lookup, lookup_frame)
+        if iu < 0 or not (
+            u > -0.5 and v > -0.5 and u < target.shape[1] - 0.5 and v < target.shape[0] - 0.5
+        ):
+            continue
+        pixel = target[int(v + 0.5), int(u + 0.5)]
+        if pixel[DISTANCE] == 0:
+            continue
+        light = pixel[ALBEDO] + x * pixel[ALBEDO_SLOPE] + y * pixel[ALBEDO_SLOPE + 1]
+        difference = light - points[k, LIGHT]
+        if not np.isnan(difference):
+            out[n] = difference
+            n += 1
+    return out[:n]

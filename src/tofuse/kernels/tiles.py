@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels.alignment import ALBEDO, ALBEDO_SLOPE, DISTANCE, PLANE, VARIANCE
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row, landing
 
@@ -30,14 +31,11 @@ GEOMETRY, PHOTO = 0, 1
 
 @kernel
 def tile_sums(
-    z: Float32,
     rays: Float32,
-    normals: Float32,
-    sigma: Float32,
-    source_photo: Float32,
     planes: Float32,
     plane_variance: Float32,
-    target_photo: Float32,
+    photo: Float32,
+    target: Float32,
     lookup: Float32,
     lookup_frame: Float64,
     T: Float64,
@@ -54,13 +52,15 @@ def tile_sums(
 ) -> Float64:
     """Sum over the source's pixels of rows of tiles start..stop; see `alignment.accumulate`.
 
+    The source is given by its images, the target as `alignment.make_target` packs it.
+
     Returns
     -------
     (stop - start, tiles_x, 2, SIZE), for the distances and for the albedo.
     """
-    rows, columns = z.shape
+    rows, columns = planes.shape[0], planes.shape[1]
     out = np.zeros((stop - start, tiles_x, 2, SIZE))
-    height, width = planes.shape[0], planes.shape[1]
+    height, width = target.shape[0], target.shape[1]
     limit2 = robust * robust
     J = np.zeros(7)
     K = np.zeros(7)
@@ -69,10 +69,11 @@ def tile_sums(
     half = stride // 2
     for row in range(first + (half - first) % stride, last, stride):
         for column in range(half, columns, stride):
-            pz = np.float64(z[row, column])
-            if pz <= 0:
+            inverse_z = np.float64(planes[row, column, 3])
+            if inverse_z <= 0:
                 continue
             tile = out[row * tiles_y // rows - start, column * tiles_x // columns]
+            pz = 1 / inverse_z
             px = rays[row, column, 0] * pz
             py = rays[row, column, 1] * pz
             qz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
@@ -82,36 +83,37 @@ def tile_sums(
             qy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
             xn = qx / qz
             yn = qy / qz
-            u, v, iu, iv = landing(xn, yn, lookup, lookup_frame)
+            u, v, iu, _ = landing(xn, yn, lookup, lookup_frame)
             if iu < 0:
                 continue
             if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
                 continue
-            i = int(v + 0.5)
-            j = int(u + 0.5)
-            if planes[i, j, 3] <= 0:
+            pixel = target[int(v + 0.5), int(u + 0.5)]
+            distance = np.float64(pixel[DISTANCE])
+            if distance == 0:
                 continue
-            a = np.float64(planes[i, j, 0])
-            b = np.float64(planes[i, j, 1])
-            c = np.float64(planes[i, j, 2])
-            length = np.sqrt(a * a + b * b + c * c)
-            r = (a * qx + b * qy + c * qz - 1.0) / length
-            m0 = (T[0, 0] * a + T[1, 0] * b + T[2, 0] * c) / length
-            m1 = (T[0, 1] * a + T[1, 1] * b + T[2, 1] * c) / length
-            m2 = (T[0, 2] * a + T[1, 2] * b + T[2, 2] * c) / length
-            along = (m0 * px + m1 * py + m2 * pz) / pz
-            sz = sigma[row, column] * scale_g
-            variance = along * along * sz * sz + plane_variance[i, j] * scale_g * scale_g / (
-                length * length
-            )
+            n0 = np.float64(pixel[PLANE])
+            n1 = np.float64(pixel[PLANE + 1])
+            n2 = np.float64(pixel[PLANE + 2])
+            across = n0 * qx + n1 * qy + n2 * qz
+            r = across - distance
+            m0 = T[0, 0] * n0 + T[1, 0] * n1 + T[2, 0] * n2
+            m1 = T[0, 1] * n0 + T[1, 1] * n1 + T[2, 1] * n2
+            m2 = T[0, 2] * n0 + T[1, 2] * n1 + T[2, 2] * n2
+            along = (m0 * px + m1 * py + m2 * pz) * pz
+            own = along * along * plane_variance[row, column] + pixel[VARIANCE]
+            variance = own * scale_g * scale_g
             e2 = r * r / variance
             if e2 >= limit2:
                 continue
-            s0 = np.float64(normals[row, column, 0])
-            s1 = np.float64(normals[row, column, 1])
-            s2 = np.float64(normals[row, column, 2])
-            known = s0 != 0 or s1 != 0 or s2 != 0
-            if known and s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
+            a = np.float64(planes[row, column, 0])
+            b = np.float64(planes[row, column, 1])
+            c = np.float64(planes[row, column, 2])
+            length = np.sqrt(a * a + b * b + c * c)
+            s0 = a / length
+            s1 = b / length
+            s2 = c / length
+            if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
                 continue
             f = 1 - e2 / limit2
             jacobian_row(J, m0, m1, m2, px, py, pz)
@@ -121,16 +123,12 @@ def tile_sums(
             slope = f * (f - 4 * e2 / limit2) / variance
             _add(tile[GEOMETRY], J, K, r, f * f / variance, slope)
 
-            tx = np.float64(target_photo[i, j, 1])
-            ty = np.float64(target_photo[i, j, 2])
-            level = np.float64(source_photo[row, column, 0])
+            tx = np.float64(pixel[ALBEDO_SLOPE])
+            ty = np.float64(pixel[ALBEDO_SLOPE + 1])
+            level = np.float64(photo[row, column, 0])
             if scale_p <= 0 or np.isnan(tx) or np.isnan(level):
                 continue
-            # To first order the albedo where the point lands exactly; a pixel's rays follow from
-            # the lookup's local slope.
-            xu = 1.0 / (lookup_frame[2] * (lookup[iv, iu + 1, 0] - lookup[iv, iu, 0]))
-            yv = 1.0 / (lookup_frame[3] * (lookup[iv + 1, iu, 1] - lookup[iv, iu, 1]))
-            r = target_photo[i, j, 0] + tx * (u - j) * xu + ty * (v - i) * yv - level - exposure
+            r = pixel[ALBEDO] + tx * xn + ty * yn - level - exposure
             e2 = r * r / (scale_p * scale_p)
             if e2 >= limit2:
                 continue
@@ -143,11 +141,8 @@ def tile_sums(
             m2 = T[0, 2] * d0 + T[1, 2] * d1 + T[2, 2] * d2
             jacobian_row(J, m0, m1, m2, px, py, pz)
             J[6] = -1.0
-            gx = np.float64(source_photo[row, column, 1])
-            gy = np.float64(source_photo[row, column, 2])
-            if np.isnan(gx):
-                gx = np.float64(0)
-                gy = np.float64(0)
+            gx = np.float64(photo[row, column, 1])
+            gy = np.float64(photo[row, column, 2])
             jacobian_row(K, gx / pz, gy / pz, -(gx * px + gy * py) / (pz * pz), px, py, pz)
             K[6] = -1.0
             p2 = scale_p * scale_p

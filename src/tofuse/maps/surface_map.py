@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry.cameras import Camera
+from tofuse.kernels.alignment import make_target
 from tofuse.kernels.surface import (
     SUMS,
     add_rows,
@@ -179,6 +180,11 @@ class SurfaceMap:
         return np.where(self.planes[..., 3:] > 0, abc / np.maximum(length, 1e-12), 0).astype(
             np.float32
         )
+
+    @cached_property
+    def target(self) -> Float32:
+        """(H, W, PIXEL_SIZE) what points of other views are compared with, see `make_target`."""
+        return make_target(self.rays, self.planes, self.plane_variance, self.photo)
 
     @cached_property
     def planar_share(self) -> float:

@@ -6,6 +6,7 @@ perturbation of the source's pose. Directions that the data does not hold keep t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,19 +14,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.geometry import se3
 from tofuse.kernels import alignment as kernels
+from tofuse.kernels import steps
+from tofuse.kernels.doubt import faked_information
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.registration.doubt import faked_information
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
-# Points from which it is told how much information can be faked: the sums are smooth.
-_DOUBT_POINTS = 500
+# Points from which means over the view are told: how much information can be faked, exposure.
+_SOME_POINTS = 500
 _CHUNK_POINTS = 6000
 
 
@@ -110,38 +111,13 @@ class ProjectiveOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Pixels of a source view, as the kernel takes them."""
+def points_of(view: SurfaceMap, stride: int) -> Float32:
+    """Every `stride`-th pixel of every `stride`-th row that has a plane, as the kernels take it.
 
-    points: Float32
-    normals: Float32
-    sigma: Float32
-    photo: Float32
-
-    @classmethod
-    def of(cls, view: SurfaceMap, stride: int) -> Points:
-        """Take every `stride`-th pixel of every `stride`-th row that has a plane.
-
-        The points lie on the fitted surface, as the target's do: what smoothing does to a curved
-        surface is then the same on both sides.
-        """
-        rows, columns = view.z.shape
-        most = -(-rows // stride) * -(-columns // stride)
-        points, normals, photo = (np.empty((most, 3), np.float32) for _ in range(3))
-        sigma = np.empty(most, np.float32)
-        n = kernels.gather(
-            view.rays,
-            view.planes,
-            view.plane_variance,
-            view.photo,
-            stride,
-            points,
-            normals,
-            sigma,
-            photo,
-        )
-        return cls(points[:n], normals[:n], sigma[:n], photo[:n])
+    The points lie on the fitted surface, as the target's do: what smoothing does to a curved
+    surface is then the same on both sides.
+    """
+    return kernels.gather(view.rays, view.planes, view.plane_variance, view.photo, stride)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,25 +234,29 @@ def align(
     iterations = 0
     converged = False
     weak = np.zeros((0, 6))
-    points = Points.of(source, options.levels[0].stride)
+    prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3)
+    points = points_of(source, options.levels[0].stride)
     if photometric:
         state.exposure = _seen_exposure(points, targets, T0) if exposure is None else exposure
-    if len(points.sigma):
-        state.most = max(3.0, options.most_sigma_m / float(np.median(points.sigma)))
+    if len(points):
+        sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
+        middle = len(sigma) // 2
+        state.most = max(3.0, options.most_sigma_m / float(np.partition(sigma, middle)[middle]))
     for number, level in enumerate(options.levels):
-        if number:
-            points = Points.of(source, level.stride)
+        if number and level.stride != options.levels[number - 1].stride:
+            points = points_of(source, level.stride)
         doubt = None
         for _ in range(level.iterations):
             state.total = _sum(points, targets, state, level, options, photometric)
             iterations += 1
-            H, g, C = kernels.normal_equations(state.total, photometric)
             if number > 0:  # at the coarsest level the views are not yet where they belong
                 if doubt is None:
                     doubt = _doubt(points, state, level, options, photometric)
-                weak = _weak_directions(_without_exposure(C) - doubt, options.held)
-            step = _step(H, g, state, weak, T_world_predicted, options)
-            state.T = kernels.moved(state.T, step[:6])
+                cross = steps.cross_information(state.total) - doubt
+                weak = steps.weak_directions(cross, UNITS, options.held)
+            state.T, step = steps.advance(
+                state.total, state.T, T_world_predicted, weak, prior, UNITS
+            )
             if photometric:
                 state.exposure += step[6]
             _rescale(state, level, photometric)
@@ -285,16 +265,15 @@ def align(
             if size < options.tolerance:
                 break
     total = state.total
-    H, _, C = kernels.normal_equations(total, photometric)
     inliers = total[kernels.INLIERS]
     return Aligned(
         T_world_source=state.T,
         converged=converged,
         iterations=iterations,
-        information=_without_exposure(H),
-        cross=_without_exposure(C) - (np.zeros((6, 6)) if doubt is None else doubt),
+        information=steps.information(total),
+        cross=steps.cross_information(total) - (np.zeros((6, 6)) if doubt is None else doubt),
         unobservable=weak,
-        points=len(points.points) * len(targets),
+        points=len(points) * len(targets),
         landed=int(total[kernels.LANDED]),
         compared=int(total[kernels.COMPARED]),
         inliers=int(inliers),
@@ -306,13 +285,13 @@ def align(
         photometric=photometric and bool(total[kernels.COUNT_P] > 0),
         score=float(
             (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
-            / max(len(points.points), 1)
+            / max(len(points), 1)
         ),
     )
 
 
 def _sum(
-    points: Points,
+    points: Float32,
     targets: Sequence[Target],
     state: _State,
     level: Level,
@@ -320,20 +299,14 @@ def _sum(
     photometric: bool,
 ) -> Float64:
     total = np.zeros(kernels.SIZE)
-    n = len(points.points)
     for target in targets:
         view = target.view
         T = np.ascontiguousarray(target.T_target_world @ state.T)
 
         def work(a: int, b: int, view: SurfaceMap = view, T: Float64 = T) -> Float64:
             return kernels.accumulate(
-                points.points,
-                points.normals,
-                points.sigma,
-                points.photo,
-                view.planes,
-                view.plane_variance,
-                view.photo,
+                points,
+                view.target,
                 view.projection.lookup,
                 view.projection.frame,
                 T,
@@ -342,109 +315,53 @@ def _sum(
                 state.scale_p if photometric else 0.0,
                 level.slack_m,
                 options.robust,
-                float(np.cos(options.max_angle)),
+                math.cos(options.max_angle),
                 a,
                 b,
             )
 
-        for part in run_chunks(work, n, max(1, n // _CHUNK_POINTS)):
+        for part in run_chunks(work, len(points), max(1, len(points) // _CHUNK_POINTS)):
             total += part
     return total
 
 
-def _seen_exposure(points: Points, targets: Sequence[Target], T: Float64) -> float:
+def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
     """Median difference in log albedo, from some of the points, before they are aligned."""
-    some = slice(None, None, max(1, len(points.points) // _DOUBT_POINTS))
+    every = max(1, len(points) // _SOME_POINTS)
     seen = []
     for target in targets:
         view = target.view
-        moved = se3.transform(target.T_target_world @ T, points.points[some])
-        ahead = moved[:, 2] > 0.02
-        moved, light = moved[ahead], points.photo[some][ahead, 0]
-        x0, y0, per_x, per_y = view.projection.frame
-        nodes = np.rint((moved[:, :2] / moved[:, 2:] - [x0, y0]) * [per_x, per_y])
-        lookup = view.projection.lookup
-        u, v = np.clip(nodes, 0, [lookup.shape[1] - 1, lookup.shape[0] - 1]).astype(int).T
-        pixel = np.rint(lookup[v, u])
-        rows, columns = view.z.shape
-        inside = (pixel >= 0).all(1) & (pixel[:, 0] < columns) & (pixel[:, 1] < rows)
-        j, i = pixel[inside].astype(int).T
-        found = view.photo[i, j, 0] - light[inside]
-        seen.append(found[np.isfinite(found)])
+        moved = np.ascontiguousarray(target.T_target_world @ T)
+        grid = view.projection
+        seen.append(
+            kernels.exposure_differences(points, every, view.target, grid.lookup, grid.frame, moved)
+        )
     both = np.concatenate(seen) if seen else np.zeros(0)
     return float(np.median(both)) if len(both) else 0.0
 
 
-def _without_exposure(H: Float64) -> Float64:
-    """Marginalise the seventh unknown."""
-    if H[6, 6] <= 0:
-        return H[:6, :6]
-    return H[:6, :6] - np.outer(H[:6, 6], H[6, :6]) / H[6, 6]
-
-
 def _doubt(
-    points: Points, state: _State, level: Level, options: ProjectiveOptions, photometric: bool
+    points: Float32, state: _State, level: Level, options: ProjectiveOptions, photometric: bool
 ) -> Float64:
     """(6, 6) information that errors fixed to the camera can fake; from some of the points."""
-    n = len(points.points)
-    some = slice(None, None, max(1, n // _DOUBT_POINTS))
-    p, normals = points.points[some], points.normals[some]
-    along = (p * normals).sum(1) / p[:, 2]
-    variance = 2 * (along * points.sigma[some] * state.scale_g) ** 2 + level.slack_m**2
     faked = faked_information(
-        p,
-        normals,
-        variance,
+        points,
+        max(1, len(points) // _SOME_POINTS),
+        state.scale_g,
+        level.slack_m,
         state.scale_p**2 if photometric else 0.0,
-        np.isfinite(points.photo[some, 1]),
         options.common_tilt,
         options.common_slope,
     )
-    return faked * state.total[kernels.INLIERS] / max(len(p), 1)
-
-
-def _weak_directions(cross: Float64, held: float) -> Float64:
-    """Unit directions, in units of 1 cm and 1 degree, whose sigma is above `held` units."""
-    scaled = cross * np.outer(UNITS, UNITS)
-    values, vectors = np.linalg.eigh(scaled)
-    return vectors[:, values < 1 / (held * held)].T
-
-
-def _step(
-    H: Float64,
-    g: Float64,
-    state: _State,
-    weak: Float64,
-    T_predicted: Float64,
-    options: ProjectiveOptions,
-) -> Float64:
-    scale = np.append(UNITS, 1.0)
-    A = H * np.outer(scale, scale)
-    b = g * scale
-    prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3) / UNITS
-    away = kernels.twist_between(T_predicted, state.T) / UNITS
-    A[np.arange(6), np.arange(6)] += 1 / prior**2
-    b[:6] += away / prior**2
-    if len(weak):
-        # What the data does not hold is held at the prediction, far more firmly than noise can.
-        firm = 1e3 * max(float(np.trace(A[:6, :6])), 1.0)
-        P = weak.T @ weak
-        A[:6, :6] += firm * P
-        b[:6] += firm * (P @ away)
-    return -np.linalg.solve(A, b) * scale
+    return faked * state.total[kernels.INLIERS]
 
 
 def _rescale(state: _State, level: Level, photometric: bool) -> None:
     """Take the sigmas from the residuals: the views show only their own noise, not their bias."""
     t = state.total
-    counts = t[kernels.HISTOGRAM : kernels.HISTOGRAM + kernels.BINS]
-    if counts.sum() > 0:
-        # Of all that was compared, not of what fitted: a scale from inliers would confirm itself.
-        share = np.cumsum(counts) / counts.sum()
-        k = int(np.searchsorted(share, 0.5))
-        below = share[k - 1] if k else 0.0
-        median = 2 ** ((k - 16 + (0.5 - below) / max(share[k] - below, 1e-9)) / 4)
-        state.scale_g = float(np.clip(1.48 * median, 0.7, state.most))
+    seen = steps.scale_of_distances(t)
+    if not math.isnan(seen):
+        state.scale_g = min(max(seen, 0.7), state.most)
     if photometric and t[kernels.WEIGHT_P] > 0:
-        seen = np.sqrt(t[kernels.SQUARES_P] / t[kernels.WEIGHT_P] / 0.72)
-        state.scale_p = float(np.clip(np.hypot(seen, level.photo_slack), 0.005, 0.5))
+        seen = math.sqrt(t[kernels.SQUARES_P] / t[kernels.WEIGHT_P] / 0.72)
+        state.scale_p = min(max(math.hypot(seen, level.photo_slack), 0.005), 0.5)

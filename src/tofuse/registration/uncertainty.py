@@ -135,15 +135,12 @@ def patches(
     rows, columns = source.z.shape
     stride = max(1, round(float(np.sqrt(rows * columns / _PIXELS))))
     across, down = options.tiles
-    inverse_z = source.planes[..., 3]
-    known = inverse_z > 0
-    z = np.divide(1, inverse_z, out=np.zeros_like(inverse_z), where=known)
-    sigma = np.sqrt(source.plane_variance) * z * z
     photometric = (
         alignment.photometric and source.has_photo and all(t.view.has_photo for t in targets)
     )
-    found = z[known]
-    depth = float(np.median(found)) if len(found) else 1.0
+    some = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
+    some = some[some > 0]
+    depth = 1 / float(np.partition(some, len(some) // 2)[len(some) // 2]) if len(some) else 1.0
     sums = []
     changes = []
     for target in targets:
@@ -153,14 +150,11 @@ def patches(
 
         def work(a: int, b: int, view: SurfaceMap = view, T: Float64 = T) -> Float64:
             return kernels.tile_sums(
-                z,
                 source.rays,
-                source.normals,
-                sigma,
+                source.planes,
+                source.plane_variance,
                 source.photo,
-                view.planes,
-                view.plane_variance,
-                view.photo,
+                view.target,
                 view.projection.lookup,
                 view.projection.frame,
                 T,

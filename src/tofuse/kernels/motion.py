@@ -1,0 +1,97 @@
+"""Rigid motions inside kernels: the exponential map and its inverse."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float64 = NDArray[np.float64]
+
+
+@kernel
+def moved(T: Float64, xi: Float64) -> Float64:
+    """T * exp(xi), (4, 4), with the rotation brought back to orthogonality to first order."""
+    w0, w1, w2 = xi[3], xi[4], xi[5]
+    angle2 = w0 * w0 + w1 * w1 + w2 * w2
+    angle = np.sqrt(angle2)
+    if angle < 1e-4:
+        s1 = 1 - angle2 / 6
+        s2 = 0.5 - angle2 / 24
+        s3 = 1.0 / 6 - angle2 / 120
+    else:
+        s1 = np.sin(angle) / angle
+        s2 = (1 - np.cos(angle)) / angle2
+        s3 = (angle - np.sin(angle)) / (angle2 * angle)
+    W = np.zeros((3, 3))
+    W[0, 1], W[0, 2] = -w2, w1
+    W[1, 0], W[1, 2] = w2, -w0
+    W[2, 0], W[2, 1] = -w1, w0
+    R = np.zeros((3, 3))
+    V = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            square = 0.0
+            for k in range(3):
+                square += W[i, k] * W[k, j]
+            one = 1.0 if i == j else 0.0
+            R[i, j] = one + s1 * W[i, j] + s2 * square
+            V[i, j] = one + s2 * W[i, j] + s3 * square
+    out = np.zeros((4, 4))
+    for i in range(3):
+        out[i, 3] = T[i, 3]
+        for j in range(3):
+            step = 0.0
+            for k in range(3):
+                out[i, j] += T[i, k] * R[k, j]
+                step += V[j, k] * xi[k]
+            out[i, 3] += T[i, j] * step
+    # One Newton step towards orthogonality: R (3 - R^T R) / 2.
+    G = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                G[i, j] += out[k, i] * out[k, j]
+    fixed = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                h = (3.0 if k == j else 0.0) - G[k, j]
+                fixed[i, j] += 0.5 * out[i, k] * h
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = fixed[i, j]
+    out[3, 3] = 1
+    return out
+
+
+@kernel
+def twist_between(A: Float64, B: Float64) -> Float64:
+    """Logarithm (6,) of A^-1 B, for rotations well below half a turn."""
+    R = np.zeros((3, 3))
+    t = np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            t[i] += A[k, i] * (B[k, 3] - A[k, 3])
+            for j in range(3):
+                R[i, j] += A[k, i] * B[k, j]
+    w0 = R[2, 1] - R[1, 2]
+    w1 = R[0, 2] - R[2, 0]
+    w2 = R[1, 0] - R[0, 1]
+    sine = 0.5 * np.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
+    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    factor = 0.5 * (angle / sine if sine > 1e-9 else 1.0)
+    w0, w1, w2 = factor * w0, factor * w1, factor * w2
+    if angle < 0.02:
+        c = 1.0 / 12 + angle * angle / 720
+    else:
+        c = 1.0 / (angle * angle) - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
+    # The inverse left Jacobian: 1 - W / 2 + c W^2.
+    a0, a1, a2 = w1 * t[2] - w2 * t[1], w2 * t[0] - w0 * t[2], w0 * t[1] - w1 * t[0]
+    out = np.empty(6)
+    out[0] = t[0] - 0.5 * a0 + c * (w1 * a2 - w2 * a1)
+    out[1] = t[1] - 0.5 * a1 + c * (w2 * a0 - w0 * a2)
+    out[2] = t[2] - 0.5 * a2 + c * (w0 * a1 - w1 * a0)
+    out[3], out[4], out[5] = w0, w1, w2
+    return out
