@@ -1,0 +1,411 @@
+"""Exhaustive search for the pose between two range images, and what both images say of a pose.
+
+Images are pinhole grids here: (H, W, 4) holds the unit normal away from the camera and the
+distance n . p of the plane seen along each node's ray; where only a depth is known, 0, 0, 0 and
+its negative; all 0 where nothing is known. The frame (x0, y0, 1/dx, 1/dy) tells the ray
+coordinates of the nodes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.alignment import moved
+from tofuse.kernels.jit import kernel
+from tofuse.kernels.projection import jacobian_row, landing
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Nearer than this, a point has no place in an image, m.
+_NEAREST = 0.05
+# Layout of what `agree` returns.
+LANDED = 0
+COMPARED = 1
+SUPPORT = 2
+VIOLATION = 3
+SQUARES_M = 4
+AGREE_SIZE = 5
+
+
+@kernel
+def _judged(
+    points: Float32,
+    normals: Float32,
+    grid: Float32,
+    frame: Float64,
+    tx: float,
+    ty: float,
+    tz: float,
+    reach: float,
+) -> float:
+    """Support less twice the free-space violation, of points that are turned already."""
+    rows, columns = grid.shape[0], grid.shape[1]
+    x0, y0, sx, sy = frame[0], frame[1], frame[2], frame[3]
+    top, left = columns - 0.5, rows - 0.5
+    per2 = 1.0 / (reach * reach)
+    total = 0.0
+    for k in range(points.shape[0]):
+        z = points[k, 2] + tz
+        if z <= _NEAREST:
+            continue
+        x = points[k, 0] + tx
+        y = points[k, 1] + ty
+        inverse = 1.0 / z
+        u = (x * inverse - x0) * sx
+        v = (y * inverse - y0) * sy
+        if not (u > -0.5 and v > -0.5 and u < top and v < left):
+            continue
+        i = int(v + 0.5)
+        j = int(u + 0.5)
+        d = grid[i, j, 3]
+        if d <= 0:
+            if d < 0 and z < -d - reach:
+                total -= 2.0
+            continue
+        r = grid[i, j, 0] * x + grid[i, j, 1] * y + grid[i, j, 2] * z - d
+        if r < -reach:
+            total -= 2.0
+        elif r < reach:
+            c = (
+                grid[i, j, 0] * normals[k, 0]
+                + grid[i, j, 1] * normals[k, 1]
+                + grid[i, j, 2] * normals[k, 2]
+            )
+            if c > 0:
+                total += c * (1.0 - r * r * per2)
+    return total
+
+
+@kernel
+def score_grid(
+    source_points: Float32,
+    source_normals: Float32,
+    target_points: Float32,
+    target_normals: Float32,
+    source_grid: Float32,
+    source_frame: Float64,
+    target_grid: Float32,
+    target_frame: Float64,
+    rotations: Float64,
+    translations: Float64,
+    reach: float,
+    scores: Float32,
+    start: int,
+    stop: int,
+) -> None:
+    """Score the translations that go with the rotations start..stop, two-way.
+
+    Parameters
+    ----------
+    source_points, source_normals, target_points, target_normals
+        (N, 3) and (M, 3), each in the frame of its own camera.
+    source_grid, source_frame, target_grid, target_frame
+        The images.
+    rotations, translations
+        (A, 3, 3), and (A, B, 3) those that go with each or (1, B, 3) with all: T_target_source.
+    reach
+        Distance of a plane within which a point supports the pose, m; nearer than the surface by
+        more than that, it stands where the camera saw through.
+    scores
+        (A, B), written: support less twice the violations, as a share of all points.
+    """
+    n, m = source_points.shape[0], target_points.shape[0]
+    P = np.empty((n, 3), np.float32)
+    PN = np.empty((n, 3), np.float32)
+    Q = np.empty((m, 3), np.float32)
+    QN = np.empty((m, 3), np.float32)
+    share = 1.0 / max(n + m, 1)
+    for a in range(start, stop):
+        R = rotations[a]
+        for k in range(n):
+            for i in range(3):
+                P[k, i] = (
+                    R[i, 0] * source_points[k, 0]
+                    + R[i, 1] * source_points[k, 1]
+                    + R[i, 2] * source_points[k, 2]
+                )
+                PN[k, i] = (
+                    R[i, 0] * source_normals[k, 0]
+                    + R[i, 1] * source_normals[k, 1]
+                    + R[i, 2] * source_normals[k, 2]
+                )
+        for k in range(m):
+            for i in range(3):
+                Q[k, i] = (
+                    R[0, i] * target_points[k, 0]
+                    + R[1, i] * target_points[k, 1]
+                    + R[2, i] * target_points[k, 2]
+                )
+                QN[k, i] = (
+                    R[0, i] * target_normals[k, 0]
+                    + R[1, i] * target_normals[k, 1]
+                    + R[2, i] * target_normals[k, 2]
+                )
+        row = min(a, translations.shape[0] - 1)
+        for b in range(translations.shape[1]):
+            t = translations[row, b]
+            total = _judged(P, PN, target_grid, target_frame, t[0], t[1], t[2], reach)
+            # The inverse moves by -R^T t.
+            sx = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
+            sy = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
+            sz = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
+            total += _judged(Q, QN, source_grid, source_frame, sx, sy, sz, reach)
+            scores[a, b] = total * share
+
+
+@kernel
+def _pull(
+    points: Float32,
+    normals: Float32,
+    grid: Float32,
+    frame: Float64,
+    T: Float64,
+    forward: bool,
+    reach: float,
+    min_cosine: float,
+    H: Float64,
+    g: Float64,
+) -> None:
+    """Add one way of the point-to-plane equations of the right perturbation of T_target_source.
+
+    Forward, the points are the source's; else they are the target's, and T is still
+    T_target_source.
+    """
+    rows, columns = grid.shape[0], grid.shape[1]
+    x0, y0, sx, sy = frame[0], frame[1], frame[2], frame[3]
+    J = np.empty(6)
+    A = np.empty((3, 3))
+    t = np.empty(3)
+    for i in range(3):
+        t[i] = 0.0
+        for j in range(3):
+            A[i, j] = T[i, j] if forward else T[j, i]
+    for i in range(3):
+        if forward:
+            t[i] = T[i, 3]
+        else:
+            t[i] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
+    per2 = 1.0 / (reach * reach)
+    for k in range(points.shape[0]):
+        px = np.float64(points[k, 0])
+        py = np.float64(points[k, 1])
+        pz = np.float64(points[k, 2])
+        z = A[2, 0] * px + A[2, 1] * py + A[2, 2] * pz + t[2]
+        if z <= _NEAREST:
+            continue
+        x = A[0, 0] * px + A[0, 1] * py + A[0, 2] * pz + t[0]
+        y = A[1, 0] * px + A[1, 1] * py + A[1, 2] * pz + t[1]
+        u = (x / z - x0) * sx
+        v = (y / z - y0) * sy
+        if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+            continue
+        i = int(v + 0.5)
+        j = int(u + 0.5)
+        d = np.float64(grid[i, j, 3])
+        if d <= 0:
+            continue
+        n0 = np.float64(grid[i, j, 0])
+        n1 = np.float64(grid[i, j, 1])
+        n2 = np.float64(grid[i, j, 2])
+        r = n0 * x + n1 * y + n2 * z - d
+        e2 = r * r * per2
+        if e2 >= 1:
+            continue
+        # The plane's normal where the point came from.
+        m0 = A[0, 0] * n0 + A[1, 0] * n1 + A[2, 0] * n2
+        m1 = A[0, 1] * n0 + A[1, 1] * n1 + A[2, 1] * n2
+        m2 = A[0, 2] * n0 + A[1, 2] * n1 + A[2, 2] * n2
+        if m0 * normals[k, 0] + m1 * normals[k, 1] + m2 * normals[k, 2] < min_cosine:
+            continue
+        w = (1 - e2) * (1 - e2)
+        if forward:
+            jacobian_row(J, m0, m1, m2, px, py, pz)
+        else:
+            # T exp(xi) moves a target's point by exp(-xi) in the source frame.
+            jacobian_row(J, -n0, -n1, -n2, x, y, z)
+        for p in range(6):
+            g[p] += w * J[p] * r
+            for o in range(p, 6):
+                H[p, o] += w * J[p] * J[o]
+
+
+@kernel
+def _solve(H: Float64, g: Float64) -> Float64:
+    """Solve the symmetric H x = -g, (6, 6), from its upper triangle, by Cholesky."""
+    L = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(i + 1):
+            s = H[j, i]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                L[i, i] = np.sqrt(max(s, 1e-12))
+            else:
+                L[i, j] = s / L[j, j]
+    x = np.empty(6)
+    for i in range(6):
+        s = -g[i]
+        for k in range(i):
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
+    for i in range(5, -1, -1):
+        s = x[i]
+        for k in range(i + 1, 6):
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
+    return x
+
+
+@kernel
+def settle(
+    source_points: Float32,
+    source_normals: Float32,
+    target_points: Float32,
+    target_normals: Float32,
+    source_grid: Float32,
+    source_frame: Float64,
+    target_grid: Float32,
+    target_frame: Float64,
+    reaches: Float64,
+    min_cosine: float,
+    unit_m: float,
+    poses: Float64,
+    start: int,
+    stop: int,
+) -> None:
+    """Two-way projective point-to-plane ICP from the poses start..stop, which it overwrites.
+
+    Parameters
+    ----------
+    reaches
+        (I,) for each iteration the distance beyond which a point counts nothing (Tukey), m.
+    min_cosine
+        Smallest cosine between normals.
+    unit_m
+        Metres that go with one radian, so that what the data leaves open is damped evenly.
+    poses
+        (N, 4, 4) T_target_source.
+    """
+    H = np.empty((6, 6))
+    g = np.empty(6)
+    for c in range(start, stop):
+        T = poses[c].copy()
+        for reach in reaches:
+            H[:] = 0
+            g[:] = 0
+            _pull(
+                source_points,
+                source_normals,
+                target_grid,
+                target_frame,
+                T,
+                True,
+                reach,
+                min_cosine,
+                H,
+                g,
+            )
+            _pull(
+                target_points,
+                target_normals,
+                source_grid,
+                source_frame,
+                T,
+                False,
+                reach,
+                min_cosine,
+                H,
+                g,
+            )
+            damping = 1e-3 * (H[0, 0] + H[1, 1] + H[2, 2]) + 1e-9
+            for p in range(3):
+                H[p, p] += damping
+                H[p + 3, p + 3] += damping * unit_m * unit_m
+            T = moved(T, _solve(H, g))
+        poses[c] = T
+
+
+@kernel
+def agree(
+    points: Float32,
+    normals: Float32,
+    sigma: Float32,
+    planes: Float32,
+    plane_variance: Float32,
+    nearest: Float32,
+    lookup: Float32,
+    lookup_frame: Float64,
+    T: Float64,
+    sigmas: float,
+    floor_m: float,
+    floor_share: float,
+    min_cosine: float,
+    start: int,
+    stop: int,
+) -> Float64:
+    """Count what an image says of the points start..stop of another one under a pose.
+
+    Parameters
+    ----------
+    points, normals, sigma
+        (N, 3) m, (N, 3) unit, (N,) sigma of z in m.
+    planes, plane_variance, lookup, lookup_frame
+        Of the image, as `alignment.accumulate` takes them.
+    nearest
+        (H, W) least depth that the image may have at a pixel, m, 0 where unknown: says what was
+        seen through where no plane is known.
+    T
+        (4, 4) from the points' frame to the image's.
+    sigmas, floor_m, floor_share
+        A point supports the pose within so many sigmas, plus metres, plus a share of its depth;
+        it violates free space if it is nearer than the surface by twice that.
+    min_cosine
+        Smallest cosine between the normals of points that support.
+    """
+    out = np.zeros(AGREE_SIZE)
+    rows, columns = planes.shape[0], planes.shape[1]
+    for k in range(start, stop):
+        px = np.float64(points[k, 0])
+        py = np.float64(points[k, 1])
+        pz = np.float64(points[k, 2])
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if z <= _NEAREST:
+            continue
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
+        if iu < 0:
+            continue
+        if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+            continue
+        out[LANDED] += 1
+        i = int(v + 0.5)
+        j = int(u + 0.5)
+        if planes[i, j, 3] <= 0:
+            limit = sigmas * np.float64(sigma[k]) + floor_m + floor_share * z
+            if nearest[i, j] > 0 and z < nearest[i, j] - 2 * limit:
+                out[VIOLATION] += 1
+            continue
+        out[COMPARED] += 1
+        a = np.float64(planes[i, j, 0])
+        b = np.float64(planes[i, j, 1])
+        c = np.float64(planes[i, j, 2])
+        length = np.sqrt(a * a + b * b + c * c)
+        r = (a * x + b * y + c * z - 1.0) / length
+        m0 = (T[0, 0] * a + T[1, 0] * b + T[2, 0] * c) / length
+        m1 = (T[0, 1] * a + T[1, 1] * b + T[2, 1] * c) / length
+        m2 = (T[0, 2] * a + T[1, 2] * b + T[2, 2] * c) / length
+        along = (m0 * px + m1 * py + m2 * pz) / pz
+        own = along * np.float64(sigma[k])
+        variance = own * own + np.float64(plane_variance[i, j]) / (length * length)
+        limit = sigmas * np.sqrt(variance) + floor_m + floor_share * z
+        if r < -2 * limit:
+            out[VIOLATION] += 1
+        elif abs(r) < limit and (
+            m0 * normals[k, 0] + m1 * normals[k, 1] + m2 * normals[k, 2] >= min_cosine
+        ):
+            out[SUPPORT] += 1
+            out[SQUARES_M] += r * r
+    return out

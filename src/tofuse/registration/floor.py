@@ -1,0 +1,134 @@
+"""The floor in a range image, or what else is horizontal and has nothing below it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.projective import Points
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FloorOptions:
+    """When a plane is taken for the floor.
+
+    Attributes
+    ----------
+    max_tilt
+        Largest angle between its normal and down, rad.
+    angle, band_m, band_share
+        How near to the plane a point and its normal must be: rad, m, and share of the depth.
+    min_share
+        Least share of the view's points on it.
+    below
+        Largest share of the view's points that may lie below it.
+    """
+
+    max_tilt: float = 0.9
+    angle: float = 0.15
+    band_m: float = 0.02
+    band_share: float = 0.01
+    min_share: float = 0.04
+    below: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in ("max_tilt", "angle", "band_m", "band_share", "min_share", "below"):
+            if not 0 <= getattr(self, name) <= 100:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 100")
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """A plane n . p = height with n (3,) pointing down; the share of the view's points on it."""
+
+    normal: Float64
+    height: float
+    share: float
+
+
+# Points that take part, and of them the planes that are tried.
+_POINTS, _TRIED = 1200, 200
+
+
+# Where down may be in an image of an unknown camera: below, or at a side of one mounted upright.
+_DOWN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+_KNOWN_TILT = np.radians(10.0)
+
+
+def find_floors(
+    views: tuple[SurfaceMap, SurfaceMap],
+    options: FloorOptions | None = None,
+    gravity: tuple[Float64, Float64] | None = None,
+) -> tuple[Floor, Floor] | None:
+    """Find the floor in two views of one camera, on the same side of both images, or None.
+
+    Parameters
+    ----------
+    gravity
+        (3,) directions in which things fall in the frames of the two views, where they are known;
+        the planes' normals must then be within 10 degrees of them.
+    """
+    options = FloorOptions() if options is None else options
+    if gravity is not None:
+        options = replace(options, max_tilt=min(options.max_tilt, _KNOWN_TILT))
+    for down in [gravity] if gravity is not None else [(d, d) for d in _DOWN]:
+        first = find_floor(views[0], down[0], options)
+        second = first and find_floor(views[1], down[1], options)
+        if first is not None and second is not None:
+            return first, second
+    return None
+
+
+def find_floor(view: SurfaceMap, down: Float64, options: FloorOptions) -> Floor | None:
+    """Find the largest plane across `down` (3,) that has nothing below it, or None."""
+    stride = max(1, round(float(np.sqrt(view.planar_share * view.z.size / _POINTS))))
+    seen = Points.of(view, stride)
+    p, n = seen.points.astype(float), seen.normals.astype(float)
+    if len(p) < 20:
+        return None
+    down = np.asarray(down, float) / np.linalg.norm(down)
+    least = np.cos(options.max_tilt)
+    facing = np.flatnonzero(n @ down > least)
+    if len(facing) < options.min_share * len(p):
+        return None
+    tried = facing[:: max(1, len(facing) // _TRIED)]
+    band = options.band_m + options.band_share * p[:, 2]
+    heights = (p[tried] * n[tried]).sum(1)
+    on = _on(p, n, band, n[tried], heights, options.angle)
+    # A table is larger than what is seen of the floor, but there is something below it.
+    lowest = (n[tried] @ p.T > heights[:, None] + 3 * band).mean(1) <= options.below
+    best = int(np.argmax(on.sum(1) * lowest))
+    for _ in range(3):  # the mean of what lies on it is better than one pixel
+        mine = on[best]
+        normal, height = _fit(p[mine], seen.sigma[mine])
+        on = _on(p, n, band, normal[None], np.array([height]), options.angle)
+        best = 0
+        if on[0].sum() < max(20, options.min_share * len(p)):
+            return None
+    below = np.count_nonzero(p @ normal > height + 3 * band)
+    if below > options.below * len(p) or normal @ down < least or height <= 0:
+        return None
+    return Floor(normal, height, float(on[0].mean()))
+
+
+def _on(
+    p: Float64, n: Float64, band: Float64, normals: Float64, heights: Float64, angle: float
+) -> NDArray[np.bool_]:
+    """(K, N) which points lie on each of K planes."""
+    near = np.abs(normals @ p.T - heights[:, None]) < band
+    return near & (normals @ n.T > np.cos(angle))
+
+
+def _fit(p: Float64, sigma: NDArray[np.float32]) -> tuple[Float64, float]:
+    """Weighted least squares plane, its normal away from the camera."""
+    w = 1 / np.maximum(sigma.astype(float), 1e-4) ** 2
+    mean = w @ p / w.sum()
+    q = (p - mean) * np.sqrt(w)[:, None]
+    normal = np.linalg.eigh(q.T @ q)[1][:, 0]
+    height = float(mean @ normal)
+    return (normal, height) if height > 0 else (-normal, -height)

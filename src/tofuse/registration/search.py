@@ -1,0 +1,445 @@
+"""Large steps between two range images: an exhaustive search, settled by what both images saw.
+
+Every pose of a coarse grid is scored on some hundred pixels of both images; the best ones are
+settled by two-way projective ICP, and chosen by `agreement`. Where both views see the floor, the
+grid is yaw and two translations; else it has all six dimensions. There is nothing random in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels import search as kernels
+from tofuse.kernels.threads import run_chunks
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.agreement import (
+    Agreement,
+    AgreementOptions,
+    agreement,
+    nearest_depth,
+    stride_for,
+)
+from tofuse.registration.floor import Floor, FloorOptions, find_floors
+from tofuse.registration.projective import Points
+from tofuse.registration.rough import with_rough_planes
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Mode = Literal["auto", "both", "planar", "full"]
+
+# Nodes of the grid on which an image is looked up, along its wider side.
+_GRID = 128
+# Points without which a view is not searched.
+_LEAST_POINTS = 50
+# The whole grid is scored on a third of the points, and the best so many times the candidates on
+# all.
+_COARSE_SHARE, _KEPT = 3, 200
+_CHUNKS = 16
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How far and how finely is searched.
+
+    Lengths are shares of the depth of the views (the mean of their medians), so that a room and a
+    box on a table are searched alike.
+
+    Attributes
+    ----------
+    mode
+        "planar" (yaw, and translation along the floor), "full" (six dimensions), "both" (planar
+        where both views see a floor, and full: slow, but the margin counts all rivals), or "auto"
+        (full only where there is no floor, or what the planar search finds does not convince).
+    yaw
+        Largest rotation about the vertical in the planar search, rad.
+    turn, roll
+        Largest rotation in the full search, and largest one about the line of sight, rad.
+    reach
+        Largest translation.
+    planar_yaw_step, planar_step
+        Steps of the planar grid, rad and share.
+    full_angle_step, full_step
+        Steps of the full grid.
+    planar_points, full_points
+        Pixels of each image that score the poses of the grid.
+    planar_candidates, full_candidates
+        How many of the grid's poses are settled.
+    settle_points
+        Pixels of each image that settle a candidate.
+    convincing
+        Least score with which "auto" leaves it at the planar search.
+    distinct_m, distinct_rad
+        Poses that differ by more are different answers.
+    floor, agreement
+        How the floor is found, and the two images compared.
+    """
+
+    mode: Mode = "auto"
+    yaw: float = 1.1
+    turn: float = 0.9
+    roll: float = 0.5
+    reach: float = 0.6
+    planar_yaw_step: float = 0.07
+    planar_step: float = 0.06
+    full_angle_step: float = 0.13
+    full_step: float = 0.1
+    planar_points: int = 200
+    full_points: int = 150
+    planar_candidates: int = 20
+    full_candidates: int = 60
+    settle_points: int = 700
+    convincing: float = 0.4
+    distinct_m: float = 0.1
+    distinct_rad: float = 0.0873
+    floor: FloorOptions = field(default_factory=FloorOptions)
+    agreement: AgreementOptions = field(default_factory=AgreementOptions)
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise ValueError(f"mode is {self.mode!r}, not one of {', '.join(get_args(Mode))}")
+        for name in ("planar_yaw_step", "planar_step", "full_angle_step", "full_step"):
+            if not 0.005 <= getattr(self, name) <= 3.2:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0.005 to 3.2")
+        for name in ("yaw", "turn", "roll"):
+            if not 0 <= getattr(self, name) <= 3.1416:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 3.1416")
+        if not 0 <= self.reach <= 10:
+            raise ValueError(f"reach is {self.reach}, not 0 to 10")
+        for name in (
+            "planar_points",
+            "full_points",
+            "planar_candidates",
+            "full_candidates",
+            "settle_points",
+        ):
+            if not 1 <= getattr(self, name) <= 1_000_000:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
+        for name in ("convincing", "distinct_m", "distinct_rad"):
+            if not 0 <= getattr(self, name) <= 1e3:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose T_target_source (4, 4) and what both images say of it."""
+
+    T_target_source: Float64
+    agreement: Agreement
+
+    @property
+    def score(self) -> float:
+        """Support less twice the free-space violation, as a share of the points."""
+        return self.agreement.score
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What a search found.
+
+    Attributes
+    ----------
+    candidates
+        Distinct poses, the best first.
+    mode
+        Which search was made: "full" where the planar one did not suffice.
+    """
+
+    candidates: tuple[Candidate, ...]
+    mode: Literal["planar", "full"]
+
+    @property
+    def T_target_source(self) -> Float64:
+        """(4, 4) the best pose."""
+        return self.candidates[0].T_target_source
+
+    @property
+    def agreement(self) -> Agreement:
+        """What both images say of the best pose."""
+        return self.candidates[0].agreement
+
+    @property
+    def score(self) -> float:
+        """Of the best pose."""
+        return self.candidates[0].score
+
+    @property
+    def runner_up(self) -> Candidate | None:
+        """The second best distinct pose."""
+        return self.candidates[1] if len(self.candidates) > 1 else None
+
+    @property
+    def margin(self) -> float:
+        """By how much the best pose scores better than the runner-up.
+
+        A symmetric scene leaves little of it, whatever the score.
+        """
+        return self.score - (max(self.candidates[1].score, 0.0) if self.runner_up else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A view as the search takes it."""
+
+    grid: Float32
+    frame: Float64
+    points: Float32
+    normals: Float32
+    depth: float
+
+    def some(self, count: int, less: NDArray[np.bool_] | None = None) -> tuple[Float32, Float32]:
+        """About so many points and their normals, of those marked `less` only every fourth."""
+        keep = np.arange(len(self.points))
+        if less is not None:
+            keep = np.concatenate([keep[~less], keep[less][::4]])
+        keep = keep[np.linspace(0, len(keep) - 1, min(count, len(keep))).round().astype(int)]
+        return np.ascontiguousarray(self.points[keep]), np.ascontiguousarray(self.normals[keep])
+
+
+def search(
+    source: SurfaceMap,
+    target: SurfaceMap,
+    options: SearchOptions | None = None,
+    *,
+    gravity: tuple[Float64, Float64] | None = None,
+) -> Match | None:
+    """Find the pose between two views that may be far apart.
+
+    Parameters
+    ----------
+    gravity
+        (3,) directions in which things fall in the source's and in the target's frame, if known.
+
+    Returns
+    -------
+    Match or None
+        None where a view has too few surfaces to be searched with.
+    """
+    options = SearchOptions() if options is None else options
+    source, target = with_rough_planes(source), with_rough_planes(target)
+    s, t = _prepare(source), _prepare(target)
+    if min(len(s.points), len(t.points)) < _LEAST_POINTS:
+        return None
+    found: list[Candidate] = []
+    if options.mode != "full":
+        floors = find_floors((source, target), options.floor, gravity)
+        if floors is not None:
+            poses = _planar(s, t, floors[0], floors[1], options)
+            found = _settled(source, target, s, t, poses, options)
+        convinced = bool(found) and max(c.score for c in found) >= options.convincing
+        if options.mode == "planar" or (options.mode == "auto" and convinced):
+            return Match(_distinct(found, options), "planar") if found else None
+    found += _settled(source, target, s, t, _full(s, t, options), options)
+    return Match(_distinct(found, options), "full")
+
+
+def _prepare(view: SurfaceMap) -> _View:
+    """Look a view up on a pinhole grid."""
+    rays = view.rays[view.planes[..., 3] > 0]
+    if len(rays) < _LEAST_POINTS:
+        nothing = np.zeros((0, 3), np.float32)
+        return _View(np.zeros((1, 1, 4), np.float32), np.ones(4), nothing, nothing, 1.0)
+    rays = view.rays[view.z > 0]
+    low, high = rays.min(0).astype(float), rays.max(0).astype(float)
+    spacing = max(float((high - low).max()) / _GRID, 1e-6)
+    x, y = (np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True))
+    x0, y0, per_x, per_y = view.projection.frame
+    lookup = view.projection.lookup
+    fu = np.clip((x - x0) * per_x, 0, lookup.shape[1] - 1.001)[None, :]
+    fv = np.clip((y - y0) * per_y, 0, lookup.shape[0] - 1.001)[:, None]
+    i, j = fv.astype(int), fu.astype(int)
+    au, av = (fu - j)[..., None], (fv - i)[..., None]
+    pixel = (1 - av) * ((1 - au) * lookup[i, j] + au * lookup[i, j + 1]) + av * (
+        (1 - au) * lookup[i + 1, j] + au * lookup[i + 1, j + 1]
+    )
+    rows, columns = view.z.shape
+    pixel = np.rint(pixel)
+    inside = (pixel >= 0).all(-1) & (pixel[..., 0] < columns) & (pixel[..., 1] < rows)
+    u, v = np.where(inside[..., None], pixel, 0).astype(int).transpose(2, 0, 1)
+    abc = view.planes[v, u, :3].astype(float)
+    known = inside & (view.planes[v, u, 3] > 0)
+    length = np.maximum(np.sqrt((abc * abc).sum(-1)), 1e-12)
+    grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
+    grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
+    seen = Points.of(view, stride_for(view, 3000))
+    return _View(
+        grid.astype(np.float32),
+        np.array([x[0], y[0], 1 / spacing, 1 / spacing]),
+        seen.points,
+        seen.normals,
+        float(np.median(seen.points[:, 2])),
+    )
+
+
+def _planar(s: _View, t: _View, floor_s: Floor, floor_t: Floor, options: SearchOptions) -> Float64:
+    """Best poses of the planar grid, (N, 4, 4)."""
+    depth = 0.5 * (s.depth + t.depth)
+    to_s, to_t = _upright(floor_s.normal), _upright(floor_t.normal)
+    n = round(options.yaw / options.planar_yaw_step)
+    yaws = np.zeros((2 * n + 1, 3))
+    yaws[:, 1] = np.linspace(-n, n, 2 * n + 1) * options.planar_yaw_step
+    rotations = to_t.T @ se3.so3_exp(yaws) @ to_s
+    moves = _ball(options.planar_step * depth, options.reach * depth, (1.0, 0.0, 1.0))
+    moves[:, 1] = floor_t.height - floor_s.height
+    less = [
+        np.abs(v.points @ f.normal - f.height) < 0.02 + 0.02 * v.points[:, 2]
+        for v, f in ((s, floor_s), (t, floor_t))
+    ]
+    step = depth * max(options.planar_step, options.planar_yaw_step)
+    return _best(
+        _Scorer(s, t, less, step),
+        rotations,
+        moves @ to_t,
+        options.planar_points,
+        options.planar_candidates,
+    )
+
+
+def _full(s: _View, t: _View, options: SearchOptions) -> Float64:
+    """Best poses of the grid of six dimensions, (N, 4, 4)."""
+    depth = 0.5 * (s.depth + t.depth)
+    flat = options.roll / options.turn if options.turn else 1.0
+    rotations = se3.so3_exp(_ball(options.full_angle_step, options.turn, (1.0, 1.0, flat)))
+    moves = _ball(options.full_step * depth, options.reach * depth, (1.0, 1.0, 1.0))
+    step = depth * max(options.full_step, options.full_angle_step)
+    return _best(
+        _Scorer(s, t, [None, None], step),
+        rotations,
+        moves,
+        options.full_points,
+        options.full_candidates,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Scorer:
+    """Scores the poses of a grid whose steps move points by about `reach`, m."""
+
+    source: _View
+    target: _View
+    less: Sequence[NDArray[np.bool_] | None]
+    reach: float
+
+    def __call__(self, rotations: Float64, translations: Float64, points: int) -> Float32:
+        """(A, B) scores of each rotation with each translation; (A, 1) if there are as many."""
+        s, t = self.source, self.target
+        some = (*s.some(points, self.less[0]), *t.some(points, self.less[1]))
+        rotations, translations = (
+            np.ascontiguousarray(rotations),
+            np.ascontiguousarray(translations),
+        )
+        scores = np.empty((len(rotations), translations.shape[-2]), np.float32)
+        run_chunks(
+            lambda a, b: kernels.score_grid(
+                *some,
+                s.grid,
+                s.frame,
+                t.grid,
+                t.frame,
+                rotations,
+                translations,
+                self.reach,
+                scores,
+                a,
+                b,
+            ),
+            len(rotations),
+            _CHUNKS,
+        )
+        return scores
+
+
+def _best(
+    scorer: _Scorer, rotations: Float64, translations: Float64, points: int, count: int
+) -> Float64:
+    """Score a grid and return its `count` best poses, (N, 4, 4); of neighbours only the best."""
+    scores = scorer(rotations, translations[None], max(1, points // _COARSE_SHARE)).ravel()
+    most = min(len(scores), _KEPT * count)
+    top = np.sort(np.argpartition(-scores, most - 1)[:most])
+    R, x = rotations[top // len(translations)], translations[top % len(translations)]
+    finer = scorer(R, x[:, None], points)[:, 0]
+    order = np.lexsort((top, -finer))
+    R, x = R[order], x[order]
+    depth = 0.5 * (scorer.source.depth + scorer.target.depth)
+    chosen: list[int] = []
+    free = np.ones(len(top), bool)
+    for k in range(len(top)):
+        if not free[k]:
+            continue
+        chosen.append(k)
+        if len(chosen) == count:
+            break
+        turned = np.sqrt(np.maximum(3 - np.einsum("ij,kij->k", R[k], R), 0))  # about the angle
+        moved = np.linalg.norm(x - x[k], axis=1)
+        free &= turned * depth + moved > 1.5 * scorer.reach
+    poses = np.tile(np.eye(4), (len(chosen), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = R[chosen], x[chosen]
+    return poses
+
+
+def _settled(
+    source: SurfaceMap,
+    target: SurfaceMap,
+    s: _View,
+    t: _View,
+    poses: Float64,
+    options: SearchOptions,
+) -> list[Candidate]:
+    """Settle poses by two-way ICP, and judge them."""
+    depth = 0.5 * (s.depth + t.depth)
+    a = options.agreement
+    floor = 3 * (a.floor_m + a.floor_share * depth)
+    reaches = np.maximum(0.25 * depth * 0.8 ** np.arange(18), floor)
+    points = (*s.some(options.settle_points), *t.some(options.settle_points))
+    cosine = float(np.cos(a.max_angle))
+    run_chunks(
+        lambda i, j: kernels.settle(
+            *points, s.grid, s.frame, t.grid, t.frame, reaches, cosine, depth, poses, i, j
+        ),
+        len(poses),
+        _CHUNKS,
+    )
+    return [Candidate(T, agreement(source, target, T, a)) for T in poses]
+
+
+def _distinct(found: list[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:
+    """Order candidates, the best first, and leave out those that are nearly a better one."""
+    distinct: list[Candidate] = []
+    for candidate in sorted(found, key=lambda candidate: -candidate.score):
+        if all(_differ(candidate, other, options) for other in distinct):
+            distinct.append(candidate)
+    return tuple(distinct)
+
+
+def _differ(a: Candidate, b: Candidate, options: SearchOptions) -> bool:
+    between = se3.inverse(a.T_target_source) @ b.T_target_source
+    return bool(
+        np.linalg.norm(between[:3, 3]) > options.distinct_m
+        or se3.angle(between) > options.distinct_rad
+    )
+
+
+def _upright(down: Float64) -> Float64:
+    """(3, 3) the smallest rotation that turns `down` to +y."""
+    y = np.array([0.0, 1.0, 0.0])
+    axis = np.cross(down, y)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        return np.eye(3)
+    return se3.so3_exp(axis / sine * np.arctan2(sine, float(down @ y)))
+
+
+def _ball(step: float, radius: float, shape: tuple[float, float, float]) -> Float64:
+    """(N, 3) nodes of a cubic grid in a ball that is squeezed by `shape` along each axis."""
+    axes = []
+    for squeeze in shape:
+        n = int(radius * squeeze / step + 1e-9)
+        axes.append(np.arange(-n, n + 1) * step)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    half = [max(radius * squeeze, step) for squeeze in shape]
+    return nodes[((nodes / half) ** 2).sum(1) <= 1 + 1e-9]
