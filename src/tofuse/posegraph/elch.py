@@ -1,0 +1,112 @@
+"""Explicit loop closing heuristics (Sprickerhof et al. 2009): each loop's error is handed round.
+
+The error of a loop is spread over the poses along it in proportion to the distance in the graph,
+whose edges are as long as their measurement is uncertain. Nothing is minimised, so it is quick.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+
+from tofuse.geometry import se3
+from tofuse.parts import part
+from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
+from tofuse.posegraph.levenberg import check_graph
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+_LEAST = 1e-12  # of the largest: no edge is so certain that it has no length
+
+
+@part("optimiser", "elch", label="validated")
+@dataclass(frozen=True)
+class Elch(Optimiser):
+    """Close one loop after another, in the order in which the camera came round.
+
+    Positions are moved in proportion, and orientations turned by slerp, with distances of their
+    own: the traces of the edges' covariances of translation and of rotation. A pose off the loop
+    moves with the pose of the loop that it hangs on. A closed loop is an edge of the graph for
+    those after it. The first vertex stays where it is. Gravity and anchors are not used.
+    """
+
+    def optimise(self, graph: PoseGraph) -> Optimisation:
+        """See `Optimiser.optimise`; logged is the sum of weighted squared errors.
+
+        It is lowered by no promise. Raises InputError for what is not finite or not positive.
+        """
+        check_graph(graph)
+        lengths = _lengths(graph)
+        poses = graph.poses.copy()
+        known = ~graph.loop
+        history = [graph.chi2()]
+        order = np.flatnonzero(graph.loop)
+        order = order[np.argsort(graph.edges[order].max(axis=1), kind="stable")]
+        for loop in map(int, order):
+            share = [_shares(graph, length, known, loop) for length in lengths]
+            if share[0] is not None and share[1] is not None:
+                poses = _spread(poses, graph, loop, share[0], share[1])
+                history.append(graph.with_poses(poses).chi2())
+            known[loop] = True
+        if len(poses):
+            poses = graph.poses[0] @ se3.inverse(poses[0]) @ poses
+            poses[0] = graph.poses[0]
+        return Optimisation(graph.with_poses(se3.orthonormalise(poses)), tuple(history), True)
+
+
+def _lengths(graph: PoseGraph) -> tuple[Float64, Float64]:
+    """Traces of the covariances of translation (m^2) and of rotation (rad^2), (M,) each."""
+    C = np.linalg.pinv(graph.information, hermitian=True)
+    diagonal = np.diagonal(C, axis1=1, axis2=2)
+    out = []
+    for part_of in (diagonal[:, :3], diagonal[:, 3:]):
+        length = part_of.sum(axis=1)
+        out.append(np.maximum(length, _LEAST * length.max(initial=1e-300)))
+    return out[0], out[1]
+
+
+def _shares(
+    graph: PoseGraph, length: Float64, known: NDArray[np.bool_], loop: int
+) -> Float64 | None:
+    """(N,) share of the loop's error that each pose takes, 0 to 1; None where it closes nothing."""
+    n = len(graph.ids)
+    start, end = graph.edges[loop]
+    i, j = graph.edges[known].T
+    # Of several edges between two poses the shortest counts, and the sparse matrix would add them.
+    order = np.lexsort((length[known], np.maximum(i, j), np.minimum(i, j)))
+    low, high, value = np.minimum(i, j)[order], np.maximum(i, j)[order], length[known][order]
+    first = np.ones(len(order), bool)
+    first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+    links = sparse.csr_matrix((value[first], (low[first], high[first])), shape=(n, n))
+    distance, before = dijkstra(links, directed=False, indices=start, return_predecessors=True)
+    if not np.isfinite(distance[end]):
+        return None
+    path = [int(end)]
+    while path[-1] != start:
+        path.append(int(before[path[-1]]))
+    on_path = np.array(path)
+    _, _, nearest = dijkstra(
+        links, directed=False, indices=on_path, min_only=True, return_predecessors=True
+    )
+    share = np.zeros(n)
+    reached = nearest >= 0
+    share[reached] = (distance / distance[end])[nearest[reached]]
+    share[on_path] = distance[on_path] / distance[end]
+    return share
+
+
+def _spread(poses: Float64, graph: PoseGraph, loop: int, slide: Float64, turn: Float64) -> Float64:
+    """Move every pose by its shares of what brings the loop's end to where it was measured."""
+    i, j = graph.edges[loop]
+    wanted = poses[i] @ graph.measurements[loop]
+    shift = wanted[:3, 3] - poses[j, :3, 3]
+    rotation = se3.so3_log(wanted[:3, :3] @ poses[j, :3, :3].T)
+    out = poses.copy()
+    out[:, :3, 3] += slide[:, None] * shift
+    out[:, :3, :3] = se3.so3_exp(turn[:, None] * rotation) @ poses[:, :3, :3]
+    return out

@@ -1,0 +1,110 @@
+"""Global relaxation in six dimensions, after Lu and Milios (1997) and Borrmann et al. (2008).
+
+Each edge says by how much its two poses should move against each other: D_ij, a small motion in
+the world's frame (v, w), p -> p + v + w x p, with the inverse covariance C_ij^-1 of the pair. To
+first order the motions X_i of the poses then minimise::
+
+    sum (X_j - X_i - D_ij)^T C_ij^-1 (X_j - X_i - D_ij)
+
+which is linear, G X = B, and solved exactly in one step (Borrmann et al. 2008, eqs 3 to 8). The
+poses, as a position and Euler angles, move by H_i^-1 X_i, with H the derivative of the motion by
+the six numbers (their eq 17); then D and C are taken anew, until nothing changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tofuse.geometry import se3
+from tofuse.parts import part
+from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
+from tofuse.posegraph.levenberg import check_graph
+from tofuse.posegraph.sparse import PairSystem
+
+Float64 = NDArray[np.float64]
+
+# Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.
+_EULER = "YXZ"
+_SAME = 1e-6  # a rise by less than this share is no rise: the last digits swing to and fro
+
+
+@part("optimiser", "lu-milios", label="validated")
+@dataclass(frozen=True)
+class LuMilios(Optimiser):
+    """Solve the linearised graph again and again (Borrmann et al. 2008).
+
+    Each edge counts by its information; there is no damping and no kernel. The first vertex of
+    each connected part stays where it is. The best poses on the way are the result, which are
+    those of the input where no step was a gain. Gravity and anchors are not used.
+
+    Attributes
+    ----------
+    max_iterations
+        At most so many linear systems are solved.
+    tolerance
+        Stop when a step lowers the sum of weighted squared errors by less than this share of it.
+    """
+
+    max_iterations: int = 50
+    tolerance: float = 1e-6
+
+    def optimise(self, graph: PoseGraph) -> Optimisation:
+        """See `Optimiser.optimise`. Raises InputError for what is not finite or not positive."""
+        check_graph(graph)
+        system = PairSystem(len(graph.ids), graph.edges)
+        best, history, converged = graph, [graph.chi2()], bool(system.fixed.all())
+        here = graph
+        for _ in range(0 if converged else self.max_iterations):
+            motion = solve_linear(here, system)
+            if motion is None:
+                break
+            moved = _moved(here.poses, motion)
+            moved[system.fixed] = graph.poses[system.fixed]
+            here = graph.with_poses(moved)
+            before = min(history)
+            history.append(here.chi2())
+            if history[-1] < before:
+                best = here
+            if before - history[-1] <= self.tolerance * before:
+                # Settled, or it went up: then this is no way to a minimum from here.
+                converged = history[-1] <= (1 + _SAME) * before
+                break
+        if history[-1] > min(history):
+            history.append(min(history))  # the step back to the best
+        return Optimisation(best, tuple(history), converged)
+
+
+def solve_linear(graph: PoseGraph, system: PairSystem) -> Float64 | None:
+    """(N, 6) motions X of the poses in the world's frame that solve G X = B; None if singular."""
+    j = graph.edges[:, 1]
+    e = graph.residuals()
+    into_camera = se3.adjoint(se3.inverse(graph.poses[j]))
+    D = -(se3.adjoint(graph.poses[j]) @ e[..., None])[..., 0]
+    C_inverse = np.swapaxes(into_camera, 1, 2) @ graph.information @ into_camera
+    pull = (C_inverse @ D[..., None])[..., 0]
+    matrix, gradient = system.assemble(C_inverse, -C_inverse, C_inverse, pull, -pull)
+    factor = system.factor(matrix, gradient)
+    return None if factor is None else factor.step()
+
+
+def _moved(poses: Float64, motion: Float64) -> Float64:
+    """Poses after motions X in the world's frame, by way of position and Euler angles."""
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler(_EULER)
+    turn = np.zeros((len(poses), 3, 3))  # w = turn @ change of the angles
+    first = np.eye(3)["XYZ".index(_EULER[0])]
+    outer = Rotation.from_euler(_EULER[:1], angles[:, :1])
+    both = Rotation.from_euler(_EULER[:2], angles[:, :2])
+    turn[:, :, 0] = first
+    turn[:, :, 1] = outer.apply(np.eye(3)["XYZ".index(_EULER[1])])
+    turn[:, :, 2] = both.apply(np.eye(3)["XYZ".index(_EULER[2])])
+    v, w = motion[:, :3], motion[:, 3:]
+    out = poses.copy()
+    # H^-1: the position moves as a point of the moving frame does, the angles as w asks.
+    out[:, :3, 3] += v + np.cross(w, poses[:, :3, 3])
+    change = (np.linalg.pinv(turn) @ w[..., None])[..., 0]
+    out[:, :3, :3] = Rotation.from_euler(_EULER, angles + change).as_matrix()
+    return out

@@ -1,0 +1,171 @@
+"""Lu and Milios in six dimensions, and ELCH: what their papers claim of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.posegraph.build import Measured, build_graph, chain
+from tofuse.posegraph.elch import Elch
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.lu_milios import LuMilios, solve_linear
+from tofuse.posegraph.sparse import PairSystem
+
+Float64 = NDArray[np.float64]
+
+
+def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph, Float64]:
+    """A camera that walks once round, each step of its own uncertainty; and the true poses."""
+    rng = np.random.default_rng(seed)
+    step = se3.exp([0.2, 0.0, 0.03, 0.01, 2 * np.pi / n, 0.0])
+    truth = np.array([np.linalg.matrix_power(step, k) for k in range(n)])
+    sigma = noise * rng.uniform(0.3, 2, n)
+    edges = []
+    for k in range(n - 1):
+        measured = step @ se3.exp(rng.normal(size=6) * sigma[k])
+        edges.append(Measured(k, k + 1, measured, np.eye(6) / sigma[k] ** 2))
+    closing = [
+        Measured(k, n - 1 - k, se3.inverse(truth[k]) @ truth[n - 1 - k], np.eye(6) / noise**2)
+        for k in range(loops)
+    ]
+    poses = [np.eye(4)]
+    for edge in edges:
+        poses.append(poses[-1] @ edge.T_i_j)
+    return build_graph(range(n), np.array(poses), edges, closing), truth
+
+
+def test_one_linear_system_is_the_whole_of_a_linear_problem():
+    """Of cameras that don't turn, one step is the weighted mean, by dense least squares."""
+    rng = np.random.default_rng(0)
+    n = 7
+    pairs = [(k, k + 1) for k in range(n - 1)] + [(0, 6), (1, 5), (2, 6)]
+    root = rng.normal(size=(len(pairs), 3, 3))
+    edges, rows, values = [], [], []
+    for (i, j), A in zip(pairs, root, strict=True):
+        T = np.eye(4)
+        T[:3, 3] = rng.normal(size=3)
+        information = np.eye(6) * 1e13  # nothing turns
+        information[:3, :3] = A.T @ A
+        edges.append(Measured(i, j, T, information))
+        row = np.zeros((3, 3 * n))
+        row[:, 3 * j : 3 * j + 3], row[:, 3 * i : 3 * i + 3] = A, -A
+        rows.append(row)
+        values.append(A @ T[:3, 3])
+    graph = build_graph(range(n), np.tile(np.eye(4), (n, 1, 1)), edges[:6], edges[6:])
+    expected = np.linalg.lstsq(np.concatenate(rows)[:, 3:], np.concatenate(values), rcond=None)[0]
+    done = LuMilios(max_iterations=1).optimise(graph)
+    np.testing.assert_allclose(done.graph.poses[1:, :3, 3].ravel(), expected, atol=1e-9)
+    # The second finds nothing left to do.
+    again = LuMilios().optimise(graph)
+    assert again.converged
+    np.testing.assert_allclose(again.graph.poses, done.graph.poses, atol=1e-7)
+
+
+def test_the_linear_system_is_that_of_the_paper():
+    """G X = B, block by block."""
+    graph, _ = ring(8, 0.01, loops=2)
+    system = PairSystem(8, graph.edges)
+    X = solve_linear(graph, system)
+    G, B = np.zeros((8, 6, 8, 6)), np.zeros((8, 6))
+    for (i, j), e, W in zip(graph.edges, graph.residuals(), graph.information, strict=True):
+        A = se3.adjoint(graph.poses[j])
+        D, C_inverse = -A @ e, np.linalg.inv(A @ np.linalg.inv(W) @ A.T)
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            G[a, :, b] += sign * C_inverse
+        B[j] += C_inverse @ D
+        B[i] -= C_inverse @ D
+    expected = np.linalg.solve(G.reshape(48, 48)[6:, 6:], B[1:].ravel())
+    np.testing.assert_allclose(X[1:].ravel(), expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(X[0], 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_small_loops_converge_to_the_minimum(seed):
+    graph, _ = ring(30, 0.01, seed, loops=4)
+    done = LuMilios(tolerance=1e-12).optimise(graph)
+    assert done.converged
+    assert len(done.objective) < 15
+    least = LevenbergMarquardt(robust="none", tolerance=1e-14).optimise(graph).graph
+    assert done.graph.chi2() == pytest.approx(least.chi2(), rel=1e-3)
+    np.testing.assert_allclose(done.graph.poses, least.poses, atol=1e-3)
+    assert done.graph.chi2() < 0.1 * graph.chi2()
+    np.testing.assert_array_equal(done.graph.poses[0], graph.poses[0])
+
+
+def test_relaxation_that_only_makes_it_worse_leaves_the_input():
+    graph, _ = ring(20, 0.01)
+    best = LevenbergMarquardt(robust="none", tolerance=1e-14).optimise(graph).graph
+    done = LuMilios().optimise(best)
+    assert done.graph.chi2() <= best.chi2()
+    np.testing.assert_allclose(done.graph.poses, best.poses, atol=1e-6)
+
+
+def test_the_ends_of_a_loop_meet():
+    graph, _ = ring(40, 0.02)
+    done = Elch().optimise(graph).graph
+    assert np.abs(graph.residuals()[-1]).max() > 0.02
+    np.testing.assert_allclose(done.residuals()[-1], 0, atol=1e-9)
+    np.testing.assert_array_equal(done.poses[0], graph.poses[0])
+
+
+def test_the_error_is_spread_in_proportion_to_the_covariances():
+    """Each pose moves by the share of the uncertainty that lies before it on the loop."""
+    graph, _ = ring(25, 0.02)
+    done = Elch().optimise(graph).graph
+    variance = 1 / graph.information[:24, 0, 0]
+    share = np.concatenate([[0], np.cumsum(variance)]) / variance.sum()
+    moved = done.poses[:, :3, 3] - graph.poses[:, :3, 3]
+    np.testing.assert_allclose(moved, share[:, None] * moved[-1], atol=1e-12)
+    turned = done.poses[:, :3, :3] @ np.swapaxes(graph.poses[:, :3, :3], 1, 2)
+    angle = se3.angle(turned)
+    assert angle[-1] > 0.01
+    np.testing.assert_allclose(angle, share * angle[-1], atol=1e-12)
+
+
+def test_what_hangs_on_a_loop_moves_with_it():
+    """Poses before the loop stay, those after it move as its end, a branch as its root."""
+    relative = np.tile(se3.exp([1.0, 0, 0, 0, 0, 0]), (9, 1, 1))
+    loop = Measured(2, 6, se3.exp([4.4, 0, 0, 0, 0, 0]), np.eye(6))
+    graph = chain(relative, [loop])
+    branch = build_graph(
+        range(11),
+        np.concatenate([graph.poses, graph.poses[4:5] @ se3.exp([0, 1.0, 0, 0, 0, 0])]),
+        [Measured(k, k + 1, T, np.eye(6)) for k, T in enumerate(relative)]
+        + [Measured(4, 10, se3.exp([0, 1.0, 0, 0, 0, 0]), np.eye(6))],
+        [loop],
+    )
+    moved = (Elch().optimise(branch).graph.poses - branch.poses)[:, 0, 3]
+    expected = [0, 0, 0, 0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4, 0.2]
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def test_loops_after_the_first_go_by_way_of_it():
+    """A closed loop is short cut: what lies beside it is not bent again."""
+    relative = np.tile(se3.exp([1.0, 0, 0, 0, 0, 0]), (19, 1, 1))
+    first = Measured(0, 10, se3.exp([10.0, 0, 0, 0, 0, 0]), np.eye(6) * 1e6)
+    second = Measured(0, 19, se3.exp([19.9, 0, 0, 0, 0, 0]), np.eye(6))
+    moved = Elch().optimise(chain(relative, [first, second])).graph.poses[:, 0, 3] - np.arange(20)
+    assert abs(moved[10]) < 1e-5
+    np.testing.assert_allclose(moved[10:], np.linspace(0, 0.9, 10), atol=1e-5)
+
+
+def test_a_loop_between_parts_that_nothing_joins_is_passed_over():
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    T = se3.exp([1.0, 0, 0, 0, 0, 0])
+    graph = build_graph(
+        range(4),
+        poses,
+        [Measured(0, 1, T, np.eye(6)), Measured(2, 3, T, np.eye(6))],
+        [Measured(0, 3, T, np.eye(6))],
+    )
+    np.testing.assert_allclose(Elch().optimise(graph).graph.poses, poses)
+
+
+@pytest.mark.parametrize("optimiser", [Elch(), LuMilios()])
+def test_nothing_to_do(optimiser):
+    for graph in (PoseGraph.empty(), chain(np.zeros((0, 4, 4)))):
+        done = optimiser.optimise(graph)
+        np.testing.assert_array_equal(done.graph.poses, graph.poses)
