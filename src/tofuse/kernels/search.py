@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.kernels.alignment import moved
 from tofuse.kernels.jit import kernel
+from tofuse.kernels.motion import moved
 from tofuse.kernels.projection import jacobian_row, landing
 
 Float32 = NDArray[np.float32]
@@ -332,8 +332,10 @@ def agree(
     points: Float32,
     normals: Float32,
     sigma: Float32,
+    light: Float32,
     planes: Float32,
     plane_variance: Float32,
+    photo: Float32,
     nearest: Float32,
     lookup: Float32,
     lookup_frame: Float64,
@@ -342,6 +344,7 @@ def agree(
     floor_m: float,
     floor_share: float,
     min_cosine: float,
+    differences: Float32,
     start: int,
     stop: int,
 ) -> Float64:
@@ -363,10 +366,16 @@ def agree(
         it violates free space if it is nearer than the surface by twice that.
     min_cosine
         Smallest cosine between the normals of points that support.
+    light, photo
+        (N,) and (H, W, 3) of which the first is the log albedo, NaN where unknown.
+    differences
+        (N,) written: log albedo of the image less the point's, for points that support; NaN where
+        one is unknown, and for the others.
     """
     out = np.zeros(AGREE_SIZE)
     rows, columns = planes.shape[0], planes.shape[1]
     for k in range(start, stop):
+        differences[k] = np.nan
         px = np.float64(points[k, 0])
         py = np.float64(points[k, 1])
         pz = np.float64(points[k, 2])
@@ -408,4 +417,5 @@ def agree(
         ):
             out[SUPPORT] += 1
             out[SQUARES_M] += r * r
+            differences[k] = photo[i, j, 0] - light[k]
     return out

@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.registration.projective import Points
+from tofuse.registration.view_points import ViewPoints
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -34,6 +34,8 @@ class AgreementOptions:
         of its depth: errors of the sensor that its noise does not show.
     max_angle
         Largest angle between the normals of surfaces that support each other, rad.
+    albedo
+        Largest difference in log albedo, exposure apart, of points that support.
     violation_weight
         How many supporting points a point in free space outweighs.
     """
@@ -43,12 +45,13 @@ class AgreementOptions:
     floor_m: float = 0.01
     floor_share: float = 0.01
     max_angle: float = 0.7
+    albedo: float = 0.3
     violation_weight: float = 2.0
 
     def __post_init__(self) -> None:
         if not 10 <= self.points <= 10_000_000:
             raise ValueError(f"points is {self.points}, not 10 or more")
-        for name in ("sigmas", "floor_m", "floor_share", "max_angle", "violation_weight"):
+        for name in ("sigmas", "floor_m", "floor_share", "max_angle", "albedo", "violation_weight"):
             if not 0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -62,11 +65,13 @@ class Agreement:
     overlap
         Share of the points that land on a surface of the other image.
     support
-        Share of the points that lie on the other image's surface.
+        Share of the points that lie on the other image's surface, and reflect as it does.
     violation
         Share of the points that lie in front of it: where the other camera saw through.
+    clash
+        Share of the points that lie on the surface, but reflect otherwise: no support.
     rms_m
-        Of the supporting points' distances from the surface; inf without any.
+        Distance from the surface of the points that lie on it; inf without any.
     points
         How many were compared, of both images.
     score
@@ -76,6 +81,7 @@ class Agreement:
     overlap: float
     support: float
     violation: float
+    clash: float
     rms_m: float
     points: int
     score: float
@@ -98,26 +104,30 @@ def agreement(
     T = np.ascontiguousarray(T_target_source, np.float64)
     total = np.zeros(kernels.AGREE_SIZE)
     count = 0
+    differences = []
     for seen, by, pose in ((source, target, T), (target, source, se3.inverse(T))):
-        points = Points.of(seen, stride_for(seen, options.points))
+        points = ViewPoints.of(seen, options.points)
         count += len(points.points)
-        total += _one_way(points, by, np.ascontiguousarray(pose), options)
-    support, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
+        differences.append(np.empty(len(points.points), np.float32))
+        total += _one_way(points, by, np.ascontiguousarray(pose), options, differences[-1])
+    on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
+    # Exposure is what most of them differ by; the way back sees its negative.
+    lighter = np.concatenate([differences[0], -differences[1]])
+    lighter = lighter[np.isfinite(lighter)]
+    clash = 0
+    if len(lighter):
+        clash = int(np.count_nonzero(np.abs(lighter - np.median(lighter)) > options.albedo))
+    support = on_surface - clash
     share = 1 / max(count, 1)
     return Agreement(
         overlap=float(total[kernels.COMPARED] * share),
         support=float(support * share),
         violation=float(violation * share),
-        rms_m=float(np.sqrt(total[kernels.SQUARES_M] / support)) if support else np.inf,
+        clash=float(clash * share),
+        rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
         points=count,
         score=float((support - options.violation_weight * violation) * share),
     )
-
-
-def stride_for(view: SurfaceMap, points: int) -> int:
-    """Stride at which about so many pixels of a view with a plane are taken."""
-    there = view.planar_share * view.z.size
-    return max(1, round(float(np.sqrt(there / points))))
 
 
 def nearest_depth(view: SurfaceMap) -> Float32:
@@ -129,7 +139,13 @@ def nearest_depth(view: SurfaceMap) -> Float32:
     return np.where(view.z > 0, least, np.float32(0)).astype(np.float32)
 
 
-def _one_way(points: Points, view: SurfaceMap, T: Float64, options: AgreementOptions) -> Float64:
+def _one_way(
+    points: ViewPoints,
+    view: SurfaceMap,
+    T: Float64,
+    options: AgreementOptions,
+    differences: Float32,
+) -> Float64:
     nearest = nearest_depth(view)
 
     def work(a: int, b: int) -> Float64:
@@ -137,8 +153,10 @@ def _one_way(points: Points, view: SurfaceMap, T: Float64, options: AgreementOpt
             points.points,
             points.normals,
             points.sigma,
+            points.light,
             view.planes,
             view.plane_variance,
+            view.photo,
             nearest,
             view.projection.lookup,
             view.projection.frame,
@@ -147,6 +165,7 @@ def _one_way(points: Points, view: SurfaceMap, T: Float64, options: AgreementOpt
             options.floor_m,
             options.floor_share,
             float(np.cos(options.max_angle)),
+            differences,
             a,
             b,
         )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.registration.projective import Points
+from tofuse.registration.view_points import ViewPoints
 
 Float64 = NDArray[np.float64]
 
@@ -86,8 +86,7 @@ def find_floors(
 
 def find_floor(view: SurfaceMap, down: Float64, options: FloorOptions) -> Floor | None:
     """Find the largest plane across `down` (3,) that has nothing below it, or None."""
-    stride = max(1, round(float(np.sqrt(view.planar_share * view.z.size / _POINTS))))
-    seen = Points.of(view, stride)
+    seen = ViewPoints.of(view, _POINTS)
     p, n = seen.points.astype(float), seen.normals.astype(float)
     if len(p) < 20:
         return None

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,27 +17,33 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
-from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.threads import run_all, run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import (
     Agreement,
     AgreementOptions,
     agreement,
     nearest_depth,
-    stride_for,
 )
 from tofuse.registration.floor import Floor, FloorOptions, find_floors
-from tofuse.registration.projective import Points
+from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.rough import with_rough_planes
+from tofuse.registration.view_points import ViewPoints
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Mode = Literal["auto", "both", "planar", "full"]
 
+# Patient, as albedo reaches no further than it is smooth; open directions are left to it.
+_PHOTOMETRIC = ProjectiveOptions(
+    levels=(Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02)), common_tilt=0.0, common_slope=0.0
+)
 # Nodes of the grid on which an image is looked up, along its wider side.
 _GRID = 128
 # Points without which a view is not searched.
 _LEAST_POINTS = 50
+# Points of a view of which the search takes its samples.
+_SEEN = 3000
 # The whole grid is scored on a third of the points, and the best so many times the candidates on
 # all.
 _COARSE_SHARE, _KEPT = 3, 200
@@ -72,6 +79,8 @@ class SearchOptions:
         How many of the grid's poses are settled.
     settle_points
         Pixels of each image that settle a candidate.
+    photo_candidates
+        How many of the best candidates are aligned by albedo too, where both views have it.
     convincing
         Least score with which "auto" leaves it at the planar search.
     distinct_m, distinct_rad
@@ -94,6 +103,7 @@ class SearchOptions:
     planar_candidates: int = 20
     full_candidates: int = 60
     settle_points: int = 700
+    photo_candidates: int = 12
     convincing: float = 0.4
     distinct_m: float = 0.1
     distinct_rad: float = 0.0873
@@ -117,6 +127,7 @@ class SearchOptions:
             "planar_candidates",
             "full_candidates",
             "settle_points",
+            "photo_candidates",
         ):
             if not 1 <= getattr(self, name) <= 1_000_000:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
@@ -233,9 +244,31 @@ def search(
             found = _settled(source, target, s, t, poses, options)
         convinced = bool(found) and max(c.score for c in found) >= options.convincing
         if options.mode == "planar" or (options.mode == "auto" and convinced):
-            return Match(_distinct(found, options), "planar") if found else None
+            return Match(_finished(source, target, found, options), "planar") if found else None
     found += _settled(source, target, s, t, _full(s, t, options), options)
-    return Match(_distinct(found, options), "full")
+    return Match(_finished(source, target, found, options), "full")
+
+
+def _finished(
+    source: SurfaceMap, target: SurfaceMap, found: list[Candidate], options: SearchOptions
+) -> tuple[Candidate, ...]:
+    """Order candidates, after albedo has placed the best ones where geometry alone can't."""
+    distinct = _distinct(found, options)
+    if not (source.has_photo and target.has_photo):
+        return distinct
+    best, rest = distinct[: options.photo_candidates], distinct[options.photo_candidates :]
+    targets = [Target(target, np.eye(4))]
+    moved = run_all(
+        [
+            partial(align, source, targets, candidate.T_target_source, _PHOTOMETRIC)
+            for candidate in best
+        ]
+    )
+    placed = [
+        Candidate(T, agreement(source, target, T, options.agreement))
+        for T in (aligned.T_world_source for aligned in moved)
+    ]
+    return _distinct([*best, *placed, *rest], options)
 
 
 def _prepare(view: SurfaceMap) -> _View:
@@ -266,7 +299,7 @@ def _prepare(view: SurfaceMap) -> _View:
     length = np.maximum(np.sqrt((abc * abc).sum(-1)), 1e-12)
     grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
     grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
-    seen = Points.of(view, stride_for(view, 3000))
+    seen = ViewPoints.of(view, _SEEN)
     return _View(
         grid.astype(np.float32),
         np.array([x[0], y[0], 1 / spacing, 1 / spacing]),
