@@ -85,8 +85,9 @@ class ProjectiveOptions:
 
     levels: tuple[Level, ...] = (
         Level(4, 6, 0.03, 0.1),
-        Level(2, 4, 0.005, 0.02),
-        Level(1, 2, 0.0, 0.0),
+        Level(4, 2, 0.005, 0.02),
+        Level(2, 1, 0.0, 0.0),
+        Level(1, 1, 0.0, 0.0),
     )
     robust: float = 3.5
     max_angle: float = 0.7
