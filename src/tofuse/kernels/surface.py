@@ -259,10 +259,10 @@ def smooth_and_slope(
     """
     rows, columns = image.shape
     h = radius + 1
-    full = (2 * radius + 1) * (2 * radius + 1)
-    m = np.empty(5)
-    mx = np.empty(5)
-    my = np.empty(5)
+    above = max(start - h, 0)
+    mean = np.empty((min(stop + h, rows) - above, columns, 3), np.float32)
+    _box_means(image, rays, radius, above, mean)
+    cross = np.empty((4, 3))
     for i in range(start, stop):
         for j in range(columns):
             out[i, j, 0] = np.nan
@@ -274,60 +274,65 @@ def smooth_and_slope(
             if np.isnan(image[i, j]):
                 continue
             good = True
-            for k in range(5):
-                ci = i
-                cj = j
-                if k == 1:
-                    cj = j - h
-                elif k == 2:
-                    cj = j + h
-                elif k == 3:
-                    ci = i - h
-                elif k == 4:
-                    ci = i + h
+            for k in range(4):
+                ci = i + (h if k == 3 else (-h if k == 2 else 0))
+                cj = j + (h if k == 1 else (-h if k == 0 else 0))
                 u = planes[ci, cj, 3]
                 expected = (
                     planes[i, j, 0] * rays[ci, cj, 0]
                     + planes[i, j, 1] * rays[ci, cj, 1]
                     + planes[i, j, 2]
                 )
-                if u <= 0 or abs(u - expected) > jump * v:
+                if u <= 0 or abs(u - expected) > jump * v or np.isnan(mean[ci - above, cj, 0]):
                     good = False
                     break
-                total = 0.0
-                count = 0
-                for a in range(max(ci - radius, 0), min(ci + radius + 1, rows)):
-                    for b in range(max(cj - radius, 0), min(cj + radius + 1, columns)):
-                        value = image[a, b]
-                        if not np.isnan(value):
-                            total += value
-                            count += 1
-                if count == 0:
-                    good = False
-                    break
-                m[k] = total / count
-                mx[k] = rays[ci, cj, 0]
-                my[k] = rays[ci, cj, 1]
-                if count < full:
-                    mx[k] = 0.0
-                    my[k] = 0.0
-                    for a in range(max(ci - radius, 0), min(ci + radius + 1, rows)):
-                        for b in range(max(cj - radius, 0), min(cj + radius + 1, columns)):
-                            if not np.isnan(image[a, b]):
-                                mx[k] += rays[a, b, 0] / count
-                                my[k] += rays[a, b, 1] / count
+                for c in range(3):
+                    cross[k, c] = mean[ci - above, cj, c]
             if not good:
                 continue
             # Chain rule: slopes by pixel to slopes by ray coordinate, for any lens.
-            xu = mx[2] - mx[1]
-            yu = my[2] - my[1]
-            xv = mx[4] - mx[3]
-            yv = my[4] - my[3]
+            du, dv = cross[1, 0] - cross[0, 0], cross[3, 0] - cross[2, 0]
+            xu, xv = cross[1, 1] - cross[0, 1], cross[3, 1] - cross[2, 1]
+            yu, yv = cross[1, 2] - cross[0, 2], cross[3, 2] - cross[2, 2]
             det = xu * yv - yu * xv
-            du = m[2] - m[1]
-            dv = m[4] - m[3]
             sx = (yv * du - yu * dv) / det
             sy = (xu * dv - xv * du) / det
-            out[i, j, 0] = m[0] + sx * (rays[i, j, 0] - mx[0]) + sy * (rays[i, j, 1] - my[0])
+            here = mean[i - above, j]
+            out[i, j, 0] = here[0] + sx * (rays[i, j, 0] - here[1]) + sy * (rays[i, j, 1] - here[2])
             out[i, j, 1] = sx
             out[i, j, 2] = sy
+
+
+@kernel
+def _box_means(image: Float32, rays: Float32, radius: int, above: int, out: Float32) -> None:
+    """Mean of each pixel's box from row `above` on, and where the middle of its pixels is.
+
+    out is (rows, W, 3): mean, x and y; NaN where the box is empty.
+    """
+    rows, columns = image.shape
+    full = (2 * radius + 1) * (2 * radius + 1)
+    for k in range(out.shape[0]):
+        i = above + k
+        for j in range(columns):
+            total = 0.0
+            count = 0
+            for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
+                for b in range(max(j - radius, 0), min(j + radius + 1, columns)):
+                    value = image[a, b]
+                    if not np.isnan(value):
+                        total += value
+                        count += 1
+            out[k, j, 0] = total / count if count else np.nan
+            if count == full:
+                out[k, j, 1] = rays[i, j, 0]
+                out[k, j, 2] = rays[i, j, 1]
+                continue
+            x = 0.0
+            y = 0.0
+            for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
+                for b in range(max(j - radius, 0), min(j + radius + 1, columns)):
+                    if not np.isnan(image[a, b]):
+                        x += rays[a, b, 0]
+                        y += rays[a, b, 1]
+            out[k, j, 1] = x / max(count, 1)
+            out[k, j, 2] = y / max(count, 1)
