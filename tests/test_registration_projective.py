@@ -10,7 +10,7 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.registration.projective import UNITS, Level, Points, ProjectiveOptions, Target, align
+from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align, points_of
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
@@ -195,12 +195,12 @@ def test_a_view_of_nothing_holds_nothing_and_stays_at_the_prediction(room):
 
 def test_points_lie_on_the_fitted_surface(room):
     view = room.views[0]
-    some = Points.of(view, 4)
-    every = Points.of(view, 1)
+    some = points_of(view, 4)
+    every = points_of(view, 1)
     assert len(every) == np.count_nonzero(view.planes[..., 3])
     assert len(some) == pytest.approx(len(every) / 16, rel=0.1)
     z = np.float32(1) / view.planes[view.planes[..., 3] > 0][:, 3]
-    np.testing.assert_allclose(every.points[:, 2], z, rtol=1e-6)
+    np.testing.assert_allclose(every[:, 2], z, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

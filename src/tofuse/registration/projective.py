@@ -112,38 +112,13 @@ class ProjectiveOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
-    """Pixels of a source view: `rows` (N, POINT_SIZE) as the kernels take them."""
+def points_of(view: SurfaceMap, stride: int) -> Float32:
+    """Every `stride`-th pixel of every `stride`-th row that has a plane, as the kernels take it.
 
-    rows: Float32
-
-    @classmethod
-    def of(cls, view: SurfaceMap, stride: int) -> Points:
-        """Take every `stride`-th pixel of every `stride`-th row that has a plane.
-
-        The points lie on the fitted surface, as the target's do: what smoothing does to a curved
-        surface is then the same on both sides.
-        """
-        return cls(kernels.gather(view.rays, view.planes, view.plane_variance, view.photo, stride))
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @cached_property
-    def points(self) -> Float32:
-        """(N, 3) in m."""
-        return np.ascontiguousarray(self.rows[:, kernels.POINT : kernels.POINT + 3])
-
-    @cached_property
-    def normals(self) -> Float32:
-        """(N, 3) unit normals away from the camera."""
-        return np.ascontiguousarray(self.rows[:, kernels.NORMAL : kernels.NORMAL + 3])
-
-    @cached_property
-    def sigma(self) -> Float32:
-        """(N,) standard deviation of z in m."""
-        return self.rows[:, kernels.SIGMA] * self.rows[:, kernels.POINT + 2]
+    The points lie on the fitted surface, as the target's do: what smoothing does to a curved
+    surface is then the same on both sides.
+    """
+    return kernels.gather(view.rays, view.planes, view.plane_variance, view.photo, stride)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,16 +236,17 @@ def align(
     converged = False
     weak = np.zeros((0, 6))
     prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3)
-    points = Points.of(source, options.levels[0].stride)
+    points = points_of(source, options.levels[0].stride)
     if photometric:
         state.exposure = _seen_exposure(points, targets, T0) if exposure is None else exposure
     if len(points):
         middle = len(points) // 2
-        typical = float(np.partition(points.sigma, middle)[middle])
+        sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
+        typical = float(np.partition(sigma, middle)[middle])
         state.most = max(3.0, options.most_sigma_m / typical)
     for number, level in enumerate(options.levels):
         if number and level.stride != options.levels[number - 1].stride:
-            points = Points.of(source, level.stride)
+            points = points_of(source, level.stride)
         doubt = None
         for _ in range(level.iterations):
             state.total = _sum(points, targets, state, level, options, photometric)
@@ -317,7 +293,7 @@ def align(
 
 
 def _sum(
-    points: Points,
+    points: Float32,
     targets: Sequence[Target],
     state: _State,
     level: Level,
@@ -331,7 +307,7 @@ def _sum(
 
         def work(a: int, b: int, view: SurfaceMap = view, T: Float64 = T) -> Float64:
             return kernels.accumulate(
-                points.rows,
+                points,
                 view.target,
                 view.projection.lookup,
                 view.projection.frame,
@@ -351,7 +327,7 @@ def _sum(
     return total
 
 
-def _seen_exposure(points: Points, targets: Sequence[Target], T: Float64) -> float:
+def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
     """Median difference in log albedo, from some of the points, before they are aligned."""
     every = max(1, len(points) // _SOME_POINTS)
     seen = []
@@ -360,20 +336,18 @@ def _seen_exposure(points: Points, targets: Sequence[Target], T: Float64) -> flo
         moved = np.ascontiguousarray(target.T_target_world @ T)
         grid = view.projection
         seen.append(
-            kernels.exposure_differences(
-                points.rows, every, view.target, grid.lookup, grid.frame, moved
-            )
+            kernels.exposure_differences(points, every, view.target, grid.lookup, grid.frame, moved)
         )
     both = np.concatenate(seen) if seen else np.zeros(0)
     return float(np.median(both)) if len(both) else 0.0
 
 
 def _doubt(
-    points: Points, state: _State, level: Level, options: ProjectiveOptions, photometric: bool
+    points: Float32, state: _State, level: Level, options: ProjectiveOptions, photometric: bool
 ) -> Float64:
     """(6, 6) information that errors fixed to the camera can fake; from some of the points."""
     faked = faked_information(
-        points.rows,
+        points,
         max(1, len(points) // _SOME_POINTS),
         state.scale_g,
         level.slack_m,
