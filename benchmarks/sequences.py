@@ -26,7 +26,7 @@ from tofuse.filters.foreground import Foreground
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.pipeline.methods import default
-from tofuse.pipeline.run import fitted
+from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording

@@ -50,26 +50,27 @@ def fit(w, rays, weight, radii=(2, 5), limit=1e-6, fill=0.7, offset=0.2):
 # --- halve ---------------------------------------------------------------------------------------
 
 
-def halve_twin(z, value, jump):
+def halve_twin(z, value, variance, jump):
     rows, columns = z.shape[0] // 2, z.shape[1] // 2
-    z_out, value_out = np.zeros((rows, columns)), np.zeros((rows, columns))
+    z_out, value_out, variance_out = np.zeros((3, rows, columns))
     for i, j in itertools.product(range(rows), range(columns)):
         block = z[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].ravel().astype(float)
         amount = value[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].ravel().astype(float)
-        amount, block = amount[block > 0], block[block > 0]
+        spread = variance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].ravel().astype(float)
+        amount, spread, block = amount[block > 0], spread[block > 0], block[block > 0]
         if len(block):
             middle = np.sort(block)[min(1, len(block) - 1)]
             near = np.abs(block - middle) <= jump * middle
             z_out[i, j] = 1 / np.mean(1 / block[near])
             value_out[i, j] = amount[near].mean()
-    return z_out, value_out
+            variance_out[i, j] = spread[near].sum() / near.sum() ** 2
+    return z_out, value_out, variance_out
 
 
-def halved(z, value, jump=0.02):
-    z_out = np.full((z.shape[0] // 2, z.shape[1] // 2), 7, np.float32)
-    value_out = z_out.copy()
-    halve(z, value, jump, z_out, value_out)
-    return z_out, value_out
+def halved(z, value, variance=None, jump=0.02):
+    out = np.full((3, z.shape[0] // 2, z.shape[1] // 2), 7, np.float32)
+    halve(z, value, value if variance is None else variance, jump, *out)
+    return out
 
 
 @pytest.mark.parametrize("shape", [(20, 16), (21, 17)])
@@ -77,21 +78,22 @@ def test_halving_is_that_of_the_slow_twin(shape):
     rng = np.random.default_rng(1)
     z = rng.choice([0, 1.0, 1.5, 1.51, 3], shape).astype(np.float32)
     z += np.where(z > 0, rng.uniform(0, 0.01, shape), 0).astype(np.float32)
-    value = rng.uniform(1, 9, shape).astype(np.float32)
-    for found, wanted in zip(halved(z, value), halve_twin(z, value, 0.02), strict=True):
+    value, variance = rng.uniform(1, 9, (2, *shape)).astype(np.float32)
+    twin = halve_twin(z, value, variance, 0.02)
+    for found, wanted in zip(halved(z, value, variance), twin, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
 def test_halving_never_makes_a_depth_between_two_surfaces():
     z = np.where(np.arange(41) < 21, 1, 3).astype(np.float32)[None].repeat(8, 0)
-    found, value = halved(z, z * 10)
+    found, value, _ = halved(z, z * 10)
     assert set(np.unique(found)) <= {1.0, 3.0}
     np.testing.assert_allclose(value, 10 * found)
 
 
 def test_halving_keeps_a_plane_a_plane():
     rays = CAMERA.rays()
-    found, _ = halved(1 / plane_w(rays), plane_w(rays), jump=0.5)
+    found, _, _ = halved(1 / plane_w(rays), plane_w(rays), jump=0.5)
     blocks = rays.reshape(15, 2, 20, 2, 2).mean((1, 3))
     np.testing.assert_allclose(1 / found, plane_w(blocks), rtol=1e-6)
 

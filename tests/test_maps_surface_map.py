@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -70,9 +71,10 @@ def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
 def test_the_cameras_own_noise_is_believed_up_to_a_factor():
     frame = wall(sigma=0.004)
     ramp = np.linspace(0.5, 2, 72, dtype=np.float32)[:, None].repeat(88, 1)
-    view = surface_map(replace(frame, sigma_image=0.3 * ramp), OPTIONS)
-    ratio = view.sigma / ramp
+    view = surface_map(replace(frame, sigma_image=0.0003 * ramp), OPTIONS)
+    ratio = view.sigma / ramp * ray_lengths(CAMERA)
     np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-5)
+    assert ratio[0, 0] > 0.001  # what the view shows of it, 4 mm at places
 
 
 def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
@@ -231,3 +233,56 @@ def test_threads_change_nothing():
 def test_options_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         SurfaceOptions(**wrong)
+
+
+@pytest.mark.parametrize("columns", [320, 50])
+def test_stated_noise_of_the_range_is_that_of_z_at_any_resolution(columns):
+    """Whatever the view shows: it has no noise at all."""
+    camera = Pinhole(88, 72, 60.0, 60.0, 43.5, 35.5)
+    frame = wall(camera)
+    view = surface_map(
+        replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)),
+        replace(OPTIONS, columns=columns),
+    )
+    wanted = 0.01 / ray_lengths(camera)
+    if columns < 88:
+        # Means of four pixels that share no noise.
+        wanted = wanted.reshape(36, 2, 44, 2).mean((1, 3)) / 2
+    np.testing.assert_allclose(view.sigma, wanted, rtol=2e-3)
+
+
+def smoothed(sigma, seed):
+    """A wall with waves on the right, as cameras see it whose neighbouring pixels share noise."""
+    rays = CAMERA.rays().astype(float)
+    z = 1.5 + 0.03 * np.sin(25 * np.maximum(rays[..., 0] - 0.1, 0)) + 0.2 * rays[..., 1]
+    noise = np.random.default_rng(seed).normal(size=z.shape)
+    noise = cv2.GaussianBlur(noise, (0, 0), 8.0)
+    return RangeFrame(0, 0.0, CAMERA, (z + noise * sigma / noise.std()).astype(np.float32))
+
+
+def test_a_curved_surface_counts_where_its_noise_is_stated_though_not_shown():
+    frame = smoothed(0.01, 1)
+    blind = surface_map(frame, OPTIONS)
+    told = surface_map(replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), OPTIONS)
+    waves = np.s_[4:-4, 60:-4]
+    blind_share, told_share = ((v.planes[waves][..., 3] > 0).mean() for v in (blind, told))
+    assert blind_share < 0.75 < 0.95 < told_share
+
+
+def test_pixels_of_a_reduced_view_weigh_by_their_stated_noise():
+    """Where sigma is wrong by place, planes follow the bad pixels; where it is right, the good."""
+    camera = Pinhole(176, 144, 230.0, 230.0, 87.5, 71.5)
+    sigma = np.where(np.arange(176) % 4 < 2, 0.002, 0.03).astype(np.float32)[None].repeat(144, 0)
+    clean = wall(camera)
+    noise = np.random.default_rng(2).normal(size=sigma.shape) * sigma
+    frame = replace(clean, depth=(clean.depth + noise).astype(np.float32))
+    options = replace(OPTIONS, columns=88)
+    off = {}
+    for name, stated in (("right", sigma), ("even", np.full_like(sigma, 0.02))):
+        view = surface_map(replace(frame, sigma_image=stated), options)
+        middle = inside(view)
+        exact = view.rays @ PLANE[:2] + PLANE[2]
+        known = view.planes[..., 3][middle] > 0
+        assert known.mean() > 0.8
+        off[name] = float(np.std((view.planes[..., 3] - exact)[middle][known]))
+    assert off["right"] < 0.25 * off["even"]

@@ -19,15 +19,25 @@ SUMS = 11  # weight, x, y, w, xx, xy, yy, xw, yw, ww, count
 
 
 @kernel
-def halve(z: Float32, value: Float32, jump: float, z_out: Float32, value_out: Float32) -> None:
+def halve(
+    z: Float32,
+    value: Float32,
+    variance: Float32,
+    jump: float,
+    z_out: Float32,
+    value_out: Float32,
+    variance_out: Float32,
+) -> None:
     """Halve an image: the mean of those pixels of each 2x2 block that lie on one surface.
 
     Of four depths those within `jump` (share of the depth) of the second nearest are averaged, as
-    inverse depths; zeros don't count. `value` is averaged over the same pixels.
+    inverse depths; zeros don't count. `value` is averaged over the same pixels, and `variance`,
+    that of z, becomes the variance of their mean, as for noise that they don't share.
     """
     rows, columns = z_out.shape
     d = np.empty(4)
     a = np.empty(4)
+    s = np.empty(4)
     for i in range(rows):
         for j in range(columns):
             n = 0
@@ -39,25 +49,31 @@ def halve(z: Float32, value: Float32, jump: float, z_out: Float32, value_out: Fl
                     while m > 0 and d[m - 1] > x:
                         d[m] = d[m - 1]
                         a[m] = a[m - 1]
+                        s[m] = s[m - 1]
                         m -= 1
                     d[m] = x
                     a[m] = value[2 * i + (k >> 1), 2 * j + (k & 1)]
+                    s[m] = variance[2 * i + (k >> 1), 2 * j + (k & 1)]
                     n += 1
             if n == 0:
                 z_out[i, j] = 0
                 value_out[i, j] = 0
+                variance_out[i, j] = 0
                 continue
             middle = d[1] if n > 1 else d[0]
             total = 0.0
             amount = 0.0
+            spread = 0.0
             count = 0
             for k in range(n):
                 if abs(d[k] - middle) <= jump * middle:
                     total += 1.0 / d[k]
                     amount += a[k]
+                    spread += s[k]
                     count += 1
             z_out[i, j] = count / total
             value_out[i, j] = amount / count
+            variance_out[i, j] = spread / (count * count)
 
 
 @kernel

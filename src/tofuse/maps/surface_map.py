@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.geometry.cameras import Camera
+from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels.alignment import make_target
 from tofuse.kernels.surface import (
     SUMS,
@@ -197,12 +197,13 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
 
     The noise is taken from the frame's own `sigma_image` where it has one, else from a law of the
     sensor family (one over the amplitude, or the square of the depth); its scale is measured on
-    the view itself, as the median misfit of small planes.
+    the view itself, as the median misfit of small planes. What a frame states of its noise is not
+    made less: planes don't show noise that neighbouring pixels share.
     """
-    projection, z, light, step = _reduced(frame, options.columns)
+    projection, z, light, own = _reduced(frame, options.columns)
     rays = projection.rays
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
-    sigma = _noise_law(frame, z, light, rays, step)
+    sigma = _noise_law(frame, z, light, rays) if own is None else own
     # d(1/z) = dz / z^2
     weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
     if options.edge_margin:
@@ -213,7 +214,10 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     add_rows(sums)
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
-    scale = max(_noise_scale(w, rays, weight, sums, options.radii[0]), _least_scale(z, sigma))
+    scale = max(
+        _noise_scale(w, rays, weight, sums, options.radii[0]),
+        _least_scale(z, sigma) if own is None else 1.0,
+    )
     radii = np.array(options.radii, np.int64)
     limit = options.misfit * scale
     run_chunks(
@@ -256,26 +260,45 @@ def _projection(camera: Camera, step: int) -> Projection:
     return known[step]
 
 
-def _reduced(frame: RangeFrame, columns: int) -> tuple[Projection, Float32, Float32 | None, int]:
-    """Grid, z and amplitude at the working resolution, and the step in pixels."""
+def _reduced(
+    frame: RangeFrame, columns: int
+) -> tuple[Projection, Float32, Float32 | None, Float32 | None]:
+    """Grid, z, amplitude and the frame's own sigma of z at the working resolution."""
     z = frame.z
     z = np.where(frame.valid & (z > _NEAREST) & (z < _FARTHEST), z, np.float32(0))
     light = frame.amplitude_image
     if light is not None:
         light = np.where(light < SATURATED_AMPLITUDE, light, np.float32(0)).astype(np.float32)
+    variance = _own_variance(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
-        rows, cols = z.shape[0] // 2, z.shape[1] // 2
-        z_half = np.empty((rows, cols), np.float32)
-        light_half = np.empty((rows, cols), np.float32)
-        halve(z, light if light is not None else z, _HALVING_JUMP, z_half, light_half)
-        z, light = z_half, light_half if light is not None else None
+        halves = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
+        halve(
+            z,
+            z if light is None else light,
+            z if variance is None else variance,
+            _HALVING_JUMP,
+            *halves,
+        )
+        z = halves[0]
+        light = None if light is None else halves[1]
+        variance = None if variance is None else halves[2]
         step *= 2
     projection = _projection(frame.camera, step)
     if step > 1:
         # The mean of a block of rays that holds an unknown one is unknown.
         z[np.isnan(projection.rays).any(-1)] = 0
-    return projection, z, light, step
+    return projection, z, light, None if variance is None else np.sqrt(variance)
+
+
+def _own_variance(frame: RangeFrame) -> Float32 | None:
+    """Variance of z that the frame states, m^2; 0 where it does not."""
+    if frame.sigma_image is None:
+        return None
+    known = (frame.sigma_image > _LEAST_SIGMA) & (frame.sigma_image < _FARTHEST)
+    # The noise is that of the range, along the ray.
+    sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
+    return np.asarray(sigma * sigma, np.float32)
 
 
 def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
@@ -292,13 +315,8 @@ def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
     return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
 
 
-def _noise_law(
-    frame: RangeFrame, z: Float32, light: Float32 | None, rays: Float32, step: int
-) -> Float32:
+def _noise_law(frame: RangeFrame, z: Float32, light: Float32 | None, rays: Float32) -> Float32:
     """Sigma of z in m up to a factor."""
-    if frame.sigma_image is not None and step == 1:
-        known = (frame.sigma_image > _LEAST_SIGMA) & (frame.sigma_image < _FARTHEST)
-        return np.where(known, frame.sigma_image, np.float32(0)).astype(np.float32)
     if light is None or frame.amplitude_kind == "ir":
         return np.float32(0.001) + np.float32(0.003) * z * z
     if frame.amplitude_kind == "raw":

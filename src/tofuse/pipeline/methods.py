@@ -8,6 +8,7 @@ from tofuse.filters.angle import NeighbourhoodAngle
 from tofuse.filters.confidence import Confidence
 from tofuse.filters.multipath import Multipath
 from tofuse.filters.neighbours import NeighbourShare
+from tofuse.filters.noise import Noise
 from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.odometry.sequential import Sequential
@@ -47,11 +48,11 @@ def thesis(kind: ViewKind) -> Config:
 def default(kind: ViewKind) -> Config:
     """Return what `tofuse run` does unless told otherwise.
 
-    Range images lose the light that came by way of other surfaces, and are aligned with
-    keyframes, by planes and albedo; only what goes into the model is filtered, and only loops
-    given by hand are closed. Clouds are registered as in the thesis, but with a resolution of
-    3 cm: two random subsets of 1000 points of a room lie several centimetres apart, so at 1 cm
-    few points find a partner.
+    Range images are told their noise, lose the light that came by way of other surfaces, and are
+    aligned with keyframes, by planes and albedo; only what goes into the model is filtered, and
+    only loops given by hand are closed. Clouds are registered as in the thesis, but with a
+    resolution of 3 cm: two random subsets of 1000 points of a room lie several centimetres apart,
+    so at 1 cm few points find a partner.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
@@ -59,7 +60,7 @@ def default(kind: ViewKind) -> Config:
         return replace(base, odometry=Sequential(registration=icp, guess="previous"))
     return replace(
         base,
-        corrections=(Multipath(lamp=1.0),),
+        corrections=(Noise(), Multipath(lamp=1.0)),
         filters=(),
         model_filters=(Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),

@@ -15,14 +15,18 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
+from tofuse.filters.confidence import Confidence
+from tofuse.filters.noise import Noise
 from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame
+from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
+from tofuse.sensor.noise import NOISE, NoiseModel
 
 Float64 = NDArray[np.float64]
 
@@ -60,6 +64,7 @@ def reconstruct(
     """
     progress = progress or Silent()
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
+    config = fitted(config, recording)
     mapper = Mapper(config, seed=seed, threads=threads, loops=loops, progress=progress)
     progress.stage("tracking", len(recording))
     odometry = recording.odometry
@@ -85,6 +90,38 @@ def reconstruct(
             )
         result = mapper.finish()
     return replace(result, recording=describe(recording))
+
+
+def fitted(config: Config, recording: Recording) -> Config:
+    """Return the configuration with what it leaves to the recording filled in.
+
+    Levels of confidence are put on the recording's own scale, and its noise model is chosen.
+
+    Raises
+    ------
+    InputError
+        If the recording has a noise.json that makes no sense.
+    """
+    corrections = tuple(
+        replace(c, model=_known_noise(recording)) if isinstance(c, Noise) and not c.model else c
+        for c in config.corrections
+    )
+    config = replace(config, corrections=corrections)
+    highest = recording.metadata.get("confidence_max")
+    if not isinstance(highest, int | float) or not 1 <= highest <= 255:
+        return config
+    scaled = (
+        tuple(f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in filters)
+        for filters in (config.filters, config.model_filters)
+    )
+    filters, model_filters = scaled
+    return replace(config, filters=filters, model_filters=model_filters)
+
+
+def _known_noise(recording: Recording) -> NoiseModel | None:
+    """Noise that the recording states, or its camera's family is known for."""
+    model = noise_model_for(recording)
+    return None if model == NOISE["unknown"] else model
 
 
 def view_kind(recording: Recording) -> ViewKind:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
-from tofuse.filters.confidence import Confidence
 from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import (
+    fitted,
     past_frames,
     reconstruct,
     reference_in_world,
@@ -123,19 +123,6 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         filters = [*front, *config.to_dict()["filters"]]
         config = changed(config, {"filters": filters}, where="--max-depth")
     return config
-
-
-def fitted(config: Config, recording: Recording) -> Config:
-    """Return the configuration with levels of confidence on the recording's own scale."""
-    highest = recording.metadata.get("confidence_max")
-    if not isinstance(highest, int | float) or not 1 <= highest <= 255:
-        return config
-    scaled = (
-        tuple(f.on_scale(round(highest)) if isinstance(f, Confidence) else f for f in filters)
-        for filters in (config.filters, config.model_filters)
-    )
-    filters, model_filters = scaled
-    return replace(config, filters=filters, model_filters=model_filters)
 
 
 def _seed(options: Options) -> int:

@@ -76,8 +76,12 @@ def family_of(recording: Recording, frame: RangeFrame | None) -> str:
             return family
     if recording.format in _FORMATS:
         return _FORMATS[recording.format]
-    size = None if frame is None else (frame.camera.width, frame.camera.height)
-    return "unknown" if size is None else _SIZES.get(size, "unknown")
+    if frame is None:
+        return "unknown"
+    family = _SIZES.get((frame.camera.width, frame.camera.height), "unknown")
+    if family == "iphone" and frame.amplitude_image is not None:
+        return "unknown"  # an iPhone gives no amplitude
+    return family
 
 
 def _beside(recording: Recording) -> NoiseModel | None:
