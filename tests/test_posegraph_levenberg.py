@@ -152,6 +152,14 @@ def test_covariances_are_those_of_repeated_measurements():
     np.testing.assert_allclose(joint[:6, :6], C[3], rtol=1e-9)
     np.testing.assert_allclose(joint[12:, 12:], C[9], rtol=1e-9)
     np.testing.assert_array_equal(joint[6:12], 0)
+    # Relative ones, from the joint covariance of the two ends.
+    i, j = graph.edges.T
+    T_i_j = se3.inverse(solution.poses[i]) @ solution.poses[j]
+    relative = factor.relative_covariances(T_i_j)
+    for m in (0, 4, len(i) - 1):
+        both = factor.joint_covariance(graph.edges[m])
+        J = np.concatenate([-se3.adjoint(se3.inverse(T_i_j[m])), np.eye(6)], axis=1)
+        np.testing.assert_allclose(relative[m], J @ both @ J.T, rtol=1e-7, atol=1e-14)
     rng = np.random.default_rng(5)
     exact = se3.inverse(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
     errors = []
@@ -190,6 +198,40 @@ def test_false_loops_are_left_out_and_true_ones_kept(seed):
     assert ate(done.graph.poses, truth) < 1.01 * alone
     plain = LevenbergMarquardt(robust="none").optimise(graph).graph.poses
     assert ate(plain, truth) > 20 * alone
+
+
+def test_a_false_loop_can_not_hide_where_odometry_is_weak():
+    """It bends the odometry and fits then; but the other loops contradict it."""
+    rng = np.random.default_rng(7)
+    graph, truth, false = walk(loops=5, false=2, seed=1)
+    loose = np.where(graph.loop, 1.0, 1 / 144)[:, None, None]
+    i, j = graph.edges[:59].T
+    measurements = graph.measurements.copy()
+    exact = se3.inverse(truth[i]) @ truth[j]
+    measurements[:59] = exact @ se3.exp(rng.normal(size=(59, 6)) * SIGMA * 12)
+    graph = replace(graph, measurements=measurements, information=loose * graph.information)
+    plain = LevenbergMarquardt(robust="none").optimise(graph).graph
+    r = plain.residuals()[false]
+    assert (np.einsum("mi,mij,mj->m", r, plain.information[false], r) < 100).all()
+    done = LevenbergMarquardt().optimise(graph)
+    np.testing.assert_array_equal(done.weights == 0, false)
+    assert ate(done.graph.poses, truth) < 0.5 * ate(plain.poses, truth)
+
+
+def test_few_loops_that_hardly_matter_are_no_reason_to_leave_any_out():
+    graph, _, _ = walk(60, 600)
+    measurements = graph.measurements.copy()
+    # One that is 11 standard deviations off, among 600 that share a squared error of 3600.
+    off = np.zeros(6)
+    off[0] = 11 * SIGMA[0]
+    measurements[-1] = measurements[-1] @ se3.exp(off)
+    graph = replace(graph, measurements=measurements)
+    plain = LevenbergMarquardt(robust="none").optimise(graph)
+    done = LevenbergMarquardt().optimise(graph)
+    assert done.weights.all()
+    np.testing.assert_array_equal(done.graph.poses, plain.graph.poses)
+    measurements[-1] = measurements[-1] @ se3.exp(10 * off)
+    assert LevenbergMarquardt().optimise(graph).weights[-1] == 0
 
 
 def test_without_false_loops_it_is_least_squares():

@@ -12,8 +12,8 @@ from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.charts import Rotation
 from tofuse.posegraph.graph import GraphPart, Gravity, Optimisation, Optimiser, PoseGraph
-from tofuse.posegraph.robust import Robust
-from tofuse.posegraph.solve import Settings, Solution, solve
+from tofuse.posegraph.robust import Robust, Settings
+from tofuse.posegraph.solve import Solution, solve
 from tofuse.posegraph.sparse import parts_of
 
 Float64 = NDArray[np.float64]

@@ -7,14 +7,49 @@ information is multiplied in the next step.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.posegraph.charts import Rotation
+
 Float64 = NDArray[np.float64]
 
 Robust = Literal["none", "huber", "cauchy", "geman-mcclure", "dcs", "switchable", "truncated"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to minimise.
+
+    Attributes
+    ----------
+    robust
+        Kernel of the loop edges.
+    gate
+        Threshold on an edge's squared error in units of its information: at 100, ten standard
+        deviations. (That of a good edge is a chi-square variable with six degrees of freedom,
+        above 40 only once in two million; but few are so good.)
+    slack
+        The information may overstate what the loops are worth: by so much, as a ratio of standard
+        deviations, the threshold may grow, if the median error of the accepted loops asks for
+        it. Of "truncated" alone.
+    rotation
+        Numbers that stand for a rotation, see `tofuse.posegraph.charts`.
+    tolerance
+        Stop when a step lowers the objective by less than this share of it.
+    max_iterations
+        At most so many steps, in each of the stages of "truncated".
+    """
+
+    robust: Robust = "truncated"
+    gate: float = 100.0
+    slack: float = 3.0
+    rotation: Rotation = "tangent"
+    tolerance: float = 1e-6
+    max_iterations: int = 100
 
 
 def cost(kernel: Robust, x: Float64, c: float) -> Float64:

@@ -68,17 +68,18 @@ class PairSystem:
         self._sum_i = _indicator(self.number[i], n, m)
         self._sum_j = _indicator(self.number[j], n, m)
         a, b = self.number[i[both]], self.number[j[both]]
-        self._both, self._swapped = both, a > b
+        self.both, self.swapped = both, a > b
         lower, upper = np.maximum(a, b), np.minimum(a, b)
         keys, where = np.unique(upper * max(n, 1) + lower, return_inverse=True)
-        self._columns, self._rows = np.divmod(keys, max(n, 1))
+        self.columns, self.rows = np.divmod(keys, max(n, 1))
+        self.block_of_both = where
         self._sum_off = _indicator(where, len(keys), len(both))
 
     def _layout(self) -> None:
         """Find where each entry of each block lies in the data of the CSC matrix."""
-        n, k, off = len(self.free), self.size, len(self._rows)
-        rows = np.concatenate([np.arange(n), self._rows, self._columns])
-        columns = np.concatenate([np.arange(n), self._columns, self._rows])
+        n, k, off = len(self.free), self.size, len(self.rows)
+        rows = np.concatenate([np.arange(n), self.rows, self.columns])
+        columns = np.concatenate([np.arange(n), self.columns, self.rows])
         order = np.lexsort((rows, columns))
         height = np.bincount(columns, minlength=n)
         start = np.concatenate([[0], np.cumsum(height)])
@@ -124,8 +125,8 @@ class PairSystem:
             diagonal = diagonal + single[0][self.free]
             gradient = gradient + single[1][self.free]
         # Blocks below the diagonal: rows belong to the pose that is eliminated later.
-        blocks = ij[self._both]
-        low = np.where(self._swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
+        blocks = ij[self.both]
+        low = np.where(self.swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
         low = (self._sum_off @ low.reshape(-1, k * k)).reshape(-1, k, k)
         data = np.empty(len(self._indices))
         for place, values in zip(self._place, (diagonal, low, np.swapaxes(low, 1, 2)), strict=True):
@@ -145,6 +146,11 @@ class PairSystem:
         At = np.swapaxes(A, 1, 2)
         AtH = At @ H
         return self.assemble(AtH @ A, -AtH, H, -(At @ g[..., None])[..., 0], g, single)
+
+    def blocks(self, matrix: Any) -> tuple[Float64, Float64]:
+        """Blocks of an assembled matrix: on the diagonal, and below it at `rows`, `columns`."""
+        data = matrix.data
+        return data[self._place[0]], data[self._place[1]]
 
     def solve(
         self,
@@ -194,7 +200,7 @@ class Factor:
     """A factorised system. Raises RuntimeError where it is singular."""
 
     def __init__(self, system: PairSystem, matrix: Any, gradient: Float64) -> None:
-        self.system, self.gradient = system, gradient
+        self.system, self.gradient, self._matrix = system, gradient, matrix
         # The blocks are in a good order already; the matrix is symmetric, so no pivoting.
         options = {"SymmetricMode": True}
         self._lu = (
@@ -233,17 +239,60 @@ class Factor:
         C = out.reshape(len(vertices) * k, -1)
         return (C + C.T) / 2
 
-    def covariances(self, vertices: Integers | None = None) -> Float64:
-        """(v, k, k) marginal covariances of single poses, all unless given; zero for fixed ones."""
-        system, k = self.system, self.system.size
-        vertices = np.arange(system.n) if vertices is None else np.asarray(vertices, np.intp)
-        out = np.zeros((len(vertices), k, k))
-        for start in range(0, len(vertices), 32):
-            C = self.joint_covariance(vertices[start : start + 32])
-            count = len(C) // k
-            blocks = C.reshape(count, k, count, k)
-            out[start : start + 32] = blocks[np.arange(count), :, np.arange(count), :]
+    def covariances(self) -> Float64:
+        """(n, 6, 6) marginal covariances of every pose's perturbation; zero for fixed ones.
+
+        Raises RuntimeError where the system is not positive definite.
+        """
+        system = self.system
+        out = np.zeros((system.n, system.size, system.size))
+        out[system.free] = self._inverse()[0]
         return out
+
+    def relative_covariances(self, T_i_j: Float64) -> Float64:
+        """(m, 6, 6) covariances of the pairs' relative poses, T_i_j exp(xi); see `covariances`.
+
+        `T_i_j` (m, 4, 4) are the relative poses where the system was made.
+        """
+        system = self.system
+        diagonal, low = self._inverse()
+        i, j = system.pairs.T
+        blocks = np.concatenate([diagonal, np.zeros((1, 6, 6))])  # the last for fixed poses
+        A = se3.adjoint(se3.inverse(T_i_j))
+        At = np.swapaxes(A, 1, 2)
+        C = blocks[system.number[j]] + A @ blocks[system.number[i]] @ At
+        both = system.both
+        cross = low[system.block_of_both]
+        # Blocks lie below the diagonal: (j, i) where i is eliminated first.
+        ji = np.where(system.swapped[:, None, None], np.swapaxes(cross, 1, 2), cross)
+        AC = A[both] @ np.swapaxes(ji, 1, 2)
+        C[both] -= AC + np.swapaxes(AC, 1, 2)
+        return C
+
+    def _inverse(self) -> tuple[Float64, Float64]:
+        """Blocks of the inverse on the diagonal (free, 6, 6), and where pairs have theirs."""
+        # Imported here: Numba takes its time, and most who optimise need no covariances.
+        from tofuse.kernels.selected_inverse import factorise, fill_in, invert
+
+        system = self.system
+        n = len(system.free)
+        diagonal, low = system.blocks(self._matrix)
+        if n == 0:
+            return diagonal, low
+        rows = np.concatenate([np.arange(n), system.rows]).astype(np.int64)
+        columns = np.concatenate([np.arange(n), system.columns]).astype(np.int64)
+        order = np.lexsort((rows, columns))
+        start = np.searchsorted(columns[order], np.arange(n + 1)).astype(np.int64)
+        full_start, full_rows = fill_in(start, rows[order])
+        # Where the blocks of the matrix are in the pattern of its factor, which has more.
+        of_full = np.repeat(np.arange(n), np.diff(full_start))
+        place = np.searchsorted(of_full * n + full_rows, columns * n + rows)
+        values = np.zeros((len(full_rows), 6, 6))
+        values[place] = np.concatenate([diagonal, low])
+        if not factorise(full_start, full_rows, values):
+            raise RuntimeError("the system is not positive definite")
+        invert(full_start, full_rows, values)
+        return values[place[:n]], values[place[n:]]
 
 
 def parts_of(n: int, pairs: Integers) -> Integers:

@@ -1,0 +1,214 @@
+"""Levenberg-Marquardt over edges and gravity: what they say of the poses, and steps down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.posegraph.charts import CHARTS, Chart, Rotation
+from tofuse.posegraph.graph import Gravity
+from tofuse.posegraph.sparse import Factor, PairSystem
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+Bool = NDArray[np.bool_]
+
+_NOTHING = 1e-12  # mean squared error of an edge, in units of its information: rounding
+
+
+class Problem:
+    """Edges and gravity, evaluated and linearised.
+
+    Where the direction of gravity in the world is not known, it is one more pose, of which only
+    two directions matter; the others are held by a unit of information.
+    """
+
+    def __init__(
+        self,
+        pairs: Integers,
+        measurements: Float64,
+        information: Float64,
+        fixed: Bool,
+        gravity: Gravity | None,
+        rotation: Rotation,
+    ) -> None:
+        self.fixed, self.information, self.gravity = fixed, information, gravity
+        self.pairs = pairs
+        self.chart: Chart = CHARTS[rotation]()
+        self._Z_inverse = se3.inverse(measurements)
+        n = len(fixed)
+        joined, held = pairs, fixed
+        self._single: tuple[Float64, Float64] | None = None
+        if gravity is not None:
+            world = np.full(len(gravity.vertices), n)
+            joined = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
+            held = np.append(fixed, gravity.world is not None)
+            block = np.zeros((n + 1, 6, 6))
+            block[n] = np.eye(6)
+            self._single = block, np.zeros((n + 1, 6))
+        self.joined = joined
+        self.system = PairSystem(len(held), joined, held, size=self.chart.size)
+
+    def start(self, poses: Float64) -> Float64:
+        """Poses with the one of gravity's world behind them, where there is gravity."""
+        poses = np.array(poses, float)
+        if self.gravity is None:
+            return poses
+        down = self.gravity.world
+        if down is None:
+            R = poses[self.gravity.vertices, :3, :3]
+            seen = (R @ self.gravity.directions[..., None])[..., 0]
+            down = (seen / self.gravity.sigma[:, None] ** 2).sum(0)
+        # The rotation whose third axis is down; the other two don't matter.
+        down = down / np.linalg.norm(down)
+        x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
+        x /= np.linalg.norm(x)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([x, np.cross(down, x), down], axis=1)
+        return np.concatenate([poses, T[None]])
+
+    def errors(self, poses: Float64) -> tuple[Float64, Float64]:
+        """Return the edges' errors (m, 6) and gravity's (g, 3), each over its sigma."""
+        i, j = self.pairs.T
+        e = se3.log(self._Z_inverse @ (se3.inverse(poses[i]) @ poses[j]))
+        if self.gravity is None:
+            return e, np.zeros((0, 3))
+        return e, (self._seen_down(poses) - [0, 0, 1]) / self.gravity.sigma[:, None]
+
+    def _seen_down(self, poses: Float64) -> Float64:
+        assert self.gravity is not None
+        world, R = poses[-1, :3, :3], poses[self.gravity.vertices, :3, :3]
+        return (world.T @ R @ self.gravity.directions[..., None])[..., 0]
+
+    def linearised(
+        self, poses: Float64, e: Float64, down: Float64, weights: Float64
+    ) -> tuple[Any, Float64]:
+        """Normal equations (matrix, gradient) where the errors were taken."""
+        J = se3.jacobian_inverse(e)
+        JtW = np.swapaxes(J, 1, 2) @ (weights[:, None, None] * self.information)
+        H, g = JtW @ J, (JtW @ e[..., None])[..., 0]
+        i, j = self.joined.T
+        T_i_j = se3.inverse(poses[i]) @ poses[j]
+        if self.gravity is not None:
+            J = np.zeros((len(down), 3, 6))
+            R = T_i_j[len(self.pairs) :, :3, :3]
+            J[:, :, 3:] = (
+                -(R @ se3.hat(self.gravity.directions)) / self.gravity.sigma[:, None, None]
+            )
+            Jt = np.swapaxes(J, 1, 2)
+            H = np.concatenate([H, Jt @ J])
+            g = np.concatenate([g, (Jt @ down[..., None])[..., 0]])
+        basis = self.chart.basis(poses)
+        if basis is None:
+            return self.system.relative(H, g, T_i_j, self._single)
+        return self._in_chart(H, g, T_i_j, *basis)
+
+    def _in_chart(
+        self, H: Float64, g: Float64, T_i_j: Float64, P: Float64, off: Float64
+    ) -> tuple[Any, Float64]:
+        i, j = self.joined.T
+        A = se3.adjoint(se3.inverse(T_i_j)) @ P[i]
+        At, Pt = np.swapaxes(A, 1, 2), np.swapaxes(P, 1, 2)
+        HA, HP = H @ A, H @ P[j]
+        scale = float(np.mean(np.diagonal(H, axis1=1, axis2=2)))
+        block = scale * off
+        if self._single is not None:
+            block = block + Pt @ self._single[0] @ P
+        single = block, np.zeros(block.shape[:2])
+        column = g[..., None]
+        return self.system.assemble(
+            At @ HA, -At @ HP, Pt[j] @ HP, -(At @ column)[..., 0], (Pt[j] @ column)[..., 0], single
+        )
+
+    def factor(self, poses: Float64, weights: Float64) -> Factor | None:
+        """Factorise the undamped normal equations in the tangent chart; None if singular."""
+        plain = self
+        if self.chart.size != 6:
+            plain = Problem(
+                self.pairs, se3.inverse(self._Z_inverse), self.information, self.fixed,
+                self.gravity, "tangent",
+            )  # fmt: skip
+        everywhere = poses if len(poses) == len(plain.system.fixed) else plain.start(poses)
+        matrix, gradient = plain.linearised(everywhere, *plain.errors(everywhere), weights)
+        return plain.system.factor(matrix, gradient)
+
+
+Cost = Callable[[Float64], Float64]
+
+
+class Descent:
+    """Levenberg-Marquardt steps; the damping is carried from one run to the next."""
+
+    def __init__(self, problem: Problem, poses: Float64) -> None:
+        self.problem, self.poses = problem, poses
+        self.damping = 1e-7
+        self.log: list[tuple[Float64, float]] = []
+        self._see()
+        self._note()
+
+    def _see(self) -> None:
+        self.e, self.down = self.problem.errors(self.poses)
+        self.chi2 = np.einsum("mi,mij,mj->m", self.e, self.problem.information, self.e)
+
+    def state(self) -> tuple[Float64, Float64, Float64, Float64]:
+        """What `restore` comes back to."""
+        return self.poses, self.e, self.down, self.chi2
+
+    def restore(self, state: tuple[Float64, Float64, Float64, Float64]) -> None:
+        """Go back, and say so in the log."""
+        self.poses, self.e, self.down, self.chi2 = state
+        self._note()
+
+    def _note(self) -> None:
+        self.log.append((self.chi2, float((self.down**2).sum())))
+
+    def run(self, total: Cost, weights: Cost, tolerance: float, iterations: int) -> bool:
+        """Step down until a step gains too little; whether that came before the last step."""
+        problem = self.problem
+        if problem.fixed.all():
+            return True
+        value = self._value(total)
+        for _ in range(iterations):
+            if value <= _NOTHING * len(problem.pairs):
+                return True
+            matrix, gradient = problem.linearised(self.poses, self.e, self.down, weights(self.chi2))
+            before = value
+            while True:
+                found = self._try(matrix, gradient, total, value)
+                if found is not None:
+                    break
+                self.damping = max(self.damping * 10, 1e-7)
+                if self.damping > 1e8:
+                    # Not even the shortest step goes down.
+                    self.damping = 1e-7
+                    return True
+            value = found
+            self.damping = max(self.damping / 10, 1e-12)
+            self._note()
+            if before - value <= tolerance * before:
+                return True
+        return False
+
+    def _try(self, matrix: Any, gradient: Float64, total: Cost, value: float) -> float | None:
+        """Take one step if it goes down; the new objective, or None and everything as before."""
+        factor = self.problem.system.factor(matrix, gradient, self.damping)
+        step = None if factor is None else factor.step()
+        if step is None:
+            return None
+        kept = self.state()
+        held = self.problem.system.fixed
+        moved = self.problem.chart.retract(self.poses, step)
+        self.poses = np.where(held[:, None, None], self.poses, moved)
+        self._see()
+        new = self._value(total)
+        if new < value:
+            return new
+        self.poses, self.e, self.down, self.chi2 = kept
+        return None
+
+    def _value(self, total: Cost) -> float:
+        return float(total(self.chi2).sum()) + float((self.down**2).sum())

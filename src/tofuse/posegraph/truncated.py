@@ -1,0 +1,164 @@
+"""Least squares in which loops count in full or not at all, and which ones is found out.
+
+1. All loops count. Where every one fits, that is the result, and it is that of least squares.
+2. Otherwise graduated non-convexity (Yang et al. 2020): the threshold of a Geman-McClure kernel
+   falls from the largest error by half at every step, so that the worst loops lose their weight
+   first, and the others come to fit better. Then loops are taken in or left out by their errors
+   until nothing changes.
+3. A false loop can hide: where odometry is weak, it bends to fit it. So every loop is held against
+   what all the others say of it, with the uncertainty that they leave. What is added to the sum of
+   squared errors by letting the loop count has a chi-square distribution if it is true::
+
+       d = m^T W (I - C W)^-1 m
+
+   with m the loop's error, W its information, C the covariance of the relative pose that it
+   measures, all in the same tangent space. The worst are left out and the rest solved again, and
+   those that fit after all are taken in.
+
+Information often promises too much. So the threshold grows with the errors of the better half of
+the loops, up to a limit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.posegraph import robust
+from tofuse.posegraph.descent import Descent, Problem
+from tofuse.posegraph.robust import Settings
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+_QUARTILE = 3.4546  # of a chi-square variable with six degrees of freedom
+_ROUNDS = 20  # at most so many times loops are taken in or left out
+_DENSE = 3.0  # edges for each pose, above which no loop can bend the others to its will
+_WORTH = (
+    0.01  # share of the objective that leaving loops out must save: few that hardly matter stay
+)
+
+
+class Truncated:
+    """The search for the loops that count.
+
+    After `run`, `descent` holds the poses, `weights` (m,) is 1 or 0 for each edge, and `limit`
+    (m,) is what an edge's squared error counts at most in the objective.
+    """
+
+    def __init__(self, problem: Problem, poses: Float64, loop: Bool, settings: Settings) -> None:
+        self.problem, self.loop, self.settings = problem, loop, settings
+        self.descent = Descent(problem, problem.start(poses))
+        self.weights = np.ones(len(loop))
+        self.limit = np.full(len(loop), np.inf)
+
+    def run(self) -> bool:
+        """Find loops and poses; whether the last descent met its stopping rule."""
+        loop, descent = self.loop, self.descent
+        converged = self._with(self.weights)
+        plain, everything = descent.state(), float(descent.chi2.sum())
+        if everything <= self.settings.gate:
+            return converged  # no loop can have added more than there is
+        gate = self._gate(descent.chi2[loop])
+        if not (descent.chi2[loop] <= gate).all():
+            self._graduate()
+            accepted = descent.chi2[loop] <= self.settings.gate * self.settings.slack**2
+            gate = self._gate(descent.chi2[loop][accepted])
+            converged = self._settle(gate)
+        if len(loop) <= _DENSE * len(self.problem.fixed):
+            converged = self._unmask(converged)
+        if (self.weights == 1).all():
+            return converged
+        limit = np.where(loop, gate, np.inf)
+        if np.minimum(descent.chi2, limit).sum() > (1 - _WORTH) * everything:
+            descent.restore(plain)
+            self.weights = np.ones(len(loop))
+            return True
+        self.limit = limit
+        return converged
+
+    def _with(self, weights: Float64) -> bool:
+        settings = self.settings
+        return self.descent.run(
+            lambda x: weights * x, lambda x: weights, settings.tolerance, settings.max_iterations
+        )
+
+    def _gate(self, errors: Float64) -> float:
+        """Threshold on squared errors, grown by what those of the better half show."""
+        spread = float(np.quantile(errors, 0.25)) / _QUARTILE if len(errors) else 1.0
+        return self.settings.gate * float(np.clip(spread, 1.0, self.settings.slack**2))
+
+    def _graduate(self) -> None:
+        loop, descent = self.loop, self.descent
+        c, lowest = float(descent.chi2[loop].max()), self.settings.gate
+        while c > lowest:
+            c = max(c / 2, lowest)
+
+            def total(x: Float64, c: float = c) -> Float64:
+                return np.where(loop, robust.cost("geman-mcclure", x, c), x)
+
+            def weights(x: Float64, c: float = c) -> Float64:
+                return np.where(loop, robust.weight("geman-mcclure", x, c), 1.0)
+
+            descent.run(total, weights, 1e-3, 2)
+
+    def _settle(self, gate: float) -> bool:
+        """Take in and leave out by the loops' errors until nothing changes."""
+        for _ in range(_ROUNDS):
+            before = self.weights
+            self.weights = np.where(self.loop & (self.descent.chi2 > gate), 0.0, 1.0)
+            converged = self._with(self.weights)
+            if (self.weights == before).all():
+                return converged
+        return False
+
+    def _unmask(self, converged: bool) -> bool:
+        """Take in and leave out by what the other edges say of each loop."""
+        seen = set()
+        for _ in range(_ROUNDS + int(self.loop.sum())):
+            d = self._against_the_others()
+            if d is None:
+                return converged
+            counts = self.loop & (self.weights > 0)
+            gate = self._gate(d[counts])
+            if (counts & (d > gate)).any():
+                # The worst first: they make others look bad.
+                worst = counts & (d > max(gate, d[counts].max() / 2))
+                weights = np.where(worst, 0.0, self.weights)
+            else:
+                weights = np.where(self.loop & ~counts & (d <= gate), 1.0, self.weights)
+            key = weights.tobytes()
+            if (weights == self.weights).all() or key in seen:
+                return converged
+            seen.add(key)
+            self.weights = weights
+            converged = self._with(weights)
+        return False
+
+    def _against_the_others(self) -> Float64 | None:
+        """(m,) squared errors of loops against all other edges; None if that can't be told."""
+        problem, descent = self.problem, self.descent
+        factor = problem.factor(descent.poses, self.weights)
+        if factor is None:
+            return None
+        i, j = problem.joined.T
+        T_i_j = se3.inverse(descent.poses[i]) @ descent.poses[j]
+        try:
+            C = factor.relative_covariances(T_i_j)[: len(self.loop)][self.loop]
+        except RuntimeError:
+            return None
+        e = descent.e[self.loop]
+        J = se3.jacobian_inverse(e)
+        W = np.swapaxes(J, 1, 2) @ problem.information[self.loop] @ J
+        value, vector = np.linalg.eigh(W)
+        root = vector * np.sqrt(np.maximum(value, 0))[:, None]  # W = root root^T
+        Rt = np.swapaxes(root, 1, 2)
+        m = (Rt @ (se3.jacobian(e) @ e[..., None]))[..., 0]
+        # Of a loop that counts C has seen it already; of one that does not it has not.
+        sign = np.where(self.weights[self.loop] > 0, -1.0, 1.0)
+        held, axes = np.linalg.eigh(np.eye(6) + sign[:, None, None] * (Rt @ C @ root))
+        along = (np.swapaxes(axes, 1, 2) @ m[..., None])[..., 0]
+        d = np.zeros(len(self.loop))
+        d[self.loop] = (along**2 / np.maximum(held, 1e-9)).sum(axis=1)
+        return d
