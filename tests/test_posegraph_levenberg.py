@@ -212,7 +212,7 @@ def test_a_false_loop_can_not_hide_where_odometry_is_weak():
     graph = replace(graph, measurements=measurements, information=loose * graph.information)
     plain = LevenbergMarquardt(robust="none").optimise(graph).graph
     r = plain.residuals()[false]
-    assert (np.einsum("mi,mij,mj->m", r, plain.information[false], r) < 100).all()
+    assert np.einsum("mi,mij,mj->m", r, plain.information[false], r).min() < 6
     done = LevenbergMarquardt().optimise(graph)
     np.testing.assert_array_equal(done.weights == 0, false)
     assert ate(done.graph.poses, truth) < 0.5 * ate(plain.poses, truth)
