@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.geometry.cameras import BrownConrady, Pinhole
+from tofuse.kernels.middle import median
 from tofuse.kernels.surface import (
     SUMS,
     add_rows,
@@ -47,6 +48,12 @@ def fit(w, rays, weight, radii=(2, 5), limit=1e-6, fill=0.7, offset=0.2):
     return planes, quality
 
 
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+def test_the_median_is_the_upper_one(count):
+    values = np.random.default_rng(count).normal(size=(count, 1)).astype(np.float32)
+    assert median(values) == np.sort(values.ravel())[count // 2]
+
+
 # --- halve ---------------------------------------------------------------------------------------
 
 
@@ -69,7 +76,8 @@ def halve_twin(z, value, variance, jump):
 
 def halved(z, value, variance=None, jump=0.02):
     out = np.full((3, z.shape[0] // 2, z.shape[1] // 2), 7, np.float32)
-    halve(z, value, value if variance is None else variance, jump, *out)
+    for start, stop in ((0, 3), (3, out.shape[1])):
+        halve(z, value, value if variance is None else variance, jump, *out, start, stop)
     return out
 
 

@@ -27,18 +27,20 @@ def halve(
     z_out: Float32,
     value_out: Float32,
     variance_out: Float32,
+    start: int,
+    stop: int,
 ) -> None:
-    """Halve an image: the mean of those pixels of each 2x2 block that lie on one surface.
+    """Halve an image, to rows start..stop: each pixel is the mean of one surface's in its 2x2.
 
     Of four depths those within `jump` (share of the depth) of the second nearest are averaged, as
     inverse depths; zeros don't count. `value` is averaged over the same pixels, and `variance`,
     that of z, becomes the variance of their mean, as for noise that they don't share.
     """
-    rows, columns = z_out.shape
+    columns = z_out.shape[1]
     d = np.empty(4)
     a = np.empty(4)
     s = np.empty(4)
-    for i in range(rows):
+    for i in range(start, stop):
         for j in range(columns):
             n = 0
             for k in range(4):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels.alignment import make_target
+from tofuse.kernels.middle import median
 from tofuse.kernels.surface import (
     SUMS,
     add_rows,
@@ -105,6 +106,17 @@ class Projection:
     rays: Float32
     lookup: Float32
     frame: Float64
+
+    @cached_property
+    def unknown(self) -> NDArray[np.bool_] | None:
+        """(H, W) whether a pixel's ray is unknown; None if no pixel's is."""
+        unknown: NDArray[np.bool_] = np.isnan(self.lengths2)
+        return unknown if unknown.any() else None
+
+    @cached_property
+    def lengths2(self) -> Float32:
+        """(H, W) squared ratio of the range to z."""
+        return np.float32(1) + (self.rays * self.rays).sum(-1)
 
     @classmethod
     def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:
@@ -203,7 +215,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     projection, z, light, own = _reduced(frame, options.columns)
     rays = projection.rays
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
-    sigma = _noise_law(frame, z, light, rays) if own is None else own
+    sigma = _noise_law(frame, z, light, projection) if own is None else own
     # d(1/z) = dz / z^2
     weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
     if options.edge_margin:
@@ -272,22 +284,15 @@ def _reduced(
     variance = _own_variance(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
-        halves = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
-        halve(
-            z,
-            z if light is None else light,
-            z if variance is None else variance,
-            _HALVING_JUMP,
-            *halves,
-        )
+        halves = _halved(z, z if light is None else light, z if variance is None else variance)
         z = halves[0]
         light = None if light is None else halves[1]
         variance = None if variance is None else halves[2]
         step *= 2
     projection = _projection(frame.camera, step)
-    if step > 1:
+    if step > 1 and projection.unknown is not None:
         # The mean of a block of rays that holds an unknown one is unknown.
-        z[np.isnan(projection.rays).any(-1)] = 0
+        z[projection.unknown] = 0
     return projection, z, light, None if variance is None else np.sqrt(variance)
 
 
@@ -299,6 +304,16 @@ def _own_variance(frame: RangeFrame) -> Float32 | None:
     # The noise is that of the range, along the ray.
     sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
     return np.asarray(sigma * sigma, np.float32)
+
+
+def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
+    out = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
+    run_chunks(
+        lambda a, b: halve(z, light, variance, _HALVING_JUMP, out[0], out[1], out[2], a, b),
+        len(out[0]),
+        _CHUNKS,
+    )
+    return out
 
 
 def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
@@ -315,19 +330,22 @@ def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
     return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
 
 
-def _noise_law(frame: RangeFrame, z: Float32, light: Float32 | None, rays: Float32) -> Float32:
+def _noise_law(
+    frame: RangeFrame, z: Float32, light: Float32 | None, projection: Projection
+) -> Float32:
     """Sigma of z in m up to a factor."""
     if light is None or frame.amplitude_kind == "ir":
         return np.float32(0.001) + np.float32(0.003) * z * z
     if frame.amplitude_kind == "raw":
         raw = light
     else:
-        r2 = z * z * (1 + (rays * rays).sum(-1))
+        r2 = z * z * projection.lengths2
         raw = np.divide(light, r2, out=np.zeros_like(z), where=r2 > 0)
-    lit = raw[raw > 0]
+    lit = raw[::2, ::2]
+    lit = lit[lit > 0]
     if len(lit) == 0:
         return np.float32(0.001) + np.float32(0.003) * z * z
-    typical = np.float32(np.median(lit))
+    typical = np.float32(median(lit))
     law = np.divide(typical, raw, out=np.full_like(z, 20), where=raw > 0)
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
 
@@ -338,7 +356,7 @@ def _least_scale(z: Float32, sigma: Float32) -> float:
     known = (z > 0) & (sigma > 0)
     if not known.any():
         return 0.0
-    return float(np.median(_LEAST_NOISE * z[known] / sigma[known])) ** 2
+    return median(_LEAST_NOISE * z[known] / sigma[known]) ** 2
 
 
 def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radius: int) -> float:
@@ -355,4 +373,4 @@ def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radi
     found = found[np.isfinite(found)]
     if len(found) == 0:
         return 1.0
-    return float(np.clip(np.median(found), 1e-6, 1e6))
+    return min(max(median(found), 1e-6), 1e6)

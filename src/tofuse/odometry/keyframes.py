@@ -255,8 +255,10 @@ class _KeyframeTracker(Tracker):
         # A motion must explain more than standing still does: a flat wall fits any.
         chosen = best if best.score > 1.03 * still.score else still
         T = self._T if chosen is still else chosen.T_world_source
-        # With no prediction to keep to, what little the data tells is the better guess.
-        how = replace(self._options.alignment, levels=_PATIENT, common_tilt=0.0, common_slope=0.0)
+        how = replace(self._options.alignment, levels=_PATIENT)
+        if not self._lost:
+            # With no prediction to keep to, what little the data tells is the better guess.
+            how = replace(how, common_tilt=0.0, common_slope=0.0)
         yield T, chosen.T_world_source, how
 
     def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe] | None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.doubt import faked_information
+from tofuse.kernels.middle import median
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 
@@ -240,10 +241,8 @@ def align(
     if photometric:
         state.exposure = _seen_exposure(points, targets, T0) if exposure is None else exposure
     if len(points):
-        middle = len(points) // 2
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
-        typical = float(np.partition(sigma, middle)[middle])
-        state.most = max(3.0, options.most_sigma_m / typical)
+        state.most = max(3.0, options.most_sigma_m / median(sigma))
     for number, level in enumerate(options.levels):
         if number and level.stride != options.levels[number - 1].stride:
             points = points_of(source, level.stride)
@@ -339,7 +338,7 @@ def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> fl
             kernels.exposure_differences(points, every, view.target, grid.lookup, grid.frame, moved)
         )
     both = np.concatenate(seen) if seen else np.zeros(0)
-    return float(np.median(both)) if len(both) else 0.0
+    return median(both) if len(both) else 0.0
 
 
 def _doubt(

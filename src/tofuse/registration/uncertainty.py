@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import tiles as kernels
+from tofuse.kernels.middle import median
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target
@@ -140,7 +141,7 @@ def patches(
     )
     some = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
     some = some[some > 0]
-    depth = 1 / float(np.partition(some, len(some) // 2)[len(some) // 2]) if len(some) else 1.0
+    depth = 1 / median(some) if len(some) else 1.0
     sums = []
     changes = []
     for target in targets:
@@ -270,7 +271,7 @@ def _seen_variance(
     n = len(found.weights)
     M = np.eye(n) - (found.responses / found.weights[:, None]) @ bread @ found.responses.T
     share = found.weights / found.weights.sum()
-    share = np.minimum(share, 4 * np.median(share))
+    share = np.minimum(share, 4 * median(share))
     expected = float(share @ ((M @ alike) * M).sum(1))
     noise = float(share @ ((M / found.weights) * M).sum(1))
     surplus = float(share @ found.means**2) - noise
