@@ -200,19 +200,20 @@ def test_false_loops_are_left_out_and_true_ones_kept(seed):
     assert ate(plain, truth) > 20 * alone
 
 
-def test_a_false_loop_can_not_hide_where_odometry_is_weak():
+@pytest.mark.parametrize("seed", [0, 4, 5])
+def test_a_false_loop_can_not_hide_where_odometry_is_weak(seed):
     """It bends the odometry and fits then; but the other loops contradict it."""
     rng = np.random.default_rng(7)
-    graph, truth, false = walk(loops=5, false=2, seed=1)
-    loose = np.where(graph.loop, 1.0, 1 / 144)[:, None, None]
+    graph, truth, false = walk(loops=5, false=2, seed=seed)
     i, j = graph.edges[:59].T
     measurements = graph.measurements.copy()
-    exact = se3.inverse(truth[i]) @ truth[j]
-    measurements[:59] = exact @ se3.exp(rng.normal(size=(59, 6)) * SIGMA * 12)
+    noise = se3.exp(rng.normal(size=(59, 6)) * SIGMA * 10)
+    measurements[:59] = se3.inverse(truth[i]) @ truth[j] @ noise
+    loose = np.where(graph.loop, 1.0, 0.01)[:, None, None]
     graph = replace(graph, measurements=measurements, information=loose * graph.information)
     plain = LevenbergMarquardt(robust="none").optimise(graph).graph
     r = plain.residuals()[false]
-    assert np.einsum("mi,mij,mj->m", r, plain.information[false], r).min() < 6
+    assert np.einsum("mi,mij,mj->m", r, plain.information[false], r).max() < 6
     done = LevenbergMarquardt().optimise(graph)
     np.testing.assert_array_equal(done.weights == 0, false)
     assert ate(done.graph.poses, truth) < 0.5 * ate(plain.poses, truth)
