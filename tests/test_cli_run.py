@@ -27,6 +27,8 @@ from tofuse.pipeline.config import from_method
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.results.output import STAGING
 from tofuse.results.verdict import REASONS
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import simulate
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply")
 FILES = {*SAME, "report.html", "run.json"}
@@ -202,9 +204,6 @@ def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
     names = [f["part"] for f in run_json(tmp_path / "a")["config"]["filters"]]
     assert names[0] == "distance"
     assert names[1:] == [name_of(f) for f in from_method("thesis").filters]
-    run(room_recording, "--out", tmp_path / "b", "--object", "--every", 4, *thesis)
-    names = [f["part"] for f in run_json(tmp_path / "b")["config"]["filters"]]
-    assert names[0] == "foreground"
     run(
         room_recording,
         "--out",
@@ -222,6 +221,32 @@ def test_filters_of_options_come_first(room_recording, tmp_path) -> None:
     # Nothing beyond the limit is in the model: the camera hardly moves from where it began.
     first = read_ply(tmp_path / "c/cloud.ply").points
     assert np.linalg.norm(first, axis=1).max() < 4
+
+
+def test_an_object_is_told_from_its_background(tmp_path) -> None:
+    effects = Effects.none(shot_noise=True, scatter=0.02)
+    simulate("box", tmp_path / "rec", every=20, frames=9, effects=effects)
+    run(tmp_path / "rec", "--out", tmp_path / "out", "--object")
+    made = run_json(tmp_path / "out")
+    assert made["config"]["filters"] == [{"part": "background", "sigmas": 4.0, "share": 0.02}]
+    *_, scattering, multipath = made["config"]["corrections"]
+    assert (scattering["part"], multipath["part"]) == ("scattering", "multipath")
+    assert 0.01 < sum(scattering["shares"]) < 0.04
+    assert 0.5 < made["filters"]["background"]["removed"] < 0.95
+    # The wall is 4 m away.
+    assert np.linalg.norm(read_ply(tmp_path / "out/cloud.ply").points, axis=1).max() < 2
+    # The run can be repeated from what it wrote.
+    again = ["--config", tmp_path / "out/run.json", "--threads", 1]
+    run(tmp_path / "rec", "--out", tmp_path / "again", "--object", *again)
+    assert same(tmp_path / "again") == same(tmp_path / "out")
+
+
+def test_a_moving_camera_has_no_background(room_recording, tmp_path, capsys) -> None:
+    run(room_recording, "--out", tmp_path / "out", "--object", status=2)
+    said = capsys.readouterr().err
+    assert "leave it out if the camera moves" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_bad_frame_in_the_middle_is_skipped_and_counted(recording, tmp_path, capsys) -> None:

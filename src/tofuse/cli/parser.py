@@ -110,7 +110,7 @@ def _processing(p: argparse.ArgumentParser) -> None:
     g.add_argument(
         "--object",
         action="store_true",
-        help="a turned object before a still background, not a moving camera",
+        help="a turned object before a still background, which is learnt unless cut off",
     )
     _seed(g)
     g.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")

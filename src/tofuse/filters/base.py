@@ -24,6 +24,8 @@ class Filter(Protocol):
         Kinds of view it works on: "range", "cloud".
     window
         How many frames it looks at, the current one included; 1 for all but temporal filters.
+    learns
+        Whether it must see frames of the whole recording first.
     """
 
     part_kind: ClassVar[str] = "filter"
@@ -33,6 +35,21 @@ class Filter(Protocol):
     def window(self) -> int:
         """How many frames it looks at, the current one included."""
         return 1
+
+    @property
+    def learns(self) -> bool:
+        """Whether it must see frames of the whole recording, with `learnt`, before it works."""
+        return False
+
+    def learnt(self, frames: Sequence[Frame]) -> Filter:
+        """Return the filter with what it has learnt from frames spread over a recording.
+
+        Parameters
+        ----------
+        frames
+            As they reach this filter: corrected, and filtered by those before it.
+        """
+        return self
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """Say which points to keep.

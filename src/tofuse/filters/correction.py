@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
 from tofuse.recordings.frames import Frame
@@ -26,10 +27,27 @@ class Correction(Protocol):
     ----------
     takes
         Kinds of view it works on, or passes through: "range", "cloud".
+    learns
+        Whether it can learn from frames of the whole recording first.
     """
 
     part_kind: ClassVar[str] = "correction"
     takes: ClassVar[frozenset[str]]
+
+    @property
+    def learns(self) -> bool:
+        """Whether it can learn from frames of the whole recording, with `learnt`, beforehand."""
+        return False
+
+    def learnt(self, frames: Sequence[Frame]) -> Correction:
+        """Return the correction with what it has learnt from frames spread over a recording.
+
+        Parameters
+        ----------
+        frames
+            As they reach this correction: corrected by those before it.
+        """
+        return self
 
     def start(self) -> Corrector:
         """Begin a recording, about which the correction may learn from its frames, in order."""

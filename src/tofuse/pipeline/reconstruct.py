@@ -19,6 +19,7 @@ from tofuse.filters.confidence import Confidence
 from tofuse.filters.noise import Noise
 from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
+from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.posegraph.loops import GivenLoop
@@ -60,11 +61,12 @@ def reconstruct(
     Raises
     ------
     InputError
-        If no frame can be read, or none has enough valid points for a pose.
+        If no frame can be read, or none has enough valid points for a pose; or if a filter can't
+        learn what it has to.
     """
     progress = progress or Silent()
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
-    config = fitted(config, recording)
+    config = learnt(fitted(config, recording), recording, threads)
     mapper = Mapper(config, seed=seed, threads=threads, loops=loops, progress=progress)
     progress.stage("tracking", len(recording))
     odometry = recording.odometry

@@ -13,6 +13,7 @@ from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
 from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
+from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import (
     fitted,
@@ -74,7 +75,7 @@ def run(
         recording = average_still(recording)
     config = resolve(options, view_kind(recording))
     _check_guess(options, recording)
-    config = fitted(config, recording)
+    config = learnt(fitted(config, recording), recording, options.threads)
     loops = (
         read_loops(options.loops, frozenset(recording.indices.tolist())) if options.loops else ()
     )
@@ -117,11 +118,19 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
                 remedy="give a larger one",
             )
         front.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
-    if options.object and options.max_depth is None:
-        front.append({"part": "foreground"})
-    if front:
-        filters = [*front, *config.to_dict()["filters"]]
-        config = changed(config, {"filters": filters}, where="--max-depth")
+    chosen = config.to_dict()
+    filters = {item["part"] for item in chosen["filters"]}
+    corrections = list(chosen["corrections"])
+    if options.object:
+        if options.max_depth is None and not filters & {"background", "foreground", "mask", "box"}:
+            front.append({"part": "background"})
+        # What the lens scatters stays where it is in the image, and holds the object back.
+        names = [item["part"] for item in corrections]
+        if "multipath" in names and "scattering" not in names:
+            corrections.insert(names.index("multipath"), {"part": "scattering"})
+    if front or corrections != chosen["corrections"]:
+        lists = {"filters": [*front, *chosen["filters"]], "corrections": corrections}
+        config = changed(config, lists, where="--object" if options.object else "--max-depth")
     return config
 
 

@@ -1,0 +1,66 @@
+"""Keep the pixels that an image marks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.filters.base import Bool, Filter
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+
+
+@part("filter", "mask")
+@dataclass(frozen=True)
+class Mask(Filter):
+    """Keep the pixels at which a mask, one image for the whole recording, is not black.
+
+    Attributes
+    ----------
+    image
+        Path of the image, of the size of the depth images.
+    """
+
+    image: str
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        if not self.image:
+            raise ValueError("image is empty: give the path of a mask")
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`; InputError if the image can't be read, or has another size."""
+        assert isinstance(frame, RangeFrame)
+        keep = _read(self.image)
+        if keep.shape != frame.depth.shape:
+            rows, columns = frame.depth.shape
+            raise InputError(
+                f"is {keep.shape[1]} x {keep.shape[0]}, the depth images are {columns} x {rows}",
+                where=self.image,
+                remedy="give a mask of their size",
+            )
+        return keep
+
+
+@lru_cache(maxsize=8)
+def _read(path: str) -> Bool:
+    try:
+        data = np.frombuffer(Path(path).read_bytes(), np.uint8)
+    except OSError as error:
+        raise InputError(
+            f"can't be read ({error.strerror})", where=path, remedy="check the path of the mask"
+        ) from error
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if image is None:
+        raise InputError("is no image", where=path, remedy="give a PNG or JPEG")
+    keep = image[..., :3].any(-1) if image.ndim == 3 else image != 0
+    keep.setflags(write=False)
+    return np.asarray(keep)

@@ -1,0 +1,161 @@
+"""Take the light out of a view that the lens scattered over the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.filters._options import above, within
+from tofuse.filters.correction import Correction
+from tofuse.filters.multipath import light_image
+from tofuse.parts import part
+from tofuse.recordings.background import moving_object
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.sensor.multipath import LightImage
+from tofuse.sensor.scattering import Scattering, learn_shares
+
+Bool = NDArray[np.bool_]
+Complex = NDArray[np.complex128]
+
+# A pixel with less than this share of its light its own is measured too badly to be saved.
+_LEAST_OWN = 0.5
+# Around what moves, pixels that are neither still nor of the object: the lens blurs its outline.
+_RIM = 4
+# Share of the frames in which a still pixel must show its background.
+_STILL = 0.9
+
+
+@part("correction", "scattering", label="validated")
+@dataclass(frozen=True)
+class LensScattering(Correction):
+    """Take off the light that the lens scatters (Mure-Dubois and Huegli 2007), see `sensor`.
+
+    Works on cameras of one modulation frequency that record amplitude; other views are passed on
+    as they are, and all are where the shares are neither given nor learnt.
+
+    Attributes
+    ----------
+    shares
+        Share of the light that goes into each Gaussian. None: learnt from the recording, where
+        something moves before a background that stands still.
+    widths
+        Standard deviations of the Gaussians, as shares of the image's width.
+    period_m
+        Range after which the phase repeats; None: as the frame says.
+    """
+
+    shares: tuple[float, ...] | None = None
+    widths: tuple[float, ...] = (0.04, 0.1, 0.3)
+    period_m: float | None = None
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if not self.widths:
+            raise ValueError("widths is empty: give one or more")
+        for width in self.widths:
+            above("widths", width, 0.005)
+            within("widths", width, 0, 2)
+        if self.shares is not None:
+            if len(self.shares) != len(self.widths):
+                raise ValueError(
+                    f"shares has {len(self.shares)} numbers, widths {len(self.widths)}"
+                )
+            for share in self.shares:
+                within("shares", share, 0, 0.5)
+        if self.period_m is not None:
+            above("period_m", self.period_m, 0)
+
+    @property
+    def learns(self) -> bool:
+        """See `Correction.learns`."""
+        return self.shares is None
+
+    def learnt(self, frames: Sequence[Frame]) -> LensScattering:
+        """See `Correction.learnt`; no share where nothing moves before a still background."""
+        shares = np.zeros(len(self.widths))
+        images = [frame for frame in frames if isinstance(frame, RangeFrame)]
+        light = [x for image in images if (x := light_phasor(image, self.period_m)) is not None]
+        if images and len(light) == len(images):
+            with suppress(InputError):
+                moves, still = _moves_and_still(images)
+                shares = learn_shares(np.stack(light), moves, still, self.widths)
+        return replace(self, shares=tuple(float(share) for share in shares))
+
+    def start(self) -> ScatteringCorrector:
+        """See `Correction.start`."""
+        return ScatteringCorrector(self)
+
+
+class ScatteringCorrector:
+    """Corrects the frames of one recording."""
+
+    def __init__(self, options: LensScattering) -> None:
+        self._period_m = options.period_m
+        self._model = (
+            Scattering(options.widths, options.shares)
+            if options.shares is not None and any(options.shares)
+            else None
+        )
+
+    def apply(self, frame: Frame) -> Frame:
+        """See `Corrector.apply`. The amplitude loses its scattered share as well."""
+        if self._model is None or not isinstance(frame, RangeFrame):
+            return frame
+        image = light_image(frame, self._period_m)
+        if image is None:
+            return frame
+        measured = _phasor(image)
+        own = self._model.removed(measured)
+        lit = (measured != 0) & (np.abs(own) > _LEAST_OWN * np.abs(measured))
+        ratio = np.where(lit, own, 1) / np.where(lit, measured, 1)
+        r = np.where(lit, frame.radial_range, 1)
+        nearer = 1 + np.angle(ratio) * (image.period_m / (2 * np.pi)) / r
+        lit &= nearer > 0
+        nearer = np.where(lit, nearer, 1)
+        factor = np.where(lit, np.abs(ratio), 1)
+        if frame.amplitude_kind == "range_compensated":
+            factor = factor * nearer**2
+        assert frame.amplitude_image is not None
+        return replace(
+            frame,
+            depth=(frame.depth * nearer).astype(np.float32),
+            amplitude_image=(frame.amplitude_image * factor).astype(np.float32),
+        )
+
+
+def _moves_and_still(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
+    """(H, W) masks: where something moves, and what is far from it and always shows itself."""
+    found = moving_object(images)
+    moves = found.own | np.any([found.mask(image.z) for image in images], axis=0)
+    square = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
+    around = cv2.dilate(moves.astype(np.uint8), square) > 0
+    return moves, ~around & np.isfinite(found.far.z) & (found.far.share > _STILL)
+
+
+def light_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex | None:
+    """Return the light (H, W) of a frame, with its phase; 0 where there is none.
+
+    None where the light or the period is not known.
+    """
+    image = light_image(frame, period_m)
+    return None if image is None else _phasor(image)
+
+
+def _phasor(image: LightImage) -> Complex:
+    """Phasor (H, W) of the raw light; 0 where there is none."""
+    seen = (image.z > 0) & (image.light > 0)
+    x, y = image.rays[..., 0], image.rays[..., 1]
+    r = np.where(seen, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
+    phase = np.float32(2 * np.pi / image.period_m) * r
+    light = np.where(seen, image.light, np.float32(0))
+    out = np.empty(r.shape, np.complex128)
+    out.real, out.imag = light * np.cos(phase), light * np.sin(phase)
+    return out

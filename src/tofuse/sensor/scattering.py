@@ -1,0 +1,156 @@
+"""Light that the lens scatters over the image, and the range bias that it makes.
+
+Between lens and sensor a share of the light is reflected to and fro, and falls on other pixels:
+a bright, near object pulls the range of all others towards its own, in a pattern that is fixed to
+the image. What a pixel measures, as a phasor (amplitude and phase), is its own light plus a blurred
+image of all light (Mure-Dubois and Huegli 2007, who take the blur for a sum of Gaussians, too)::
+
+    M = D + sum_i s_i G_i * D
+
+The shares s_i can be seen where a thing moves before a background that stands still: whatever of
+the background's light follows the blurred image of the thing was scattered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+Float64 = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Bool = NDArray[np.bool_]
+
+# The blur is computed on an image of about so many columns.
+_COLUMNS = 44
+# Fixed-point steps that take the scattered light off: each is right to one more power of its share.
+_STEPS = 2
+# Fewest still pixels to learn from.
+_LEAST_PIXELS = 200
+# Least chi^2 that scattering must explain to be believed: neighbouring pixels share some noise.
+_LEAST_CHI2 = 50.0
+# Larger shares than this in all are another effect.
+_MOST_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Scattering:
+    """How much light a lens scatters, and how far.
+
+    Attributes
+    ----------
+    widths
+        Standard deviations of the Gaussians, as shares of the image's width.
+    shares
+        Share of the light that goes into each.
+    """
+
+    widths: tuple[float, ...]
+    shares: tuple[float, ...]
+
+    def removed(self, measured: Complex) -> Complex:
+        """Return the measured light (H, W) without what was scattered onto each pixel.
+
+        What is scattered varies slowly over the image, so it is computed on a coarse grid.
+        """
+        step = _coarse_step(measured.shape[1], min(self.widths))
+        coarse = _reduced(measured, step)
+        own, scattered = coarse, np.zeros_like(coarse)
+        for _ in range(_STEPS):
+            scattered = np.zeros_like(coarse)
+            for width, share in zip(self.widths, self.shares, strict=True):
+                if share:
+                    scattered += share * _blurred(own, width * measured.shape[1] / step)
+            own = coarse - scattered
+        return measured - _enlarged(scattered, step, measured.shape)
+
+
+def blurred(light: Complex, width: float) -> Complex:
+    """Blur an image (H, W) by a Gaussian of `width` times its width; beyond it there is no light.
+
+    Fine detail is lost in a wide blur, so that it is computed on a coarse grid.
+    """
+    step = _coarse_step(light.shape[1], width)
+    small = _blurred(_reduced(light, step), width * light.shape[1] / step)
+    return _enlarged(small, step, light.shape)
+
+
+def _coarse_step(columns: int, width: float) -> int:
+    """Side in pixels of the blocks of the coarse grid, at least two to a standard deviation."""
+    return max(1, min(columns // _COLUMNS, int(width * columns / 2)))
+
+
+def _reduced(light: Complex, step: int) -> Float64:
+    """Block means (h, w, 2): real and imaginary part."""
+    rows, columns = light.shape
+    h, w = -(-rows // step), -(-columns // step)
+    padded = np.zeros((h * step, w * step, 2))
+    padded[:rows, :columns, 0] = light.real
+    padded[:rows, :columns, 1] = light.imag
+    size = (w, h)
+    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.float64)
+
+
+def _blurred(small: Float64, sigma: float) -> Float64:
+    kernel = cv2.getGaussianKernel(2 * int(np.ceil(3 * sigma)) + 1, sigma)
+    border = cv2.BORDER_CONSTANT
+    return np.asarray(cv2.sepFilter2D(small, cv2.CV_64F, kernel, kernel, borderType=border))
+
+
+def _enlarged(small: Float64, step: int, shape: tuple[int, ...]) -> Complex:
+    size = (small.shape[1] * step, small.shape[0] * step)
+    large = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
+    return np.ascontiguousarray(large).view(np.complex128)[..., 0]
+
+
+def learn_shares(light: Complex, source: Bool, still: Bool, widths: tuple[float, ...]) -> Float64:
+    """Find the shares of light that a lens scatters from what moves onto what does not.
+
+    Of each still pixel the change over time is compared with that of the blurred images of what
+    moves (least squares, no share below 0). What changes all still pixels alike, the exposure or
+    the sensor's temperature, is taken off from both.
+
+    Parameters
+    ----------
+    light
+        (N, H, W) phasors.
+    source, still
+        (H, W) where things move; where nothing does, in any of the images.
+    widths
+        See `Scattering`.
+
+    Returns
+    -------
+    The share of each width; all 0 where nothing is scattered, or nothing can be told.
+    """
+    none = np.zeros(len(widths))
+    still = still & (light != 0).all(0)
+    if np.count_nonzero(still) < _LEAST_PIXELS or len(light) < 3:
+        return none
+    seen = light[:, still]
+    mean = seen.mean(0)
+
+    def own_change(values: Complex) -> Float64:
+        change = values - values.mean(0)
+        common = (change * mean.conj()).sum(1) / (np.abs(mean) ** 2).sum()
+        change = change - common[:, None] * mean
+        return np.concatenate([change.real.ravel(), change.imag.ravel()])
+
+    moving = np.where(source, light, 0)
+    images = [np.stack([blurred(image, width)[still] for image in moving]) for width in widths]
+    A = np.stack([own_change(image) for image in images], 1)
+    b = own_change(seen)
+    # einsum, not a matrix product: BLAS may sum differently with more threads.
+    H, g = np.einsum("ni,nj->ij", A, A), np.einsum("ni,n->i", A, b)
+    if not np.diag(H).all():
+        return none
+    scale = 1 / np.sqrt(np.diag(H))
+    shares = nnls(H * np.outer(scale, scale), g * scale)[0] * scale
+    explained = float(2 * (shares * g).sum() - shares @ H @ shares)
+    noise = float(np.einsum("n,n->", b, b)) - explained
+    if not explained * len(b) > _LEAST_CHI2 * noise or shares.sum() > _MOST_SHARE:
+        return none
+    return np.asarray(shares)

@@ -1,0 +1,181 @@
+"""An object told from its background, and the lens's scattering learnt from both, as simulated.
+
+All of the camera's errors are on. The truth is what the rays of the pixels' middles hit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.filters.background import Background
+from tofuse.filters.mask import Mask
+from tofuse.filters.scattering import LensScattering
+from tofuse.parts import to_dict
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import corrected_depth
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import plan
+from tofuse.simulation.scenes import box
+
+OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
+
+
+# What takes longest to simulate.
+SLOW = ("multipath", "gloss")
+
+
+@dataclass(frozen=True)
+class Shown:
+    frames: tuple[RangeFrame, ...]
+    masks: tuple[np.ndarray, ...]  # which pixels show the object
+    stands: tuple[np.ndarray, ...]  # and which its stand, which turns and does not change
+
+
+@cache
+def shown(scene: str, camera: str = "sr4000", count: int = 7, off: tuple[str, ...] = ()) -> Shown:
+    every = {"torso": 222, "box": 570}[scene] // count
+    effects = Effects().without(*off)
+    made = plan(scene, camera=camera, every=every, frames=count, effects=effects)
+    frames = []
+    for rendered in made.frames(None):
+        f = rendered.frame
+        depth = corrected_depth(made.correction, f.camera, f.depth, f.depth_kind)
+        frames.append(replace(f, depth=depth, ambiguity_m=made.model.ambiguity_m))
+    rays = made.model.camera.rays()
+    ahead = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1).reshape(-1, 3)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    masks, stands = [], []
+    names = np.array([m.name for m in made.scene.materials] + [""])
+    for k in range(count):
+        t = k * every / made.sequence.frame_rate_hz
+        T = made.sequence.T_room_camera(t)
+        hits = made.scene.cast(T[:3, 3], ahead @ T[:3, :3].T, made.sequence.T_room_object(t))
+        seen = names[hits.surface].reshape(rays.shape[:2])
+        masks.append(np.isin(seen, OF_OBJECT[scene]))
+        stands.append(seen == "stand")
+    return Shown(tuple(frames), tuple(masks), tuple(stands))
+
+
+def check(case: Shown, least: float) -> None:
+    """Overlap of what is kept with the truth; a lens blurs a pixel at the outline."""
+    found = Background().learnt(case.frames)
+    for frame, mask, stand in zip(case.frames, case.masks, case.stands, strict=True):
+        counted = frame.valid & ~(cv2.dilate(stand.astype(np.uint8), np.ones((5, 5))) > 0)
+        keep, true = found.mask(frame, ()) & counted, mask & counted
+        assert (keep & true).sum() / (keep | true).sum() > least
+        inner = cv2.erode(true.astype(np.uint8), np.ones((5, 5))) > 0
+        outer = cv2.dilate(true.astype(np.uint8), np.ones((5, 5))) > 0
+        assert (keep & inner).sum() > 0.98 * inner.sum()
+        assert (keep & ~outer).sum() < 0.03 * true.sum()
+
+
+def test_a_person_is_told_from_the_room() -> None:
+    check(shown("torso"), 0.93)
+
+
+def test_a_box_is_told_from_the_room() -> None:
+    check(shown("box"), 0.85)
+
+
+@pytest.mark.parametrize(("distance", "size"), [(0.8, (0.3, 0.3, 0.4)), (1.3, (0.16, 0.2, 0.25))])
+def test_boxes_of_other_distances_and_sizes(
+    distance: float, size: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(box, "DISTANCE", distance)
+    for name, value in zip(("WIDTH", "DEPTH", "HEIGHT"), size, strict=True):
+        monkeypatch.setattr(box, name, value)
+    check(shown.__wrapped__("box", off=SLOW), 0.82)
+
+
+def test_another_camera() -> None:
+    check(shown("box", camera="ifm-o3r", off=SLOW), 0.85)
+
+
+def test_a_camera_in_motion_is_refused_and_says_what_to_do() -> None:
+    made = plan("rail", every=35, effects=Effects.none(shot_noise=True))
+    frames = [rendered.frame for rendered in made.frames(None)]
+    with pytest.raises(InputError, match="leave it out if the camera moves"):
+        Background().learnt(frames)
+
+
+def test_the_filter_must_learn_first_and_keeps_its_options() -> None:
+    filter_ = Background(sigmas=5.0)
+    case = shown("box")
+    with pytest.raises(InputError, match="has not learnt"):
+        filter_.mask(case.frames[0], ())
+    found = filter_.learnt(case.frames)
+    assert filter_.learns
+    assert not found.learns
+    assert (
+        to_dict(found) == to_dict(filter_) == {"part": "background", "sigmas": 5.0, "share": 0.02}
+    )
+    small = case.frames[0]
+    small = replace(
+        small,
+        camera=replace(small.camera, width=20, height=10),
+        depth=small.depth[:10, :20],
+        amplitude_image=None,
+        confidence_image=None,
+    )
+    with pytest.raises(InputError, match="20 x 10"):
+        found.mask(small, ())
+
+
+def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
+    """It learns what the simulator scatters, though the shape of its blur is another one."""
+    case, clean = shown("box"), shown("box", off=("scatter",))
+    learnt = LensScattering().learnt(case.frames)
+    assert learnt.shares is not None
+    assert not learnt.learns
+    assert 0.015 < sum(learnt.shares) < 0.035
+    none = LensScattering().learnt(clean.frames)
+    assert none.shares == (0.0, 0.0, 0.0)
+    assert none.start().apply(case.frames[0]) is case.frames[0]
+    corrector = learnt.start()
+    for k in (0, 4):
+        before, after, truth = case.frames[k], corrector.apply(case.frames[k]), clean.frames[k]
+        # Around the object, where the light that it scatters is strongest.
+        mask = case.masks[k].astype(np.uint8)
+        ring = cv2.dilate(mask, np.ones((9, 9))) != cv2.dilate(mask, np.ones((31, 31)))
+        bias = abs(float((before.z - truth.z)[ring].mean()))
+        left = abs(float((after.z - truth.z)[ring].mean()))
+        assert bias > 0.004
+        assert left < 0.35 * bias
+        assert (after.valid == before.valid).all()
+
+
+def test_scattering_that_is_given_needs_no_recording_and_light_is_needed() -> None:
+    frame = shown("box").frames[0]
+    given = LensScattering(shares=(0.01, 0.0, 0.01))
+    assert not given.learns
+    assert not np.array_equal(given.start().apply(frame).depth, frame.depth)
+    dark = replace(frame, amplitude_image=None)
+    assert given.start().apply(dark) is dark
+    assert LensScattering().learnt([dark] * 8).shares == (0.0, 0.0, 0.0)
+    for options in ({"shares": (0.1,)}, {"widths": ()}, {"widths": (0.0,)}, {"period_m": 0.0}):
+        with pytest.raises(ValueError, match=r"shares|widths|period_m"):
+            LensScattering(**options)
+
+
+def test_a_mask_is_an_image(tmp_path) -> None:
+    frame = shown("box").frames[0]
+    image = np.zeros(frame.depth.shape, np.uint8)
+    image[30:40, 50:60] = 1
+    path = tmp_path / "mask.png"
+    cv2.imwrite(str(path), image)
+    assert (Mask(str(path)).mask(frame, ()) == (image > 0)).all()
+    cv2.imwrite(str(tmp_path / "color.png"), np.dstack([image, 0 * image, 0 * image]))
+    assert (Mask(str(tmp_path / "color.png")).mask(frame, ()) == (image > 0)).all()
+    cv2.imwrite(str(tmp_path / "small.png"), image[:10])
+    (tmp_path / "text.png").write_text("no image")
+    for name, why in (("small", "176 x 10"), ("text", "no image"), ("none", "can't be read")):
+        with pytest.raises(InputError, match=why):
+            Mask(str(tmp_path / f"{name}.png")).mask(frame, ())
+    with pytest.raises(ValueError, match="empty"):
+        Mask("")
