@@ -12,6 +12,7 @@ from tofuse.evaluation.consistency import map_consistency
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady
 from tofuse.kernels import alignment
+from tofuse.posegraph.build import Measured, chain
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 
@@ -22,11 +23,18 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 def scripts(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import peers.o3d
+    import pose_graphs
     import scaling
     import sequences
     import tracking
 
-    return {"peers": peers, "scaling": scaling, "sequences": sequences, "tracking": tracking}
+    return {
+        "pose_graphs": pose_graphs,
+        "peers": peers,
+        "scaling": scaling,
+        "sequences": sequences,
+        "tracking": tracking,
+    }
 
 
 @pytest.fixture
@@ -194,3 +202,28 @@ def test_watched_kernels_count_the_bytes_of_their_arrays(scripts):
     assert found.calls > 3
     assert found.bytes < found.calls * 48 * 36 * 4 * (10 + 4 + 1 + 3) + 1e6
     assert found.seconds > 0
+
+
+def test_graphs_with_false_loops_have_the_same_true_ones(scripts):
+    pose_graphs = scripts["pose_graphs"]
+    clean, truth = pose_graphs.make_graph("walk", 1, 0.0)
+    graph, _ = pose_graphs.make_graph("walk", 1, 0.3)
+    m = len(clean.edges)
+    np.testing.assert_array_equal(graph.measurements[:m], clean.measurements)
+    false = len(graph.edges) - m
+    assert false / graph.loop.sum() == pytest.approx(0.3, abs=0.01)
+    # Six degrees of freedom an edge, as the information says; false ones are gross.
+    exact = graph.with_poses(truth)
+    assert exact.chi2(np.arange(len(graph.edges)) < m) / m == pytest.approx(6, abs=1)
+    assert exact.chi2(np.arange(len(graph.edges)) >= m) / false > 1000
+    assert pose_graphs.ate(clean.with_poses(truth), truth) == pytest.approx(0, abs=1e-9)
+    assert pose_graphs.ate(clean, truth) > 0.01
+
+
+def test_a_general_solver_comes_to_the_same_minimum(scripts):
+    pose_graphs = scripts["pose_graphs"]
+    relative = se3.exp(np.tile([0.3, 0.0, 0.1, 0.02, 0.5, 0.1], (12, 1)))
+    graph = chain(relative, [Measured(0, 12, np.eye(4), np.eye(6))])
+    least = pose_graphs.LevenbergMarquardt(robust="none").optimise(graph).graph.chi2()
+    assert least < 0.5 * graph.chi2()
+    assert pose_graphs.general_solver(graph)[-1] == pytest.approx(least, rel=0.01)
