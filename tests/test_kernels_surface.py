@@ -272,11 +272,21 @@ def test_light_of_a_matte_plane_gives_one_albedo(power, camera):
     light[5, 6] = 0
     light[5, 7] = np.nan
     out = np.zeros(w.shape, np.float32)
-    albedo_image(planes, camera.rays(), light, power, out)
+    albedo_image(planes, camera.rays(), light, power, True, out)
     holes = np.zeros(w.shape, bool)
     holes[[3, 5, 5], [4, 6, 7]] = True
     np.testing.assert_array_equal(np.isnan(out), holes)
     np.testing.assert_allclose(out[~holes], np.log(0.4), atol=1e-5)
+
+
+def test_light_from_elsewhere_is_taken_as_it_is():
+    rays = CAMERA.rays()
+    planes = np.broadcast_to(np.float32([A, B, C, 0]), (*rays.shape[:2], 4)).copy()
+    planes[..., 3] = plane_w(rays)
+    light = np.full(rays.shape[:2], 90, np.float32)
+    out = np.zeros(light.shape, np.float32)
+    albedo_image(planes, rays, light, 0.0, False, out)
+    np.testing.assert_allclose(out, np.log(90), rtol=1e-6)
 
 
 def test_a_surface_seen_along_itself_has_no_albedo():
@@ -285,7 +295,7 @@ def test_a_surface_seen_along_itself_has_no_albedo():
     planes[..., 0], planes[..., 2] = 10.0, 1.0  # nearly contains the optical axis
     planes[..., 3] = np.maximum(plane_w(rays, 10, 0, 1), 0)
     out = np.zeros(rays.shape[:2], np.float32)
-    albedo_image(planes, rays, np.ones(out.shape, np.float32), 0.0, out)
+    albedo_image(planes, rays, np.ones(out.shape, np.float32), 0.0, True, out)
     assert np.isnan(out[15, 20])
     assert np.isfinite(out[15, 39])
 

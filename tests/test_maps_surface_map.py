@@ -12,6 +12,7 @@ from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable, ray_lengths
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import Projection, SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.registration.projective import ProjectiveOptions, Target, align
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 PLANE = np.array([0.1, -0.15, 0.5])  # a X + b Y + c Z = 1
@@ -286,3 +287,59 @@ def test_pixels_of_a_reduced_view_weigh_by_their_stated_noise():
         assert known.mean() > 0.8
         off[name] = float(np.std((view.planes[..., 3] - exact)[middle][known]))
     assert off["right"] < 0.25 * off["even"]
+
+
+def painted(shift=0.0, gain=1.0, *, color=True):
+    """A flat wall, 1.5 m away, with a pattern, seen by a camera moved to the right by `shift`."""
+    camera = Pinhole(160, 120, 180.0, 180.0, 79.5, 59.5)
+    rays = camera.rays().astype(float)
+    x, y = 1.5 * rays[..., 0] + shift, 1.5 * rays[..., 1]
+    linear = 0.2 + 0.15 * np.sin(9 * x + 2 * y) * np.sin(8 * y - 3 * x) + 0.1 * np.sin(4 * x)
+    coded = 255 * np.clip(gain * np.maximum(linear, 0), 0, 1) ** (1 / 2.2)
+    noise = np.random.default_rng(int(1000 * shift)).normal(size=(2, *rays.shape[:2]))
+    image = np.clip(np.rint(coded + noise[0]), 0, 255).astype(np.uint8)
+    return RangeFrame(
+        round(100 * shift),
+        0.0,
+        camera,
+        (1.5 + 0.003 * noise[1]).astype(np.float32),
+        color_image=np.repeat(image[..., None], 3, 2) if color else None,
+    )
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.8, 0.6])
+def test_colour_holds_a_pose_before_a_flat_wall_whatever_the_exposure(gain):
+    shift, true = 0.05, np.eye(4)
+    true[0, 3] = shift
+    views = [surface_map(f, OPTIONS) for f in (painted(), painted(shift, gain))]
+    aligned = align(views[1], [Target(views[0], np.eye(4))], np.eye(4), ProjectiveOptions())
+    assert aligned.photometric
+    assert len(aligned.unobservable) == 0
+    assert np.linalg.norm((aligned.T_world_source - true)[:3, 3]) < 0.003
+    # Of coded light: the power of the code is in it.
+    assert aligned.exposure == pytest.approx(-np.log(gain) / 2.2, abs=0.02)
+    bare = [surface_map(f, OPTIONS) for f in (painted(color=False), painted(shift, color=False))]
+    blind = align(bare[1], [Target(bare[0], np.eye(4))], np.eye(4), ProjectiveOptions())
+    assert len(blind.unobservable) == 3
+
+
+def test_saturated_and_dark_colour_is_none():
+    frame = painted()
+    color = frame.color_image.copy()
+    color[40:60, 40:60, 1] = 255
+    color[80:100, 80:100] = 2
+    view = surface_map(replace(frame, color_image=color), OPTIONS)
+    assert np.isnan(view.photo[44:56, 44:56]).all()
+    assert np.isnan(view.photo[84:96, 84:96]).all()
+    assert np.isfinite(view.photo[44:56, 84:96]).all()
+
+
+def test_colour_that_is_not_registered_takes_no_part():
+    view = surface_map(replace(painted(), color_registered=False), OPTIONS)
+    assert not view.has_photo
+
+
+def test_amplitude_goes_before_colour():
+    frame = replace(wall(amplitude="raw", texture=1.0), color_image=np.zeros((72, 88, 3), np.uint8))
+    plain = surface_map(replace(frame, color_image=None), OPTIONS)
+    np.testing.assert_array_equal(surface_map(frame, OPTIONS).photo, plain.photo)

@@ -85,6 +85,7 @@ def test_tum(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 5000, rtol=1e-6)
     assert frame.depth[0, :2].tolist() == [0, 0]
     assert frame.color_image is not None
+    assert frame.color_registered
     assert (frame.color_image == 1).all()
     assert recording.reference is not None
     np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
@@ -127,6 +128,7 @@ def test_7scenes(tmp_path: Path) -> None:
     assert frame.camera == Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
     np.testing.assert_allclose(frame.depth[1:], COUNTS[2][1:] / 1000, rtol=1e-6)
     assert frame.color_image is not None
+    assert not frame.color_registered
     np.testing.assert_allclose(recording.timestamps, [0, 2 / 30, 4 / 30])
     assert recording.reference is not None
     np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)

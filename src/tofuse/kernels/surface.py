@@ -230,12 +230,13 @@ def fit_planes(
 
 @kernel
 def albedo_image(
-    planes: Float32, rays: Float32, light: Float32, power: float, out: Float32
+    planes: Float32, rays: Float32, light: Float32, power: float, own_lamp: bool, out: Float32
 ) -> None:
     """Logarithm of the albedo, up to a constant: light * range^power / cos(incidence).
 
     `power` is 2 where the light falls off with the square of the range, 0 where that has been
-    compensated. NaN where there is no plane, no light, or the surface is seen too slantwise.
+    compensated. Without a lamp of its own a camera sees surfaces as bright from any side, and the
+    cosine is left out. NaN where there is no plane, no light, or the surface is seen too slantwise.
     """
     rows, columns = light.shape
     for i in range(rows):
@@ -254,7 +255,8 @@ def albedo_image(
             cosine = v / np.sqrt((a * a + b * b + c * c) * length2)
             if cosine < 0.15:
                 continue
-            out[i, j] = np.log(light[i, j] / cosine) + 0.5 * power * np.log(length2 / (v * v))
+            shade = cosine if own_lamp else 1.0
+            out[i, j] = np.log(light[i, j] / shade) + 0.5 * power * np.log(length2 / (v * v))
 
 
 @kernel

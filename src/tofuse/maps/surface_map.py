@@ -33,6 +33,8 @@ Float64 = NDArray[np.float64]
 _CHUNKS = 4
 # Depths within this share of each other are one surface when an image is halved.
 _HALVING_JUMP = 0.02
+# Levels of colour: below, the logarithm is noise; from the other on, a channel is saturated.
+_DARKEST, _BRIGHTEST = 8, 254
 # m. Depths and sigmas beyond are no measurement, and their squares no float32.
 _NEAREST, _FARTHEST = 1e-3, 1e3
 _LEAST_SIGMA = 1e-6
@@ -168,8 +170,8 @@ class SurfaceMap:
     plane_variance
         (H, W) variance of that 1/z, 1/m^2.
     photo
-        (H, W, 3) logarithm of the albedo, smoothed, and its slopes by x/z and y/z; NaN where
-        unknown.
+        (H, W, 3) logarithm of the albedo (of amplitude, else of colour), smoothed, and its slopes
+        by x/z and y/z; NaN where unknown.
     projection
         Where points of this view's frame land.
     """
@@ -215,7 +217,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     projection, z, light, own = _reduced(frame, options.columns)
     rays = projection.rays
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
-    sigma = _noise_law(frame, z, light, projection) if own is None else own
+    lit = frame.amplitude_image is not None
+    sigma = _noise_law(frame, z, light if lit else None, projection) if own is None else own
     # d(1/z) = dz / z^2
     weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
     if options.edge_margin:
@@ -243,8 +246,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     has_photo = light is not None
     if light is not None:
         albedo = np.empty((rows, columns), np.float32)
-        power = 2.0 if frame.amplitude_kind == "raw" else 0.0
-        albedo_image(planes, rays, light, power, albedo)
+        power = 2.0 if lit and frame.amplitude_kind == "raw" else 0.0
+        albedo_image(planes, rays, light, power, lit, albedo)
         run_chunks(
             lambda a, b: smooth_and_slope(
                 albedo, planes, rays, options.photo_radius, 0.05, photo, a, b
@@ -275,12 +278,10 @@ def _projection(camera: Camera, step: int) -> Projection:
 def _reduced(
     frame: RangeFrame, columns: int
 ) -> tuple[Projection, Float32, Float32 | None, Float32 | None]:
-    """Grid, z, amplitude and the frame's own sigma of z at the working resolution."""
+    """Grid, z, amplitude (or colour's) and the frame's own sigma of z at the working resolution."""
     z = frame.z
     z = np.where(frame.valid & (z > _NEAREST) & (z < _FARTHEST), z, np.float32(0))
-    light = frame.amplitude_image
-    if light is not None:
-        light = np.where(light < SATURATED_AMPLITUDE, light, np.float32(0)).astype(np.float32)
+    light = _light(frame)
     variance = _own_variance(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
@@ -294,6 +295,21 @@ def _reduced(
         # The mean of a block of rays that holds an unknown one is unknown.
         z[projection.unknown] = 0
     return projection, z, light, None if variance is None else np.sqrt(variance)
+
+
+def _light(frame: RangeFrame) -> Float32 | None:
+    """Amplitude, or without it the luminance of the colour; 0 where saturated or too dark.
+
+    Colour is coded by a power of the light, which its logarithm turns into a factor.
+    """
+    light = frame.amplitude_image
+    if light is not None:
+        return np.where(light < SATURATED_AMPLITUDE, light, np.float32(0)).astype(np.float32)
+    if frame.color_image is None or not frame.color_registered:
+        return None
+    grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
+    seen = (grey >= _DARKEST) & (frame.color_image.max(-1) < _BRIGHTEST)
+    return np.where(seen, grey, 0).astype(np.float32)
 
 
 def _own_variance(frame: RangeFrame) -> Float32 | None:

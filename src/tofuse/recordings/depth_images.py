@@ -33,6 +33,8 @@ class DepthImageSource(FileSource):
         Of all frames, unless `options` names another camera.json, which then gives both.
     color
         None, or one image for each frame.
+    color_registered
+        Whether they are as seen by the depth camera.
     options
         Of the reader.
 
@@ -50,10 +52,12 @@ class DepthImageSource(FileSource):
         depth_unit_m: float,
         *,
         color: Sequence[Path] | None = None,
+        color_registered: bool = True,
         options: ReaderOptions | None = None,
     ) -> None:
         super().__init__(timestamps)
         self.files, self.color = list(files), None if color is None else list(color)
+        self.color_registered = color_registered
         kind: DepthKind = "z"
         where = "the camera of this format"
         if options is not None and options.camera is not None:
@@ -103,4 +107,5 @@ class DepthImageSource(FileSource):
             depth_from_counts(counts, self.depth_unit_m),
             self.depth_kind,
             color_image=color,
+            color_registered=self.color_registered,
         )

@@ -96,7 +96,7 @@ class RangeFrame:
     confidence_image
         (H, W) uint8; higher is better.
     color_image
-        (H, W, 3) uint8 RGB, registered to depth.
+        (H, W, 3) uint8 RGB at the pixels of depth.
     sigma_image
         (H, W) float32, standard deviation of the range in m.
     normal_image
@@ -108,6 +108,9 @@ class RangeFrame:
         active brightness by a map of the maker's own, to be taken as raw.
     ambiguity_m
         Range in m after which the measurement repeats; None where not known.
+    color_registered
+        Whether the colour of a pixel is that of the point it measures; if not, it is good for
+        colouring only.
     """
 
     index: int
@@ -122,6 +125,7 @@ class RangeFrame:
     normal_image: Float32 | None = None
     amplitude_kind: AmplitudeKind = "raw"
     ambiguity_m: float | None = None
+    color_registered: bool = True
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)

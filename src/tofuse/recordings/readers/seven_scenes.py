@@ -53,6 +53,7 @@ class SevenScenes:
             None if options.camera else _camera(path),
             0.001,
             color=color if complete else None,
+            color_registered=False,
             options=options,
         )
         if color and not complete:
