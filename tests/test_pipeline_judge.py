@@ -20,8 +20,10 @@ from tofuse.results.verdict import REASONS, verdict_of
 STEP = se3.exp(np.array([0.05, 0, 0, 0, 0.02, 0]))
 
 
-def registration(share=0.5, converged=True) -> Registration:
-    return Registration(STEP, converged, 10, int(1000 * share), 1000, 0.3, 0.01, np.eye(6) * 1e4)
+def registration(share=0.5, converged=True, unheld=False) -> Registration:
+    free = np.eye(6)[: int(unheld)]
+    found = int(1000 * share)
+    return Registration(STEP, converged, 10, found, 1000, 0.3, 0.01, np.eye(6) * 1e4, free)
 
 
 def pair(i, j, share=0.95, rms=0.004, compared=10_000) -> PairAgreement:
@@ -45,16 +47,22 @@ def evidence(
     given=(),
     settled=True,
     images=None,
+    unheld=(),
+    steps=None,
+    **more,
 ) -> Evidence:
     """Nine frames of a walk, closed by loops (i, j, error of the chain as a 6-vector)."""
     n = len(statuses)
     records = tuple(FrameRecord(k, 0.1 * k, s) for k, s in enumerate(statuses))
     posed = [k for k, s in enumerate(statuses) if s in ("tracked", "predicted")]
     poses = np.stack([np.linalg.matrix_power(STEP, k) for k in posed])
+    if steps is not None:
+        poses = np.stack([se3.exp(np.asarray(xi, float)) for xi in steps])
     shares = shares or [0.5] * n
     converged = converged or [True] * n
     registrations = tuple(
-        registration(shares[k], converged[k]) if k in posed[1:] else None for k in range(n)
+        registration(shares[k], converged[k], k in unheld) if k in posed[1:] else None
+        for k in range(n)
     )
     sequence = [Measured(a, b, STEP, np.eye(6)) for a, b in pairwise(posed)]
     row = {frame: k for k, frame in enumerate(posed)}
@@ -79,6 +87,7 @@ def evidence(
         Optimisation(graph, (1.0, 0.5), settled),
         agreement() if images is None else images,
         frozenset(given),
+        **more,
     )
 
 
@@ -103,6 +112,11 @@ CASES = {
     "loop_gap": evidence(gaps=((0, 8, [0.2, 0, 0, 0, 0, 0]),)),
     "optimiser_gave_up": evidence(settled=False),
     "unreadable_frames": evidence(("tracked",) * 4 + ("skipped",) + ("tracked",) * 4),
+    "jumped": evidence(steps=[(0.05 * k + 0.4 * (k > 4), 0, 0, 0, 0, 0) for k in range(9)]),
+    "unobserved_motion": evidence(unheld=(4,)),
+    "repeated_images": evidence(repeated=(4, 5)),
+    "implausible_depth": evidence(depths=(25.0,) * 9),
+    "stood_still": evidence(steps=[(0.001 * (k % 2), 0, 0, 0, 0, 0) for k in range(9)]),
     "single_frame": evidence(("tracked",)),
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
 }
@@ -154,6 +168,42 @@ def test_a_loop_within_what_drift_allows_is_no_gap() -> None:
     assert codes(evidence(gaps=((0, 8, [0.035, 0, 0, 0, 0, 0]),))) == ["loop_gap"]
     assert codes(evidence(gaps=((0, 8, [0, 0, 0, 0, np.radians(1.8), 0]),))) == []
     assert codes(evidence(gaps=((0, 8, [0, 0, 0, 0, np.radians(2.2), 0]),))) == ["loop_gap"]
+
+
+def test_a_few_directions_that_are_not_held_do_not_drift() -> None:
+    long = evidence(("tracked",) * 21, unheld=(4, 5))
+    assert codes(long) == []
+    assert codes(evidence(("tracked",) * 21, unheld=(4, 5, 6))) == ["unobserved_motion"]
+
+
+@pytest.mark.parametrize(
+    ("depths", "ambiguity_m", "words"),
+    [
+        ((0.2, 0.25, 0.3), None, "is 0.25 m, nearer than"),
+        ((13.0, 30.0, 14.0), None, "is 14 m, farther than"),
+        ((6.0, 6.5, 7.0), 5.0, "is 6.5 m, but this camera's phase repeats after 5 m"),
+        ((6.0, 6.5, 7.0), 7.5, ""),
+        ((0.35, 0.3, 11.0), None, ""),
+    ],
+)
+def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) -> None:
+    reasons = judge(evidence(depths=depths, ambiguity_m=ambiguity_m))[1]
+    assert [r.code for r in reasons] == ["implausible_depth"] * bool(words)
+    assert all(words in r.text for r in reasons)
+    assert all(r.text.endswith("check the depth unit.") for r in reasons)
+
+
+def test_each_stretch_of_repeated_images_is_told() -> None:
+    reasons = judge(evidence(repeated=(2, 5, 6)))[1]
+    assert [r.frames for r in reasons] == [(2, 2), (5, 6)]
+    assert "Frames 5 to 6 are the same image" in reasons[1].text
+
+
+def test_a_camera_that_moves_a_little_did_not_stand_still() -> None:
+    for axis, size in ((0, 0.012), (4, np.radians(0.6))):
+        steps = np.zeros((9, 6))
+        steps[5:, axis] = size
+        assert codes(evidence(steps=steps)) == []
 
 
 def test_many_gaps_are_one_reason_that_tells_the_worst() -> None:

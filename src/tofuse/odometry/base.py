@@ -25,7 +25,7 @@ class Step:
     status
         "tracked"; "predicted" where the data held none of it; "lost" without a pose.
     reason
-        Why it is not tracked; empty otherwise.
+        Why it is not tracked, or what was out of the ordinary in tracking it; may be empty.
     T_world_camera
         (4, 4), or None where lost.
     reference
@@ -50,6 +50,10 @@ class Tracker(Protocol):
         `T_odometry` is the frame's T_world_camera from an odometry file, if there is one.
         """
         ...
+
+    def interrupt(self) -> None:
+        """Hear that the next frame begins another recording: the motion need not go on."""
+        return
 
 
 class Odometry(Protocol):

@@ -13,6 +13,8 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Step, Tracker
+from tofuse.odometry.likeness import likeness, thumbnail
+from tofuse.odometry.motion import Motion
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
@@ -33,8 +35,11 @@ Guess = Literal["identity", "previous", "odometry"]
 _PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
 _WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
-# Keyframes that are kept, so that memory stays flat.
-_REMEMBERED = 40
+# From one frame to the next no view gets so many times deeper, nor as much nearer.
+_RESCALED = 4.0
+# Keyframes that are kept, so that memory stays flat, and those of them that a lost view is aligned
+# with, so that it does not cost more than ten that are not.
+_REMEMBERED, _TRIED = 40, 5
 
 
 @dataclass(frozen=True)
@@ -156,6 +161,7 @@ class _Keyframe:
     view: SurfaceMap
     T_world_camera: Float64
     depth: float  # median, m
+    thumbnail: Float64
 
 
 class _KeyframeTracker(Tracker):
@@ -164,8 +170,9 @@ class _KeyframeTracker(Tracker):
         self._keyframes: list[_Keyframe] = []
         self._T: Float64 | None = None  # of the last frame with a pose
         self._T_odometry: Float64 | None = None
-        self._motion: Float64 | None = None  # of the last two frames, if both have a pose
+        self._motion = Motion()
         self._lost = False
+        self._depth = 0.0  # median of the last frame with a pose, m
 
     def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
         """See `Tracker.push`."""
@@ -175,21 +182,38 @@ class _KeyframeTracker(Tracker):
         if len(frame) < options.minimum_points:
             reason = f"{len(frame)} valid points, {options.minimum_points} are needed"
             return self._lose(reason)
+        depths = frame.depth[frame.valid]
+        if depths.min() == depths.max():
+            return self._lose(f"every depth is {depths[0]:.3g} m")
         view = surface_map(frame, options.surface)
         if np.count_nonzero(view.planes[..., 3]) < options.minimum_points:
             return self._lose("nearly no surface in what is left of the image")
         if self._T is None:
             self._keep(view, np.eye(4))
             self._T, self._T_odometry = np.eye(4), T_odometry
+            self._motion.follow(self._T)
+            self._depth = self._keyframes[0].depth
             return Step("tracked", "", np.eye(4))
 
         reasons: list[str] = []
-        found = self._track(view, T_odometry, reasons) or self._relocate(view)
+        expected = self._expected(T_odometry)
+        depth = float(np.median(view.z[view.z > 0]))
+        if not self._lost and not 1 / _RESCALED < depth / self._depth < _RESCALED:
+            return self._lose(f"the typical depth was {self._depth:.2g} m and is {depth:.2g} m")
+        found = self._track(view, expected, reasons) or self._relocate(view)
         if found is None:
             return self._lose(reasons[0])
-        aligned, reference = found
+        aligned, reference, chosen = found
         T = aligned.T_world_source
-        self._motion = None if self._lost else se3.inverse(self._T) @ T
+        surprise = self._motion.surprise(T, expected)
+        if surprise:
+            return self._lose(f"fits keyframe {reference.view.index}, but {surprise}")
+        self._depth = depth
+        notes = [chosen] if chosen else []
+        if self._motion.follow(T):
+            notes.append("the camera jumped, and this view goes on from there")
+        if frame.amplitude_image is not None and not aligned.photometric:
+            notes.append("the albedo took no part")
         self._T, self._T_odometry, self._lost = T, T_odometry, False
         if self._is_new(T, reference):
             self._keep(view, T)
@@ -197,31 +221,48 @@ class _KeyframeTracker(Tracker):
         C = covariance(view, [target], aligned, options.alignment, options.uncertainty)
         registration = _registration(aligned, reference.T_world_camera, C)
         status: Literal["tracked", "predicted"] = "tracked"
-        reason = ""
         if len(aligned.unobservable) == 6:
-            status, reason = "predicted", "nothing in view holds the camera in any direction"
-        return Step(status, reason, T, reference.view.index, registration)
+            status = "predicted"
+            notes.insert(0, "nothing in view holds the camera in any direction")
+        return Step(status, "; ".join(notes), T, reference.view.index, registration)
+
+    def interrupt(self) -> None:
+        """See `Tracker.interrupt`."""
+        self._motion.interrupt()
+        self._lost = True
+
+    def _expected(self, T_odometry: Float64 | None) -> Float64 | None:
+        """Where the guess puts the camera; None where it does not tell."""
+        assert self._T is not None
+        if self._options.guess == "previous":
+            return self._motion.expected
+        if self._options.guess == "identity":
+            return self._T
+        before = self._T_odometry
+        if T_odometry is None or before is None:
+            return None
+        return np.asarray(self._T @ se3.inverse(before) @ T_odometry, np.float64)
 
     def _lose(self, reason: str) -> Step:
         self._lost = True
-        self._motion = None
+        self._motion.miss()
         return Step("lost", reason, None)
 
     def _track(
-        self, view: SurfaceMap, T_odometry: Float64 | None, reasons: list[str]
-    ) -> tuple[Aligned, _Keyframe] | None:
+        self, view: SurfaceMap, expected: Float64 | None, reasons: list[str]
+    ) -> tuple[Aligned, _Keyframe, str] | None:
         """Align with the newest keyframes, from the guess and then from where the camera was."""
         options = self._options
         newest = self._keyframes[-options.targets :]
         targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
-        for predicted, start, how in self._predictions(view, targets, T_odometry):
+        for predicted, start, how, chosen in self._predictions(view, targets, expected):
             aligned = align(view, targets, predicted, how, start=start)
             if how is options.alignment:
                 objection = options.acceptance.objection(aligned)
             else:
                 objection = options.relocated.objection(aligned) or self._doubt(aligned)
             if not objection:
-                return aligned, newest[-1]
+                return aligned, newest[-1], chosen
             reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
         return None
 
@@ -235,18 +276,12 @@ class _KeyframeTracker(Tracker):
         return ""
 
     def _predictions(
-        self, view: SurfaceMap, targets: list[Target], T_odometry: Float64 | None
-    ) -> Iterator[tuple[Float64, Float64, ProjectiveOptions]]:
-        """Where the camera may be, where to begin the search, and how; the likeliest first."""
+        self, view: SurfaceMap, targets: list[Target], expected: Float64 | None
+    ) -> Iterator[tuple[Float64, Float64, ProjectiveOptions, str]]:
+        """Where the camera may be, where to begin, how, and in words; the likeliest first."""
         assert self._T is not None
-        guess = self._options.guess
-        before = self._T_odometry
-        if guess == "odometry" and T_odometry is not None and before is not None:
-            T = self._T @ se3.inverse(before) @ T_odometry
-            yield T, T, self._options.alignment
-        elif guess == "previous" and self._motion is not None:
-            T = se3.orthonormalise(self._T @ self._motion)
-            yield T, T, self._options.alignment
+        if expected is not None and self._options.guess != "identity":
+            yield expected, expected, self._options.alignment, ""
         # Nothing tells how the camera moves: try some turns of it, and of what it sees.
         coarse = replace(self._options.alignment, levels=_PATIENT[:1])
         starts = [self._T @ motion for motion in _turns(view)]
@@ -259,23 +294,31 @@ class _KeyframeTracker(Tracker):
         if not self._lost:
             # With no prediction to keep to, what little the data tells is the better guess.
             how = replace(how, common_tilt=0.0, common_slope=0.0)
-        yield T, chosen.T_world_source, how
+        turn = np.degrees(se3.angle(se3.inverse(self._T) @ starts[1 + turned.index(best)]))
+        where = "where the camera was" if chosen is still else f"a turn by {turn:.0f} degrees"
+        unknown = "the prediction did not fit" if expected is not None else "nothing predicted it"
+        yield T, chosen.T_world_source, how, f"{unknown}: found from {where}"
 
-    def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe] | None:
-        """Look for the view among the keyframes, the newest first."""
+    def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe, str] | None:
+        """Look for the view among the keyframes that look most like it."""
         options = self._options
         wide = replace(options.alignment, levels=_WIDE, prior_m=3.0, prior_rad=3.0)
-        for keyframe in reversed(self._keyframes):
+        fine = replace(options.alignment, levels=_PATIENT)
+        found = []
+        for k in likeness(thumbnail(view), [k.thumbnail for k in self._keyframes])[:_TRIED]:
+            keyframe = self._keyframes[k]
             target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
             coarse = align(view, target, keyframe.T_world_camera, wide)
-            if options.relocated.objection(coarse):
-                continue
-            fine = replace(options.alignment, levels=_PATIENT)
-            aligned = align(view, target, coarse.T_world_source, fine)
+            if not options.relocated.objection(coarse):
+                found.append((coarse.score, k, coarse.T_world_source))
+        for _, k, T in sorted(found, key=lambda one: (-one[0], one[1])):
+            keyframe = self._keyframes[k]
+            target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+            aligned = align(view, target, T, fine)
             # A flat wall fits anywhere: only a view that is held in every direction is found again.
             objection = options.relocated.objection(aligned)
             if not objection and aligned.converged and not len(aligned.unobservable):
-                return aligned, keyframe
+                return aligned, keyframe, f"found again at keyframe {keyframe.view.index}"
         return None
 
     def _is_new(self, T: Float64, reference: _Keyframe) -> bool:
@@ -288,8 +331,26 @@ class _KeyframeTracker(Tracker):
 
     def _keep(self, view: SurfaceMap, T: Float64) -> None:
         depth = float(np.median(view.z[view.z > 0]))
-        self._keyframes.append(_Keyframe(view, T, depth))
-        del self._keyframes[:-_REMEMBERED]
+        self._keyframes.append(_Keyframe(view, T, depth, thumbnail(view)))
+        if len(self._keyframes) > _REMEMBERED:
+            del self._keyframes[self._dispensable()]
+
+    def _dispensable(self) -> int:
+        """Which keyframe is missed least: the later one of the two that are nearest in pose.
+
+        The earlier one has drifted less. The newest ones, which are tracked against, stay.
+        """
+        options = self._options
+        old = self._keyframes[: -options.targets]
+        T = np.stack([k.T_world_camera for k in old])
+        reach = options.keyframe_distance * np.array([k.depth for k in old])
+        place = T[:, :3, 3]
+        apart = np.linalg.norm(place[:, None] - place, axis=-1) / np.minimum(reach[:, None], reach)
+        turned = np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3])
+        angle = np.arccos(np.clip((turned - 1) / 2, -1, 1)) / options.keyframe_angle
+        away = np.hypot(apart, angle)
+        away[np.triu_indices(len(old))] = np.inf
+        return int(np.argmin(away.min(1)))
 
 
 def _turns(view: SurfaceMap) -> list[Float64]:

@@ -94,6 +94,10 @@ class _SequentialTracker(Tracker):
             "odometry": _odometry_motion,
         }
 
+    def interrupt(self) -> None:
+        """See `Tracker.interrupt`."""
+        self._motion = np.eye(4)
+
     def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
         options, last = self._options, self._last

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.evaluation.consistency import Consistency
 from tofuse.geometry import se3
+from tofuse.odometry.motion import jumps
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.registration.base import Registration
 from tofuse.results.types import FrameRecord, Reason, Verdict
@@ -22,6 +23,12 @@ Float64 = NDArray[np.float64]
 WEAK_SHARE = 0.05
 # More registrations than this that ran out of iterations are a pattern.
 UNSETTLED_SHARE = 0.05
+# More frames than this that are not held in every direction build up drift.
+UNHELD_SHARE = 0.1
+# Typical depths in m that ToF cameras hardly have.
+NEAREST_M, FARTHEST_M = 0.3, 12.0
+# A camera that moved by no more than this stood still.
+STILL_M, STILL_RAD = 0.01, np.radians(0.5)
 # A loop that moves the end by more than this share of the path (and these floors) bends the path.
 GAP_SHARE, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
 # Inliers of overlapping images: below the first most of what they saw contradicts the poses;
@@ -47,6 +54,14 @@ class Evidence:
         Of all overlapping images under the final poses; None where there are too few.
     given
         Pairs (i, j) of loops given by hand.
+    depths
+        Median radial range of every frame with a pose, m.
+    ambiguity_m
+        Range after which the camera's phase repeats, if it is known.
+    repeated
+        Indices of the frames that are the same as the one before, to the last pixel.
+    interruptions
+        Positions among the records at which another recording begins.
     """
 
     records: tuple[FrameRecord, ...]
@@ -56,12 +71,18 @@ class Evidence:
     optimisation: Optimisation
     agreement: Consistency | None
     given: frozenset[tuple[int, int]] = frozenset()
+    depths: tuple[float, ...] = ()
+    ambiguity_m: float | None = None
+    repeated: tuple[int, ...] = ()
+    interruptions: tuple[int, ...] = ()
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
     """Return the verdict and the reasons for it, gravest first as they are listed."""
     reasons = [
         *_poses(evidence),
+        *_motion(evidence),
+        *_depths(evidence),
         *_registrations(evidence),
         *_loops(evidence),
         *_images(evidence),
@@ -88,6 +109,43 @@ def _poses(e: Evidence) -> Iterator[Reason]:
         yield Reason("single_frame", (frame, frame), text)
 
 
+def _motion(e: Evidence) -> Iterator[Reason]:
+    posed = iter(e.sequential)
+    has_pose = [r.status in ("tracked", "predicted") for r in e.records]
+    poses = [next(posed) if has else None for has in has_pose]
+    for k, words in jumps(poses, e.interruptions):
+        frame = e.records[k].index
+        yield Reason("jumped", (frame, frame), f"Frame {frame} has a pose, but {words}.")
+    for first, last in _runs(e.records, [r.index in e.repeated for r in e.records]):
+        which = f"Frame {first} is" if first == last else f"Frames {first} to {last} are"
+        text = f"{which} the same image as the one before: nothing new was measured."
+        yield Reason("repeated_images", (first, last), text)
+    T = e.optimisation.graph.poses
+    moved = se3.inverse(T[:1]) @ T
+    still = np.linalg.norm(moved[:, :3, 3], axis=1) < STILL_M
+    if len(T) > 2 and (still & (se3.angle(moved) < STILL_RAD)).all():
+        ids = e.optimisation.graph.ids
+        text = f"The camera never moved in {len(T)} frames: the model is what one view sees."
+        yield Reason("stood_still", (int(ids[0]), int(ids[-1])), text)
+
+
+def _depths(e: Evidence) -> Iterator[Reason]:
+    if not e.depths:
+        return
+    typical = float(np.median(e.depths))
+    what = f"The typical distance is {typical:.3g} m"
+    if e.ambiguity_m is not None and typical > e.ambiguity_m:
+        text = f"{what}, but this camera's phase repeats after {e.ambiguity_m:.3g} m"
+    elif typical > FARTHEST_M:
+        text = f"{what}, farther than ToF cameras see"
+    elif typical < NEAREST_M:
+        text = f"{what}, nearer than most ToF cameras see"
+    else:
+        return
+    everything = (e.records[0].index, e.records[-1].index)
+    yield Reason("implausible_depth", everything, f"{text}: check the depth unit.")
+
+
 def _registrations(e: Evidence) -> Iterator[Reason]:
     pairs = [
         (record.index, r)
@@ -103,6 +161,13 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
             "that were compared."
         )
         yield Reason("weak_registration", (weak[0], weak[-1]), text)
+    unheld = [index for index, r in pairs if len(r.unobservable)]
+    if len(unheld) > UNHELD_SHARE * len(pairs):
+        text = (
+            f"In {len(unheld)} of {len(pairs)} registrations the data does not hold the camera in "
+            "every direction; there the pose is a prediction, and drifts."
+        )
+        yield Reason("unobserved_motion", (unheld[0], unheld[-1]), text)
     unsettled = [index for index, r in pairs if not r.converged]
     if len(unsettled) > UNSETTLED_SHARE * len(pairs):
         text = f"{len(unsettled)} of {len(pairs)} registrations stopped before they settled."
@@ -180,7 +245,11 @@ def _images(e: Evidence) -> Iterator[Reason]:
 
 def stretches(records: Sequence[FrameRecord], status: str) -> list[tuple[int, int]]:
     """Return (first, last) frame index of each unbroken stretch of frames with that status."""
-    has = np.array([False, *(r.status == status for r in records), False])
+    return _runs(records, [r.status == status for r in records])
+
+
+def _runs(records: Sequence[FrameRecord], marked: Sequence[bool]) -> list[tuple[int, int]]:
+    has = np.array([False, *marked, False])
     edges = np.flatnonzero([a != b for a, b in pairwise(has)])
     return [
         (records[a].index, records[b - 1].index)

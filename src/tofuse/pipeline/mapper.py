@@ -76,6 +76,11 @@ class Mapper:
         self._views: dict[int, CloudFrame] = {}  # filtered and thinned, of frames with a pose
         self._voxel_m = 0.01
         self._checks = _EvenSample(_CHECKED_IMAGES)
+        self._depths: list[float] = []  # typical ranges of the frames with a pose, m
+        self._ambiguity_m: float | None = None
+        self._before: RangeFrame | None = None  # as the camera gave it
+        self._repeated: list[int] = []
+        self._interruptions: list[int] = []
         self._seen: dict[str, int] = {}
         self._removed: dict[str, int] = {}
         self._finished = False
@@ -116,6 +121,7 @@ class Mapper:
             can't work on, or its index does not grow.
         """
         self._check(frame)
+        repeated = self._is_repeated(frame)
         with threads(self.threads):
             with self._watch.timing("filters"):
                 before = self._history if history is None else history
@@ -129,6 +135,9 @@ class Mapper:
                 self._removed[removal.name] = self._removed.get(removal.name, 0) + removal.removed
             with self._watch.timing("tracking"):
                 step = self._tracker.push(filtered, T_odometry)
+            if repeated and step.status == "tracked":
+                reason = f"the same image as frame {self._records[-1].index}, to the last pixel"
+                step = replace(step, status="predicted", reason=reason)
             self._add(frame, clean, step)
             if step.T_world_camera is not None:
                 with self._watch.timing("loops"):
@@ -142,6 +151,21 @@ class Mapper:
         self._records.append(FrameRecord(index, timestamp, "skipped", reason))
         self._steps.append(None)
         self._progress.advance(self._records[-1])
+
+    def interrupt(self) -> None:
+        """Say that the next frame begins another recording: the camera may be elsewhere by then."""
+        self._interruptions.append(len(self._records))
+        self._tracker.interrupt()
+
+    def _is_repeated(self, frame: Frame) -> bool:
+        """Whether an image is the one before: a camera that hangs, as noise never repeats."""
+        if not isinstance(frame, RangeFrame):
+            return False
+        before, self._before = self._before, frame
+        if before is None or not len(frame) or not np.array_equal(before.depth, frame.depth):
+            return False
+        self._repeated.append(frame.index)
+        return True
 
     def _corrected(self, frame: Frame) -> Frame:
         """Correct a frame, unless it is among those that were corrected last."""
@@ -201,6 +225,10 @@ class Mapper:
         if not self._views:
             self._voxel_m = self.config.fusion.voxel_m or choose_voxel(filtered)
         self._views[frame.index] = as_cloud(filtered, _KEPT_POINTS)
+        if isinstance(frame, RangeFrame):
+            ranges = frame.radial_range[::4, ::4]
+            self._depths.append(float(np.median(ranges[ranges > 0])) if ranges.any() else 0.0)
+            self._ambiguity_m = frame.ambiguity_m
         if isinstance(filtered, RangeFrame):
             # A fresh frame: the arrays derived from this one are not kept with it.
             self._checks.add(replace(filtered))
@@ -253,6 +281,10 @@ class Mapper:
                 optimisation,
                 self._agreement(graph),
                 frozenset((g.i, g.j) for g in self._given_loops),
+                tuple(d for d in self._depths if d > 0),
+                self._ambiguity_m,
+                tuple(self._repeated),
+                tuple(self._interruptions),
             )
             verdict, reasons = judge(evidence)
         return Reconstruction(

@@ -76,6 +76,10 @@ def reconstruct(
     with threadpool_limits(1):
         for k, item in enumerate(recording.read_all()):
             index, time = int(recording.indices[k]), float(recording.timestamps[k])
+            if k and part_start(recording, index) != part_start(
+                recording, int(recording.indices[k - 1])
+            ):
+                mapper.interrupt()
             if isinstance(item, UnreadableFrameError):
                 unreadable.append(item)
                 mapper.skip(index, time, str(item))
@@ -144,9 +148,7 @@ def past_frames(
     They are the recording's own neighbours, whatever was selected of it, and of several joined
     recordings those of the same one; `known` are frames that need not be read again.
     """
-    joined = recording.metadata.get("parts", ())
-    starts = accumulate((part["frames"] for part in joined), initial=0)
-    first = max(start for start in starts if start <= index)
+    first = part_start(recording, index)
     past = []
     for k in range(max(first, index - count), index):
         try:
@@ -154,6 +156,13 @@ def past_frames(
         except UnreadableFrameError:
             continue
     return past
+
+
+def part_start(recording: Recording, index: int) -> int:
+    """Return the first frame of the recording, of several joined ones, that frame `index` is of."""
+    joined = recording.metadata.get("parts", ())
+    starts = accumulate((part["frames"] for part in joined), initial=0)
+    return max(start for start in starts if start <= index)
 
 
 def describe(recording: Recording) -> dict[str, Any]:

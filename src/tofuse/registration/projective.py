@@ -163,7 +163,8 @@ class Aligned:
         Whether the albedo took part.
     score
         How much of the view fits, for comparing alignments of one view: robust weights of both
-        terms, less twice the points in free space, as a share of the points.
+        terms, less twice the points in free space, as a share of the points (the mean over
+        targets).
     """
 
     T_world_source: Float64
@@ -286,7 +287,7 @@ def align(
         photometric=photometric and bool(total[kernels.COUNT_P] > 0),
         score=float(
             (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
-            / max(len(points), 1)
+            / max(len(points) * len(targets), 1)
         ),
     )
 

@@ -13,6 +13,10 @@ REASONS: dict[str, tuple[str, str]] = {
     "images_disagree": ("failed", "Most of what the images saw contradicts the estimated poses."),
     "lost_frames": ("degraded", "Some readable frames have no pose."),
     "images_differ": ("degraded", "Images that overlap do not agree as well as neighbours do."),
+    "jumped": ("degraded", "A frame was found far from where the motion led."),
+    "unobserved_motion": ("degraded", "Often the data did not hold the camera in every direction."),
+    "repeated_images": ("degraded", "Images were repeated, to the last pixel."),
+    "implausible_depth": ("degraded", "Depths are not such as this camera measures."),
     "weak_registration": ("degraded", "Neighbouring frames had few points in common."),
     "not_converged": ("degraded", "Registrations stopped before they settled."),
     "unchecked_drift": ("degraded", "No loop checks how much error has built up."),
@@ -20,6 +24,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "optimiser_gave_up": ("degraded", "The optimiser ran out of iterations before it settled."),
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
     "single_frame": ("note", "Only one frame has a pose: there was nothing to register."),
+    "stood_still": ("note", "The camera never moved: the model is what one view sees."),
     "loop_rejected": ("note", "A loop given by hand could not be confirmed."),
 }
 

@@ -1,0 +1,131 @@
+"""How a camera moves: where it is expected next, and which motions are surprises.
+
+A camera that is carried or turned changes its velocity little from one frame to the next. A frame
+that fits well at a place where it can hardly be (a mirrored image, another scale of depth, another
+place that looks alike) is given away by that.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+
+Float64 = NDArray[np.float64]
+
+# What a motion may differ from the expected one, whatever was seen before: m and rad. Carried
+# cameras at 5 to 30 frames a second stay below.
+FLOOR = np.array([0.06, np.radians(4.0)])
+# Over that, so many times the largest of so many recent differences.
+_TIMES, _RECENT = 2.0, 4
+# After so many frames without a pose the camera can be anywhere.
+_FORGOTTEN = 3
+
+
+class Motion:
+    """The motion of a camera so far."""
+
+    def __init__(self) -> None:
+        self._T: Float64 | None = None  # of the last frame with a pose
+        self._per_frame: Float64 | None = None  # (6,) the motion of a frame, while it is known
+        self._missed = 0  # frames since
+        self._elsewhere: Float64 | None = None  # the last surprise, and frames since
+        self._waited = 0
+        self._differences: deque[Float64] = deque(maxlen=_RECENT)
+
+    @property
+    def expected(self) -> Float64 | None:
+        """T_world_camera (4, 4) if the last motion goes on; None if it is not known."""
+        if self._T is None or self._per_frame is None:
+            return None
+        return _onward(self._T, self._per_frame, self._missed + 1)
+
+    def surprise(self, T: Float64, expected: Float64 | None) -> str:
+        """Return in words how a pose differs from what was expected, or nothing if it is believed.
+
+        A surprise is believed if the frame before it was one too and the camera went on from there
+        as it moved before: a jump of the camera, or of the recording, does not change how it moves,
+        but a mirrored image does.
+        """
+        if self._T is None or expected is None or self._missed >= _FORGOTTEN:
+            return ""
+        difference = _size(se3.inverse(expected) @ T)
+        if self._differences:
+            usual = np.max(self._differences, axis=0)
+        else:
+            usual = _size(se3.inverse(self._T) @ expected)
+        allowed = FLOOR + _TIMES * usual
+        if (difference <= allowed * (self._missed + 1)).all():
+            self._differences.append(difference / (self._missed + 1))
+            self._elsewhere = None
+            return ""
+        if self._elsewhere is not None and self._per_frame is not None:
+            onward = _onward(self._elsewhere, self._per_frame, self._waited + 1)
+            if (_size(se3.inverse(onward) @ T) <= allowed * (self._waited + 1)).all():
+                return ""
+        self._elsewhere, self._waited = T, -1  # the call of `miss` follows
+        return (
+            f"that is {difference[0]:.2f} m and {np.degrees(difference[1]):.0f} degrees from where "
+            "the motion leads"
+        )
+
+    def follow(self, T: Float64) -> bool:
+        """Take the pose of the next frame; returns whether the camera jumped to get there."""
+        before, frames = self._T, self._missed + 1
+        jumped = self._elsewhere is not None
+        if jumped:
+            before, frames = self._elsewhere, self._waited + 1
+        if before is None or frames > _FORGOTTEN:
+            self._per_frame = None
+        elif frames > 0:  # at the place of a surprise itself the motion is taken to go on
+            self._per_frame = se3.log(se3.inverse(before) @ T) / frames
+        self._T, self._missed, self._elsewhere = T, 0, None
+        return jumped
+
+    def interrupt(self) -> None:
+        """Say that the camera may be anywhere by the next frame."""
+        self._missed = _FORGOTTEN
+        self._per_frame, self._elsewhere = None, None
+
+    def miss(self) -> None:
+        """Say that the next frame has no pose."""
+        self._missed += 1
+        self._waited += 1
+        if self._missed >= _FORGOTTEN:
+            self._per_frame, self._elsewhere = None, None
+
+
+def jumps(
+    poses: Sequence[Float64 | None], interruptions: Collection[int] = ()
+) -> list[tuple[int, str]]:
+    """Positions of poses (4, 4) that the motion before does not lead to, and how far off they are.
+
+    None is a frame without a pose; `interruptions` are positions at which a recording begins.
+    """
+    motion = Motion()
+    found = []
+    for k, T in enumerate(poses):
+        if k in interruptions:
+            motion.interrupt()
+        if T is None:
+            motion.miss()
+            continue
+        words = motion.surprise(T, motion.expected)
+        if words:
+            found.append((k, words))
+        motion.follow(T)
+    return found
+
+
+def _onward(T: Float64, per_frame: Float64, frames: int) -> Float64:
+    """Pose (4, 4) after so many frames of a motion (6,)."""
+    return se3.orthonormalise(T @ se3.exp(per_frame * frames))
+
+
+def _size(T: Float64) -> Float64:
+    """Distance in m and angle in rad of a motion (4, 4)."""
+    return np.array([np.linalg.norm(T[:3, 3]), float(se3.angle(T))])
