@@ -105,7 +105,9 @@ def render(
     if effects.multipath:
         points = middle.points.reshape(shape)[pick.centre]
         normals = middle.normals.reshape(shape)[pick.centre]
-        bounced = optics.bounced_light(scene, model, points, normals, *poses[-1])
+        bounced = optics.bounced_light(
+            scene, model, points, normals, *poses[-1], gloss=effects.gloss
+        )
 
     parts = _phase_images(model, effects, taps, bounced)
     exposure = parts.exposure(model, effects, scene.ambient)
