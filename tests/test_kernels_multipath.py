@@ -175,3 +175,14 @@ def test_flat_nodes_are_counted_on_planes_and_not_on_bent_ones() -> None:
     flat = kernels.flat_nodes(fitted(nodes), 4, 0.1, 0.003)
     assert flat > 5000
     assert kernels.flat_nodes(fitted(bent), 4, 0.1, 0.003) < 0.8 * flat
+
+
+def test_nearest_is_the_first_of_the_least_distances() -> None:
+    rng = np.random.default_rng(5)
+    x, y = rng.normal(size=(2, 50))
+    nodes = np.round(rng.normal(size=(70, 2)), 1)
+    away = (x[:, None] - nodes[:, 0]) ** 2 + (y[:, None] - nodes[:, 1]) ** 2
+    np.testing.assert_array_equal(kernels.nearest(x, y, nodes), away.argmin(1))
+    # Equal ones: a place in the middle of a square.
+    square = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0]])
+    assert kernels.nearest(np.zeros(1), np.zeros(1), square)[0] == 0

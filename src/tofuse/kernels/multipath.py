@@ -190,6 +190,20 @@ def choose_planes(
 
 
 @kernel
+def nearest(x: Float64, y: Float64, nodes: Float64) -> NDArray[np.int64]:
+    """Index (N,) of the nearest of nodes (M, 2) to each place x, y (N,); the first of equals."""
+    out = np.zeros(x.size, np.int64)
+    for i in range(x.size):
+        least = np.inf
+        for j in range(len(nodes)):
+            away = (x[i] - nodes[j, 0]) ** 2 + (y[i] - nodes[j, 1]) ** 2
+            if away < least:
+                least = away
+                out[i] = j
+    return out
+
+
+@kernel
 def exchange(
     sources: Float32, start: int, stop: int, receivers: Float32, wavelength: float, out: Float32
 ) -> None:

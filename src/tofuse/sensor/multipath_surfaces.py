@@ -215,8 +215,7 @@ def unseen_sources(surfaces: Surfaces, lamp: float, gain: float, wave_number: fl
     if len(gx) == 0:
         return none
     nodes = surfaces.nodes.reshape(-1, COLUMNS)[chosen]
-    away = (gx[:, None] - nodes[:, X]) ** 2 + (gy[:, None] - nodes[:, Y]) ** 2
-    near = away.argmin(1)
+    near = kernels.nearest(gx, gy, np.ascontiguousarray(nodes[:, X : Y + 1]))
     node = nodes[near]
     w = node[:, A] * gx + node[:, B] * gy + node[:, C]
     # A plane that runs away, or into the camera, says nothing about what is there.
