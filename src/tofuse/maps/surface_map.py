@@ -195,6 +195,39 @@ class SurfaceMap:
             np.float32
         )
 
+    def thinned(self, columns: int) -> SurfaceMap:
+        """Return the view at every n-th pixel, so that it has at most so many columns.
+
+        A plane fits beyond its own pixel, so for comparing views few pixels are enough.
+        """
+        step = -(-self.z.shape[1] // columns)
+        if step == 1:
+            return self
+        first = step // 2
+        kept = (slice(first, None, step),) * 2
+        rays, z, sigma, planes, variance, photo = (
+            np.ascontiguousarray(image[kept])
+            for image in (
+                self.rays,
+                self.z,
+                self.sigma,
+                self.planes,
+                self.plane_variance,
+                self.photo,
+            )
+        )
+        lookup = (self.projection.lookup - np.float32(first)) / np.float32(step)
+        projection = Projection(lookup, self.projection.frame)
+        return SurfaceMap(
+            self.index, rays, z, sigma, planes, variance, photo, projection, self.has_photo
+        )
+
+    @cached_property
+    def depth(self) -> float:
+        """Median z in m; 1 where nothing is valid."""
+        valid = self.z[self.z > 0]
+        return float(np.median(valid)) if len(valid) else 1.0
+
     @cached_property
     def target(self) -> Float32:
         """(H, W, PIXEL_SIZE) what points of other views are compared with, see `make_target`."""

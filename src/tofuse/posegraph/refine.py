@@ -1,0 +1,390 @@
+"""Refinement over all overlapping views at once (eq 2.8), and self-calibration.
+
+Every pair of overlapping views gives the normal equations of its relative pose; by the adjoint
+they become equations in both poses, and one sparse system moves all of them. Then the points look
+for their partners again, until nothing moves: the thesis's wish to run its code "iterated"
+(chapter 8), with planes and albedo in place of points. Errors of the camera that all views share
+can be unknowns of the same system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import linalg
+
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph.views import KeptView, overlaps
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Integers = NDArray[np.intp]
+
+UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+_PAIRS_A_CHUNK = 8
+# Few residuals tell no scale.
+_LEAST_COMPARED = 50
+_UPPER = np.triu_indices(kernels.UNKNOWNS)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Iterations with the same forgiveness: as in `registration.projective.Level`."""
+
+    iterations: int
+    slack_m: float
+    photo_slack: float
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.iterations <= 1000:
+            raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
+        if not (0 <= self.slack_m < 1e3 and 0 <= self.photo_slack < 1e3):
+            raise ValueError("slack_m and photo_slack must be 0 or more")
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """How views are refined together.
+
+    Attributes
+    ----------
+    rounds
+        Coarse and wide to fine; which views overlap is found anew for each.
+    overlap
+        Least share of each other that two views must see.
+    neighbours
+        At most so many earlier partners of each view, spread evenly over those that overlap.
+    points
+        About so many points of each view.
+    robust, max_angle, photometric, most_sigma_m
+        As in `ProjectiveOptions`.
+    settled
+        Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
+    """
+
+    rounds: tuple[Round, ...] = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(6, 0.0, 0.0))
+    overlap: float = 0.3
+    neighbours: int = 16
+    points: int = 2500
+    robust: float = 3.5
+    max_angle: float = 0.7
+    photometric: bool = True
+    most_sigma_m: float = 0.02
+    settled: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.rounds) <= 20:
+            raise ValueError(f"rounds holds {len(self.rounds)}; give 1 to 20")
+        if not 0 < self.overlap <= 1:
+            raise ValueError(f"overlap is {self.overlap}, not above 0 and up to 1")
+        for name in ("neighbours", "points"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
+        for name in ("robust", "max_angle", "most_sigma_m", "settled"):
+            if not 1e-6 <= getattr(self, name) <= 1e6:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """How well each directed pair agrees: counts of points as in `Aligned`.
+
+    Attributes
+    ----------
+    target, source
+        (P,) positions of the views.
+    compared, inliers, in_front
+        (P,) counts.
+    """
+
+    target: Integers
+    source: Integers
+    compared: Float64
+    inliers: Float64
+    in_front: Float64
+
+    def of_views(self, count: int) -> Float64:
+        """(N,) inliers less twice the points in free space, as a share of those compared."""
+        good = self.inliers - 2 * self.in_front
+        total, most = np.zeros(count), np.zeros(count)
+        for ends in (self.target, self.source):
+            np.add.at(total, ends, good)
+            np.add.at(most, ends, self.compared)
+        return total / np.maximum(most, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What a refinement found.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first has not moved.
+    errors
+        (ERRORS,) of the camera, in the order of `kernels.refinement`; 0 where not asked for.
+    pairs
+        (M, 2) positions of the views i < j that took part.
+    moved
+        Largest motion of each iteration, in units of 1 cm and 1 degree.
+    before, after
+        Support at the poses to start from and at those found, with the same sigmas.
+    """
+
+    poses: Float64
+    errors: Float64
+    pairs: Integers
+    moved: tuple[float, ...]
+    before: Support
+    after: Support
+
+
+@dataclass(eq=False)
+class _Pairs:
+    """Directed pairs, what is known of each, and what was summed last."""
+
+    target: Integers
+    source: Integers
+    exposure: Float64
+    scale_g: Float64
+    scale_p: Float64
+    most: Float64
+    rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
+
+
+def refine(
+    views: Sequence[KeptView],
+    poses: Float64,
+    options: RefineOptions,
+    *,
+    calibrate: Sequence[int] = (),
+) -> Refined:
+    """Move all views until they agree with all that they overlap with.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) T_world_camera to start from; the first stays.
+    calibrate
+        Errors of the camera to estimate as well, by their number in `kernels.refinement`.
+    """
+    start = poses
+    errors = np.zeros(kernels.ERRORS)
+    known = np.ones(kernels.ERRORS, np.int64)
+    known[list(calibrate)] = 0
+    moved: list[float] = []
+    state = _no_pairs()
+    for stage in options.rounds:
+        pairs = chosen(*overlaps(views, poses, options.overlap), options.neighbours)
+        state = _directed(views, pairs, options, state)
+        for _ in range(stage.iterations if len(pairs) else 0):
+            _evaluate(views, poses, errors, known, state, stage, options)
+            step, change = _solve(poses, state, known)
+            poses = se3.orthonormalise(poses @ se3.exp(step))
+            poses[0] = start[0]
+            errors = errors + change
+            _rescale(state, stage)
+            moved.append(float(np.abs(step / UNITS).max()))
+            if moved[-1] < options.settled:
+                break
+    pairs = state.target[: len(state.target) // 2], state.source[: len(state.target) // 2]
+    last = options.rounds[-1]
+    after = _support(views, poses, errors, known, state, last, options)
+    before = _support(views, start, np.zeros_like(errors), known, state, last, options)
+    return Refined(poses, errors, np.stack(pairs, 1), tuple(moved), before, after)
+
+
+def chosen(pairs: Integers, shares: Float64, neighbours: int) -> Integers:
+    """At most so many earlier partners of each view, spread evenly, first and last included."""
+    keep = [np.zeros(0, np.intp)]
+    for j in np.unique(pairs[:, 1]):
+        rows = np.flatnonzero(pairs[:, 1] == j)
+        if len(rows) > neighbours:
+            rows = rows[np.unique(np.linspace(0, len(rows) - 1, neighbours).round().astype(int))]
+        keep.append(rows)
+    return pairs[np.concatenate(keep)]
+
+
+def _no_pairs() -> _Pairs:
+    none = np.zeros(0, np.intp)
+    return _Pairs(none, none, *(np.zeros(0) for _ in range(4)))
+
+
+def _directed(
+    views: Sequence[KeptView], pairs: Integers, options: RefineOptions, before: _Pairs
+) -> _Pairs:
+    """Both directions of each pair, with what was known of them before."""
+    target = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    source = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    n = len(target)
+    most = np.maximum(3.0, options.most_sigma_m / np.array([v.sigma for v in views]))
+    state = _Pairs(target, source, np.zeros(n), np.ones(n), np.full(n, 0.1), most[source])
+    lit = np.array([v.surface.has_photo for v in views]) & options.photometric
+    state.scale_p[~(lit[target] & lit[source])] = 0.0
+    row = {ts: k for k, ts in enumerate(zip(before.target, before.source, strict=True))}
+    old = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
+    for name in ("exposure", "scale_g", "scale_p"):
+        getattr(state, name)[old >= 0] = getattr(before, name)[old[old >= 0]]
+    return state
+
+
+def _evaluate(
+    views: Sequence[KeptView],
+    poses: Float64,
+    errors: Float64,
+    known: Int64,
+    state: _Pairs,
+    stage: Round,
+    options: RefineOptions,
+) -> None:
+    """Sum the normal equations of every directed pair."""
+    T_target_source = se3.inverse(poses[state.target]) @ poses[state.source]
+    rows = np.empty((len(state.target), kernels.SIZE))
+    cosine = float(np.cos(options.max_angle))
+
+    def work(a: int, b: int) -> None:
+        for k in range(a, b):
+            target, p = views[state.target[k]].surface, views[state.source[k]].points
+            kernels.pair_equations(
+                p.points,
+                p.normals,
+                p.sigma,
+                p.photo,
+                target.planes,
+                target.plane_variance,
+                target.photo,
+                target.projection.lookup,
+                target.projection.frame,
+                np.ascontiguousarray(T_target_source[k]),
+                state.exposure[k],
+                state.scale_g[k],
+                state.scale_p[k],
+                stage.slack_m,
+                options.robust,
+                cosine,
+                errors,
+                known,
+                rows[k],
+            )
+
+    run_chunks(work, len(rows), -(-len(rows) // _PAIRS_A_CHUNK))
+    state.rows = rows
+
+
+def _support(
+    views: Sequence[KeptView],
+    poses: Float64,
+    errors: Float64,
+    known: Int64,
+    state: _Pairs,
+    stage: Round,
+    options: RefineOptions,
+) -> Support:
+    _evaluate(views, poses, errors, known, state, stage, options)
+    counts = (kernels.COMPARED, kernels.INLIERS, kernels.IN_FRONT)
+    return Support(state.target, state.source, *(state.rows[:, k] for k in counts))
+
+
+def _solve(poses: Float64, state: _Pairs, known: Int64) -> tuple[Float64, Float64]:
+    """One Gauss-Newton step: (N, 6) right perturbations of the poses, and that of the errors."""
+    H, g = _without_exposure(state)
+    free = np.flatnonzero(known == 0)
+    n = len(poses)
+    # A relative pose moves with its source, and against its target as the source sees it.
+    A = -se3.adjoint(se3.inverse(poses[state.source]) @ poses[state.target])
+    At = np.swapaxes(A, 1, 2)
+    pose, mixed = H[:, :6, :6], H[:, :6, 6 + free]
+    s, t = 6 * state.source, 6 * state.target
+    calibration = np.broadcast_to(6 * n, len(s))
+    system = _System(6 * n + len(free))
+    system.add(s, s, pose)
+    system.add(t, t, At @ pose @ A)
+    system.add(t, s, At @ pose)
+    system.add(s, t, pose @ A)
+    for rows, block in ((s, mixed), (t, At @ mixed)):
+        system.add(rows, calibration, block)
+        system.add(calibration, rows, np.swapaxes(block, 1, 2))
+    system.add(calibration, calibration, H[:, (6 + free)[:, None], 6 + free])
+    system.add_right(s, g[:, :6])
+    system.add_right(t, (At @ g[:, :6, None])[..., 0])
+    system.add_right(calibration, g[:, 6 + free])
+    x = system.solve(np.append(np.tile(UNITS, n), np.full(len(free), 0.01)), held=6)
+    errors = np.zeros(kernels.ERRORS)
+    errors[free] = x[6 * n :]
+    return x[: 6 * n].reshape(n, 6), errors
+
+
+def _without_exposure(state: _Pairs) -> tuple[Float64, Float64]:
+    """Normal equations of each pair without its exposure, which moves to where it fits best."""
+    m, e = len(state.target), kernels.EXPOSURE
+    H = np.zeros((m, kernels.UNKNOWNS, kernels.UNKNOWNS))
+    H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.H : kernels.G]
+    H[:, _UPPER[1], _UPPER[0]] = state.rows[:, kernels.H : kernels.G]
+    g = state.rows[:, kernels.G : kernels.G + kernels.UNKNOWNS]
+    firm = np.maximum(H[:, e, e], 1e-9)
+    state.exposure -= np.clip(g[:, e] / firm, -0.3, 0.3)
+    rest = np.delete(np.arange(kernels.UNKNOWNS), e)
+    lever = H[:, rest, e] / firm[:, None]
+    return (
+        H[:, rest[:, None], rest] - lever[:, :, None] * H[:, None, e, rest],
+        g[:, rest] - lever * g[:, [e]],
+    )
+
+
+class _System:
+    """A symmetric sparse system put together from blocks; what is added twice adds up."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._parts: list[tuple[Integers, Integers, Float64]] = []
+        self._right = np.zeros(size)
+
+    def add(self, rows: Integers, columns: Integers, blocks: Float64) -> None:
+        """Add blocks (M, a, b) whose first elements are at (rows[m], columns[m])."""
+        _, a, b = blocks.shape
+        i = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)
+        j = np.broadcast_to(columns[:, None, None] + np.arange(b), blocks.shape)
+        self._parts.append((i.ravel(), j.ravel(), blocks.ravel()))
+
+    def add_right(self, rows: Integers, blocks: Float64) -> None:
+        """Add blocks (M, a) to the gradient."""
+        np.add.at(self._right, rows[:, None] + np.arange(blocks.shape[1]), blocks)
+
+    def solve(self, units: Float64, *, held: int) -> Float64:
+        """Return the step that takes the gradient to 0; the first `held` unknowns stay.
+
+        `units` (size,) says what is a small step of each unknown: what nothing holds stays.
+        """
+        i, j, values = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        M = sparse.coo_matrix((values, (i, j)), shape=(self._size, self._size)).tocsc()
+        D = sparse.diags(units[held:])
+        M = (D @ M[held:, held:] @ D).tocsc()
+        M = M + sparse.diags(1e-3 + 1e-6 * M.diagonal())
+        solver = linalg.splu(M.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        x = np.zeros(self._size)
+        x[held:] = -units[held:] * solver.solve(units[held:] * self._right[held:])
+        return x
+
+
+def _rescale(state: _Pairs, stage: Round) -> None:
+    """Take the sigmas of each pair from its residuals, as the tracker does."""
+    counts = state.rows[:, kernels.HISTOGRAM :]
+    total = counts.sum(1)
+    share = np.cumsum(counts, 1) / np.maximum(total, 1)[:, None]
+    place = np.argmax(share >= 0.5, 1)
+    row = np.arange(len(place))
+    below = np.where(place > 0, share[row, place - 1], 0)
+    inside = (0.5 - below) / np.maximum(share[row, place] - below, 1e-9)
+    median = 2 ** ((place - 16 + inside) / 4)
+    enough = total >= _LEAST_COMPARED
+    state.scale_g[enough] = np.clip(1.48 * median, 0.7, state.most)[enough]
+    weight = state.rows[:, kernels.WEIGHT_P]
+    seen = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
+    lit = (weight > 0) & (state.scale_p > 0)
+    state.scale_p[lit] = np.clip(np.hypot(seen, stage.photo_slack), 0.005, 0.5)[lit]
