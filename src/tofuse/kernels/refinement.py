@@ -268,16 +268,53 @@ def pair_equations(
 
 
 @kernel
-def overlap(points: Float32, T: Float64, shape: Int64, lookup: Float32, frame: Float64) -> float:
-    """Share of the points (N, 3) that T (4, 4) moves into an image of `shape` (rows, columns)."""
-    landed = 0
+def overlap(
+    points: Float32,
+    normals: Float32,
+    planes: Float32,
+    lookup: Float32,
+    lookup_frame: Float64,
+    T: Float64,
+    tolerance: float,
+    min_cosine: float,
+) -> float:
+    """Share of a view's points that another view sees too, if T (4, 4) T_target_source is right.
+
+    Such points land where the target has a surface, at about its depth (within the share
+    `tolerance`), which faces the same way.
+
+    Parameters
+    ----------
+    points, normals
+        (N, 3), (N, 3) of the source.
+    planes, lookup, lookup_frame
+        Of the target, as in `pair_equations`.
+    """
+    seen = 0
     for k in range(points.shape[0]):
-        z = T[2, 0] * points[k, 0] + T[2, 1] * points[k, 1] + T[2, 2] * points[k, 2] + T[2, 3]
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         if z <= 0.02:
             continue
-        x = T[0, 0] * points[k, 0] + T[0, 1] * points[k, 1] + T[0, 2] * points[k, 2] + T[0, 3]
-        y = T[1, 0] * points[k, 0] + T[1, 1] * points[k, 1] + T[1, 2] * points[k, 2] + T[1, 3]
-        u, v, iu, _ = landing(x / z, y / z, lookup, frame)
-        if iu >= 0 and -0.5 < u < shape[1] - 0.5 and -0.5 < v < shape[0] - 0.5:
-            landed += 1
-    return landed / max(points.shape[0], 1)
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
+        if iu < 0:
+            continue
+        if not (u > -0.5 and v > -0.5 and u < planes.shape[1] - 0.5 and v < planes.shape[0] - 0.5):
+            continue
+        i = int(v + 0.5)
+        j = int(u + 0.5)
+        if planes[i, j, 3] <= 0 or abs(z * planes[i, j, 3] - 1) > tolerance:
+            continue
+        a = planes[i, j, 0]
+        b = planes[i, j, 1]
+        c = planes[i, j, 2]
+        cosine = (
+            a * (T[0, 0] * normals[k, 0] + T[0, 1] * normals[k, 1] + T[0, 2] * normals[k, 2])
+            + b * (T[1, 0] * normals[k, 0] + T[1, 1] * normals[k, 1] + T[1, 2] * normals[k, 2])
+            + c * (T[2, 0] * normals[k, 0] + T[2, 1] * normals[k, 1] + T[2, 2] * normals[k, 2])
+        )
+        if cosine >= min_cosine * np.sqrt(a * a + b * b + c * c):
+            seen += 1
+    return seen / max(points.shape[0], 1)

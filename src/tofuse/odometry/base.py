@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
 
@@ -32,6 +33,9 @@ class Step:
         Index (`Frame.index`) of the frame it was registered to; None for the first.
     registration
         T_reference_frame and how well it is known; None for the first frame.
+    surface
+        The view as it was made ready for tracking; None where the method makes none, and for
+        frames without a pose.
     """
 
     status: Status
@@ -39,6 +43,7 @@ class Step:
     T_world_camera: Float64 | None
     reference: int | None = None
     registration: Registration | None = None
+    surface: SurfaceMap | None = None
 
 
 class Tracker(Protocol):

@@ -193,7 +193,7 @@ class _KeyframeTracker(Tracker):
             self._T, self._T_odometry = np.eye(4), T_odometry
             self._motion.follow(self._T)
             self._depth = self._keyframes[0].depth
-            return Step("tracked", "", np.eye(4))
+            return Step("tracked", "", np.eye(4), surface=view)
 
         reasons: list[str] = []
         expected = self._expected(T_odometry)
@@ -224,7 +224,7 @@ class _KeyframeTracker(Tracker):
         if len(aligned.unobservable) == 6:
             status = "predicted"
             notes.insert(0, "nothing in view holds the camera in any direction")
-        return Step(status, "; ".join(notes), T, reference.view.index, registration)
+        return Step(status, "; ".join(notes), T, reference.view.index, registration, view)
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""

@@ -16,6 +16,7 @@ from tofuse.fusion.cloud import CloudFusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import LoopDetector
+from tofuse.posegraph.refinement import NoRefinement, Refining
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.results.output import read_run_json
 
@@ -40,6 +41,8 @@ class Config:
         Spreads the error of the loops.
     fusion
         Makes the cloud.
+    refinement
+        Makes the poses better, all at once, after loops are closed.
     corrections
         Applied in this order to every frame, before the filters.
     model_filters
@@ -53,6 +56,7 @@ class Config:
     loops: LoopDetector
     optimiser: Optimiser
     fusion: CloudFusion
+    refinement: Refining = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
 

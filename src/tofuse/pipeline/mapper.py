@@ -88,7 +88,8 @@ class Mapper:
     def _begin(self) -> None:
         self._correctors = [correction.start() for correction in self.config.corrections]
         self._tracker = self.config.odometry.start(self.seed)
-        self._loops = self.config.loops.start(self.seed)
+        self._loops = self.config.loops.start(self.seed, self._given_loops)
+        self._refiner = self.config.refinement.start()
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
 
     def push(
@@ -141,7 +142,11 @@ class Mapper:
             self._add(frame, clean, step)
             if step.T_world_camera is not None:
                 with self._watch.timing("loops"):
-                    self._loops.push(self._views[frame.index], step.T_world_camera)
+                    self._loops.push(self._views[frame.index], step.T_world_camera, step.surface)
+                if step.surface is not None:
+                    self._refiner.push(step.surface, step.T_world_camera)
+                    # Kept there as far as it is needed, and large.
+                    self._steps[-1] = replace(step, surface=None)
         self._progress.advance(self._records[-1])
         return step.T_world_camera
 
@@ -257,7 +262,7 @@ class Mapper:
     def _finish(self) -> Reconstruction:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
-            loops = self._loops.finish(self._given_loops)
+            loops = self._loops.finish()
             graph = self._graph(loops)
         sequential = graph.poses
         optimisation = Optimisation(graph, (), True)
@@ -266,7 +271,11 @@ class Mapper:
             with self._watch.timing("optimisation"):
                 optimisation = self.config.optimiser.optimise(graph)
         graph = optimisation.graph
-        moved = bool(graph.loop.any())
+        self._progress.stage("refining")
+        with self._watch.timing("refinement"):
+            refinement = self._refiner.finish(graph.ids.tolist(), graph.poses)
+            graph = graph.with_poses(refinement.poses)
+        moved = bool(graph.loop.any()) or refinement.kept
         self._progress.stage("fusing", len(graph.ids) * (2 if moved else 1))
         with self._watch.timing("fusion"):
             cloud = self._fuse(graph)
@@ -302,6 +311,7 @@ class Mapper:
                 {n: self._removed[n] / max(self._seen[n], 1) for n in self._seen},
                 dict(self._watch.seconds),
                 before,
+                refinement,
             ),
             config=self.config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(self._records)},

@@ -17,6 +17,8 @@ from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.loops import Confirmation
 from tofuse.posegraph.nearby import Nearby
+from tofuse.posegraph.refinement import Joint
+from tofuse.posegraph.revisits import Revisits
 from tofuse.registration.icp import algorithm_1
 
 
@@ -64,9 +66,8 @@ def default(kind: ViewKind) -> Config:
         filters=(),
         model_filters=(Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),
-        # Point-to-point ICP measures a loop less well than this odometry drifts in a turn, so
-        # only loops given by hand are closed.
-        loops=Nearby(per_frame=0),
+        loops=Revisits(),
         # Not for clouds: it believes what a registration says of its errors, and ICP's is too good.
         optimiser=LevenbergMarquardt(),
+        refinement=Joint(),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import RegistrationError
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
@@ -49,14 +50,40 @@ class ClosedLoop:
     information: Float64 | None = None
 
 
+def given_loop(
+    loop: GivenLoop, posed: Collection[int], confirm: Callable[[int, int], ClosedLoop]
+) -> ClosedLoop:
+    """Decide about a loop that a person gave.
+
+    Parameters
+    ----------
+    posed
+        Indices of the frames that have a pose.
+    confirm
+        Measures the loop between frames i and j, where its motion was not given.
+    """
+    for frame in (loop.i, loop.j):
+        if frame not in posed:
+            return ClosedLoop(LoopRecord(loop.i, loop.j, False, f"frame {frame} has no pose"))
+    if loop.T_i_j is None:
+        return confirm(loop.i, loop.j)
+    record = LoopRecord(loop.i, loop.j, True, "given with its motion")
+    return ClosedLoop(record, loop.T_i_j, GIVEN_INFORMATION)
+
+
+def in_order(closed: Mapping[tuple[int, int], ClosedLoop]) -> list[ClosedLoop]:
+    """Return loops by frames (i, j) in the order of j, then i."""
+    return [closed[pair] for pair in sorted(closed, key=lambda ij: ij[::-1])]
+
+
 class Loops(Protocol):
     """Loop detection at work: holds what it needs of the frames so far."""
 
-    def push(self, view: Frame, T_world_camera: Float64) -> None:
-        """Add the next frame that has a pose."""
+    def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
+        """Add the next frame that has a pose, and its surface if the tracker made one."""
         ...
 
-    def finish(self, given: Sequence[GivenLoop] = ()) -> list[ClosedLoop]:
+    def finish(self) -> list[ClosedLoop]:
         """Return every candidate and given loop with its decision, in the order of j, then i."""
         ...
 
@@ -66,8 +93,8 @@ class LoopDetector(Protocol):
 
     part_kind: ClassVar[str] = "loops"
 
-    def start(self, seed: int) -> Loops:
-        """Begin a new recording."""
+    def start(self, seed: int, given: Sequence[GivenLoop] = ()) -> Loops:
+        """Begin a new recording, of which a person may have given some loops."""
         ...
 
 

@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
-from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import (
-    GIVEN_INFORMATION,
     ClosedLoop,
     Confirmation,
     GivenLoop,
     LoopDetector,
     Loops,
+    given_loop,
+    in_order,
 )
 from tofuse.recordings.frames import Frame
 
@@ -61,9 +62,9 @@ class Nearby(LoopDetector):
         if self.per_frame < 0:
             raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
 
-    def start(self, seed: int) -> Loops:
-        """See `LoopDetector.start`."""
-        return _NearbyLoops(self, seed)
+    def start(self, seed: int, given: Sequence[GivenLoop] = ()) -> Loops:
+        """See `LoopDetector.start`. What a person gives takes the place of what is found."""
+        return _NearbyLoops(self, seed, given)
 
     def candidates(self, poses: Float64) -> Integers:
         """Return the positions of the cameras that the newest may see again, best first.
@@ -81,14 +82,15 @@ class Nearby(LoopDetector):
 
 
 class _NearbyLoops(Loops):
-    def __init__(self, options: Nearby, seed: int) -> None:
+    def __init__(self, options: Nearby, seed: int, given: Sequence[GivenLoop]) -> None:
         self._options = options
+        self._given_loops = given
         self._seed = seed
         self._views: dict[int, Frame] = {}
         self._poses: dict[int, Float64] = {}
         self._closed: dict[tuple[int, int], ClosedLoop] = {}
 
-    def push(self, view: Frame, T_world_camera: Float64) -> None:
+    def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
         """See `Loops.push`."""
         self._views[view.index] = view
         self._poses[view.index] = T_world_camera
@@ -96,25 +98,16 @@ class _NearbyLoops(Loops):
         for k in self._options.candidates(np.stack(list(self._poses.values()))):
             self._closed[frames[k], view.index] = self._confirm(frames[k], view.index)
 
-    def finish(self, given: Sequence[GivenLoop] = ()) -> list[ClosedLoop]:
-        """See `Loops.finish`. What a person gives takes the place of what was found."""
-        for loop in given:
-            self._closed[loop.i, loop.j] = self._given(loop)
-        return [self._closed[pair] for pair in sorted(self._closed, key=lambda ij: ij[::-1])]
+    def finish(self) -> list[ClosedLoop]:
+        """See `Loops.finish`."""
+        for loop in self._given_loops:
+            self._closed[loop.i, loop.j] = given_loop(loop, self._poses, self._confirm)
+        return in_order(self._closed)
 
     def _confirm(self, i: int, j: int) -> ClosedLoop:
         guess = se3.inverse(self._poses[i]) @ self._poses[j]
         confirmation = self._options.confirmation
         return confirmation.confirm(self._views[j], self._views[i], guess, seed=self._seed)
-
-    def _given(self, loop: GivenLoop) -> ClosedLoop:
-        for frame in (loop.i, loop.j):
-            if frame not in self._poses:
-                return ClosedLoop(LoopRecord(loop.i, loop.j, False, f"frame {frame} has no pose"))
-        if loop.T_i_j is None:
-            return self._confirm(loop.i, loop.j)
-        record = LoopRecord(loop.i, loop.j, True, "given with its motion")
-        return ClosedLoop(record, loop.T_i_j, GIVEN_INFORMATION)
 
 
 def yaw(T: Float64) -> Float64:

@@ -68,10 +68,10 @@ class RefineOptions:
         Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
     """
 
-    rounds: tuple[Round, ...] = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(6, 0.0, 0.0))
+    rounds: tuple[Round, ...] = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(5, 0.0, 0.0))
     overlap: float = 0.3
-    neighbours: int = 16
-    points: int = 2500
+    neighbours: int = 10
+    points: int = 1500
     robust: float = 3.5
     max_angle: float = 0.7
     photometric: bool = True
@@ -181,7 +181,7 @@ def refine(
     moved: list[float] = []
     state = _no_pairs()
     for stage in options.rounds:
-        pairs = chosen(*overlaps(views, poses, options.overlap), options.neighbours)
+        pairs = chosen(overlaps(views, poses, options.overlap)[0], options.neighbours)
         state = _directed(views, pairs, options, state)
         for _ in range(stage.iterations if len(pairs) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
@@ -193,14 +193,15 @@ def refine(
             moved.append(float(np.abs(step / UNITS).max()))
             if moved[-1] < options.settled:
                 break
-    pairs = state.target[: len(state.target) // 2], state.source[: len(state.target) // 2]
+    half = len(state.target) // 2
+    pairs = np.stack([state.target[:half], state.source[:half]], 1)
     last = options.rounds[-1]
     after = _support(views, poses, errors, known, state, last, options)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
-    return Refined(poses, errors, np.stack(pairs, 1), tuple(moved), before, after)
+    return Refined(poses, errors, pairs, tuple(moved), before, after)
 
 
-def chosen(pairs: Integers, shares: Float64, neighbours: int) -> Integers:
+def chosen(pairs: Integers, neighbours: int) -> Integers:
     """At most so many earlier partners of each view, spread evenly, first and last included."""
     keep = [np.zeros(0, np.intp)]
     for j in np.unique(pairs[:, 1]):

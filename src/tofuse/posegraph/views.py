@@ -20,6 +20,9 @@ Integers = NDArray[np.intp]
 
 # Of every view, to tell which views overlap.
 _OVERLAP_POINTS = 150
+# Points see the same surface if they lie within this share of its depth, and face it like this.
+_NEAR = 0.1
+_FACING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +102,11 @@ class ViewStore:
         )
 
 
-def overlaps(
-    views: Sequence[KeptView], poses: Float64, least: float
-) -> tuple[Integers, Float64]:
+def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[Integers, Float64]:
     """Pairs of views that see at least a share `least` of each other, and that share.
 
-    The share is the smaller of both ways, and knows nothing of what stands in between. Views
-    that look apart by more than a quarter turn do not overlap.
+    The share is the smaller of both ways. It counts points that lie near a surface of the other
+    view which faces the same way, so it allows for poses that have drifted somewhat.
 
     Parameters
     ----------
@@ -116,19 +117,26 @@ def overlaps(
     -------
     pairs (M, 2), i < j, in the order of j, then i; shares (M,).
     """
-    some = [
-        np.ascontiguousarray(v.points.points[:: max(1, len(v.points.points) // _OVERLAP_POINTS)])
-        for v in views
-    ]
-    shapes = [np.array(v.surface.z.shape, np.int64) for v in views]
+    some = []
+    for v in views:
+        thin = slice(None, None, max(1, len(v.points.points) // _OVERLAP_POINTS))
+        points, normals = v.points.points[thin], v.points.normals[thin]
+        some.append((np.ascontiguousarray(points), np.ascontiguousarray(normals)))
     axes = poses[:, :3, 2]
     inverse = se3.inverse(poses)
 
     def seen(target: int, source: int) -> float:
-        projection = views[target].surface.projection
-        T = np.ascontiguousarray(inverse[target] @ poses[source])
+        surface = views[target].surface
         return float(
-            kernels.overlap(some[source], T, shapes[target], projection.lookup, projection.frame)
+            kernels.overlap(
+                *some[source],
+                surface.planes,
+                surface.projection.lookup,
+                surface.projection.frame,
+                np.ascontiguousarray(inverse[target] @ poses[source]),
+                _NEAR,
+                _FACING,
+            )
         )
 
     def rows(a: int, b: int) -> list[tuple[int, int, float]]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tofuse.fusion.cloud import Cloud
 from tofuse.odometry.base import Status
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
+from tofuse.posegraph.refinement import Refinement
 
 Float64 = NDArray[np.float64]
 
@@ -56,7 +57,9 @@ class Diagnostics:
     seconds
         Wall time of each stage.
     cloud_before
-        The model as the sequential poses give it; None where no loop was closed.
+        The model as the sequential poses give it; None where nothing moved them.
+    refinement
+        What became of the refinement over all views.
     """
 
     verdict: Verdict
@@ -68,6 +71,7 @@ class Diagnostics:
     removed: dict[str, float]
     seconds: dict[str, float]
     cloud_before: Cloud | None = None
+    refinement: Refinement | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,198 @@
+"""Refinement as a part: which views take part, what is believed, and how the others follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.parts import part
+from tofuse.posegraph.refine import Refined, RefineOptions, refine
+from tofuse.posegraph.views import KeptView, Spacing, ViewStore
+
+Float64 = NDArray[np.float64]
+CameraError = Literal["offset", "scale", "focal"]
+
+# Images as targets: more pixels would not say more.
+_COLUMNS = 200
+_ERRORS: dict[CameraError, int] = {
+    "offset": kernels.OFFSET,
+    "scale": kernels.SCALE,
+    "focal": kernels.FOCAL,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """What a refinement made of a trajectory.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first has not moved.
+    kept
+        Whether they differ from what they were: only a trajectory whose views support each other
+        better is believed.
+    views, pairs
+        How many took part.
+    moved_m, moved_rad
+        Largest motions of a view.
+    support
+        Share of the compared points that agree, less twice those in free space, before and after.
+    errors
+        Of the camera, by name, where they were estimated: what is missing from the range (m), from
+        the depth (share), and by how much rays are wider than thought (share).
+    """
+
+    poses: Float64
+    kept: bool = False
+    views: int = 0
+    pairs: int = 0
+    moved_m: float = 0.0
+    moved_rad: float = 0.0
+    support: tuple[float, float] = (0.0, 0.0)
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+class Refiner(Protocol):
+    """Refinement at work on one recording: holds what it needs of the views so far."""
+
+    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
+        """Add the next view that has a pose."""
+        ...
+
+    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+        """Refine the poses (N, 4, 4) of all frames, whose indices are `ids`, ascending."""
+        ...
+
+
+class Refining(Protocol):
+    """A method that makes poses better once loops are closed."""
+
+    part_kind: ClassVar[str] = "refinement"
+
+    def start(self) -> Refiner:
+        """Begin a new recording."""
+        ...
+
+
+@part("refinement", "none")
+@dataclass(frozen=True)
+class NoRefinement(Refining):
+    """Leaves the poses as the optimiser found them."""
+
+    def start(self) -> Refiner:
+        """See `Refining.start`."""
+        return _Idle()
+
+
+class _Idle(Refiner):
+    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
+        """Keep nothing."""
+
+    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+        """See `Refiner.finish`."""
+        return Refinement(poses)
+
+
+@part("refinement", "joint")
+@dataclass(frozen=True)
+class Joint(Refining):
+    """Moves all views until each agrees with all that it overlaps with (eq 2.8), see `refine`.
+
+    Views are kept by the motion of the camera; frames in between follow them. The outcome is
+    believed only if the views support each other at least as well as before, and views that lose
+    support stay where their neighbours had them.
+
+    Attributes
+    ----------
+    spacing
+        Which views take part.
+    refine
+        How they are refined.
+    calibrate
+        Errors of the camera that are estimated as well: "offset", "scale", "focal".
+    loss
+        A view has lost support if its share fell by more.
+    """
+
+    spacing: Spacing = Spacing()  # noqa: RUF009 - immutable
+    refine: RefineOptions = RefineOptions()  # noqa: RUF009 - immutable
+    calibrate: tuple[CameraError, ...] = ()
+    loss: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.loss <= 1:
+            raise ValueError(f"loss is {self.loss}, not 0 to 1")
+
+    def start(self) -> Refiner:
+        """See `Refining.start`."""
+        return _Joint(self)
+
+
+class _Joint(Refiner):
+    def __init__(self, options: Joint) -> None:
+        self._options = options
+        self._store = ViewStore(options.spacing)
+
+    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
+        """See `Refiner.push`."""
+        self._store.push(surface.thinned(_COLUMNS), T_world_camera)
+
+    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+        """See `Refiner.finish`."""
+        options = self._options
+        row = {int(index): k for k, index in enumerate(ids)}
+        views = [KeptView.of(s, options.refine.points) for s in self._store.surfaces]
+        at = np.array([row[v.surface.index] for v in views], np.intp)
+        if len(views) < 2:
+            return Refinement(poses, views=len(views))
+        before = poses[at]
+        numbers = [_ERRORS[name] for name in options.calibrate]
+        refined = refine(views, before, options.refine, calibrate=numbers)
+        support = refined.before.of_views(len(views)), refined.after.of_views(len(views))
+        mean = float(support[0].mean()), float(support[1].mean())
+        unchanged = Refinement(poses, False, len(views), len(refined.pairs), support=mean)
+        if not len(refined.pairs) or mean[1] < mean[0]:
+            return unchanged
+        after = _without_losers(before, refined, support[1] < support[0] - options.loss)
+        motion = se3.log(se3.inverse(before) @ after)
+        return replace(
+            unchanged,
+            poses=followed(poses, at, after),
+            kept=True,
+            moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
+            moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+            errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
+        )
+
+
+def _without_losers(before: Float64, refined: Refined, lost: NDArray[np.bool_]) -> Float64:
+    """The refined poses, but views that lost support stay where a neighbour had them."""
+    after = refined.poses.copy()
+    good = np.flatnonzero(~lost)
+    for k in np.flatnonzero(lost) if len(good) else ():
+        near = good[np.argmin(np.abs(good - k))]
+        after[k] = after[near] @ se3.inverse(before[near]) @ before[k]
+    return se3.inverse(after[0]) @ after if lost[0] else after
+
+
+def followed(poses: Float64, at: NDArray[np.intp], after: Float64) -> Float64:
+    """All poses (N, 4, 4), when those at positions `at` (ascending) have become `after`.
+
+    Each frame keeps its motion relative to the views before and after it, and lies between what
+    the two say by its place between them.
+    """
+    every = np.arange(len(poses))
+    right = np.clip(np.searchsorted(at, every), 0, len(at) - 1)
+    left = np.clip(np.searchsorted(at, every, side="right") - 1, 0, len(at) - 1)
+    relative = [after[k] @ se3.inverse(poses[at[k]]) @ poses for k in (left, right)]
+    gap = at[right] - at[left]
+    share = np.where(gap > 0, (every - at[left]) / np.maximum(gap, 1), 0.0)
+    return se3.interpolate(relative[0], relative[1], share)
