@@ -34,7 +34,9 @@ _POINTS = 600
 # The trajectory has drifted when a loop closes: little, or much.
 _NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 4, 0.0, 0.0))
 _FAR = (Level(4, 20, 0.15, 0.3), *_NEAR)
-_ALIGNMENT = ProjectiveOptions(levels=_NEAR, prior_m=3.0, prior_rad=3.0)
+_ALIGNMENT = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
+# Sigma, in units of 1 cm and 1 degree, above which a direction keeps the prediction: never.
+_NOT_HELD = 1e6
 _ACCEPTANCE = Acceptance(0.8, 0.3, 0.05, 200, 0.02, 0.6)
 
 
@@ -56,9 +58,9 @@ class Revisits(LoopDetector):
     per_view
         At most so many candidates for each view, those of the largest overlap.
     alignment
-        How two views are aligned.
-    far
-        Levels to try where that fails.
+        How two views are aligned, apart from the levels.
+    near, far
+        Levels to try, and those where they fail; at least two each.
     acceptance
         When an alignment is believed.
     both_ways_m, both_ways_rad
@@ -70,6 +72,7 @@ class Revisits(LoopDetector):
     apart: float = 0.1
     per_view: int = 2
     alignment: ProjectiveOptions = _ALIGNMENT
+    near: tuple[Level, ...] = _NEAR
     far: tuple[Level, ...] = _FAR
     acceptance: Acceptance = _ACCEPTANCE
     both_ways_m: float = 0.03
@@ -143,16 +146,15 @@ class _RevisitLoops(Loops):
         """Align the later view with the earlier one, and back."""
         options = self._options
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
-        there = align(source, [Target(target, np.eye(4))], guess, options.alignment)
+        there = self._align(target, source, guess, options.near)
         objection = self._objection(there)
         if objection:
-            farther = replace(options.alignment, levels=options.far)
-            again = align(source, [Target(target, np.eye(4))], guess, farther)
+            again = self._align(target, source, guess, options.far)
             if not self._objection(again):
                 there, objection = again, ""
         T = there.T_world_source
         if not objection:
-            back = align(target, [Target(source, np.eye(4))], se3.inverse(T), options.alignment)
+            back = self._align(source, target, se3.inverse(T), options.near)
             objection = self._objection(back)
             gap = T @ back.T_world_source
             if not objection and (
@@ -173,6 +175,16 @@ class _RevisitLoops(Loops):
             return ClosedLoop(record)
         C = covariance(source, [Target(target, np.eye(4))], there, options.alignment)
         return ClosedLoop(record, T, np.asarray(np.linalg.inv(C), np.float64))
+
+    def _align(
+        self, target: SurfaceMap, source: SurfaceMap, guess: Float64, levels: tuple[Level, ...]
+    ) -> Aligned:
+        """Align with nothing held at the guess, which has drifted; then see what is held."""
+        options = replace(self._options.alignment, levels=levels)
+        free = replace(options, held=_NOT_HELD, common_tilt=0.0, common_slope=0.0)
+        targets = [Target(target, np.eye(4))]
+        T = align(source, targets, guess, free).T_world_source
+        return align(source, targets, T, replace(options, levels=levels[-2:]))
 
     def _objection(self, aligned: Aligned) -> str:
         found = self._options.acceptance.objection(aligned)
