@@ -333,9 +333,9 @@ def test_the_scale_of_distances_is_that_of_normal_deviates(sigma):
     view[2][:] = 0.0
     off = sigma * np.sqrt(1e-6 / (NORMAL @ NORMAL)) * np.random.default_rng(11).normal(size=3000)
     view[0] += (off[:, None] * (MOTION[:3, :3].T @ unit)).astype(np.float32)
-    found = steps.scale_of_distances(accumulate(view, of))
+    found = steps.scale_of_distances(accumulate(view, of)[kernels.HISTOGRAM :])
     assert found == pytest.approx(sigma, rel=0.08)
-    assert np.isnan(steps.scale_of_distances(np.zeros(kernels.SIZE)))
+    assert np.isnan(steps.scale_of_distances(np.zeros(kernels.BINS)))
 
 
 def test_the_difference_in_exposure_is_seen_where_points_land():

@@ -150,7 +150,7 @@ def accumulate(
         along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(points[k, SIGMA])
         own = along * along + np.float64(pixel[VARIANCE])
         r2 = r * r
-        out[HISTOGRAM + _bin(r2 / own)] += 1
+        out[HISTOGRAM + histogram_bin(r2 / own)] += 1
         per_variance = 1 / (scale_g2 * own + slack2)
         e2 = r2 * per_variance * inverse_limit2
         if e2 >= 1:
@@ -211,7 +211,7 @@ def accumulate(
 
 
 @kernel
-def _bin(ratio: float) -> int:
+def histogram_bin(ratio: float) -> int:
     """Bin of a squared distance: the exponent of the number and two bits of its mantissa."""
     bits = np.float32(ratio).view(np.int32)
     place = int(bits >> 21) - ((127 - 8) << 2)

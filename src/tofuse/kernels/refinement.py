@@ -12,6 +12,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels.alignment import (
+    ALBEDO,
+    ALBEDO_SLOPE,
+    BINS,
+    DISTANCE,
+    LIGHT,
+    LIGHT_SLOPE,
+    NORMAL,
+    PLANE,
+    POINT,
+    SIGMA,
+    VARIANCE,
+    histogram_bin,
+)
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row, landing
 
@@ -32,16 +46,15 @@ UNKNOWNS = 7 + ERRORS
 # Layout of the row of a pair.
 H = 0  # upper triangle over the unknowns
 G = UNKNOWNS * (UNKNOWNS + 1) // 2
-LANDED = G + UNKNOWNS
-COMPARED = LANDED + 1
+COMPARED = G + UNKNOWNS  # points that land where the target has a plane
 INLIERS = COMPARED + 1
-IN_FRONT = INLIERS + 1
+IN_FRONT = INLIERS + 1  # points in free space of the target
 SQUARES_M = IN_FRONT + 1  # of the inliers' distances, m^2
-WEIGHT_P = SQUARES_M + 1
+WEIGHT_P = SQUARES_M + 1  # sums of the robust weights and squares of the log albedo's residuals
 SQUARES_P = WEIGHT_P + 1
-COST = SQUARES_P + 1  # robust cost of both terms, in squared sigmas
-HISTOGRAM = COST + 1  # of distances in unscaled sigmas, quarter octaves from 1/16
-BINS = 48
+TERMS = SQUARES_P + 1  # residuals of both terms
+SUPPORT = TERMS + 1  # their robust costs (Tukey's biweight), from 1 for none to 0 for the largest
+HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
 
 
@@ -70,12 +83,7 @@ def displacement(B: Float64, x: float, y: float, z: float, known: Int64) -> None
 @kernel
 def pair_equations(
     points: Float32,
-    normals: Float32,
-    depth_sigma: Float32,
-    source_photo: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    target_photo: Float32,
+    target: Float32,
     lookup: Float32,
     lookup_frame: Float64,
     T: Float64,
@@ -93,39 +101,20 @@ def pair_equations(
 
     Parameters
     ----------
-    points, normals, depth_sigma, source_photo
-        (N, 3) m; (N, 3) unit; (N,) sigma of z, m; (N, 3) log albedo and its slopes by ray
-        coordinate, NaN where unknown.
-    planes, plane_variance, target_photo
-        Of the target: (H, W, 4), (H, W) variance of 1/z, (H, W, 3).
-    lookup, lookup_frame
-        As `projection.landing` takes them.
-    T
-        (4, 4) T_target_source.
-    exposure
-        Target log albedo minus the source's.
-    scale_g, scale_p
-        Sigmas of distances are multiplied by the first; the second is that of the log albedo, 0
-        to leave the albedo out.
-    slack
-        Added in quadrature to the sigma of a distance, m.
-    robust
-        Residuals beyond so many sigmas count nothing (Tukey's biweight).
-    min_cosine
-        Smallest cosine between the normals.
+    points, target, lookup, lookup_frame, T, exposure, scale_g, scale_p, slack, robust, min_cosine
+        As in `alignment.accumulate`.
     errors
         (ERRORS,) of the camera as estimated so far: points and planes are moved by them.
     known
         (ERRORS,) not 0 for errors of the camera that are not asked for.
     """
     out[:] = 0.0
-    rows, columns = planes.shape[0], planes.shape[1]
+    rows, columns = target.shape[0], target.shape[1]
     unknowns = UNKNOWNS
     while unknowns > 7 and known[unknowns - 8]:
         unknowns -= 1
     asked = unknowns - 7
     J = np.zeros(UNKNOWNS)
-    K = np.zeros(6)
     Bp = np.zeros((ERRORS, 3))
     Bq = np.zeros((ERRORS, 3))
     A = np.zeros((UNKNOWNS, UNKNOWNS))
@@ -136,9 +125,10 @@ def pair_equations(
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for k in range(points.shape[0]):
-        px = np.float64(points[k, 0])
-        py = np.float64(points[k, 1])
-        pz = np.float64(points[k, 2])
+        point = points[k]
+        px = np.float64(point[POINT])
+        py = np.float64(point[POINT + 1])
+        pz = np.float64(point[POINT + 2])
         if asked:
             displacement(Bp, px, py, pz, known)
             for p in range(asked):
@@ -150,115 +140,94 @@ def pair_equations(
             continue
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
-        u, v, iu, iv = landing(x / (z * wider), y / (z * wider), lookup, lookup_frame)
+        # Where the target looks for it: its rays are wider than it thinks.
+        xn = x / (z * wider)
+        yn = y / (z * wider)
+        u, v, iu, _ = landing(xn, yn, lookup, lookup_frame)
         if iu < 0:
             continue
         if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
-        i = int(v + 0.5)
-        j = int(u + 0.5)
-        out[LANDED] += 1
-        inverse_z = np.float64(planes[i, j, 3])
-        if inverse_z <= 0:
+        pixel = target[int(v + 0.5), int(u + 0.5)]
+        distance = np.float64(pixel[DISTANCE])
+        if distance == 0:
             continue
         out[COMPARED] += 1
-        a = np.float64(planes[i, j, 0])
-        b = np.float64(planes[i, j, 1])
-        c = np.float64(planes[i, j, 2])
-        length = np.sqrt(a * a + b * b + c * c)
-        r = (a * x + b * y + c * z - 1.0) / length
+        out[TERMS] += 1
+        n0 = np.float64(pixel[PLANE])
+        n1 = np.float64(pixel[PLANE + 1])
+        n2 = np.float64(pixel[PLANE + 2])
+        across = n0 * x + n1 * y + n2 * z
+        r = across - distance
         if asked:
             displacement(Bq, x, y, z, known)
             for p in range(asked):
-                r -= errors[p] * (a * Bq[p, 0] + b * Bq[p, 1] + c * Bq[p, 2]) / length
-        m0 = (r00 * a + r10 * b + r20 * c) / length
-        m1 = (r01 * a + r11 * b + r21 * c) / length
-        m2 = (r02 * a + r12 * b + r22 * c) / length
-        along = (m0 * px + m1 * py + m2 * pz) / pz * np.float64(depth_sigma[k])
-        own = along * along + plane_variance[i, j] / (length * length)
+                r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
+        along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
+        own = along * along + np.float64(pixel[VARIANCE])
         variance = own * scale_g * scale_g + slack * slack
-        e2 = r * r / variance
-        # The bin of |r| / sqrt(own), without the root.
-        place = 16 + int(np.floor(2 * np.log2(max(r * r / own, 1e-18))))
-        out[HISTOGRAM + min(max(place, 0), BINS - 1)] += 1
-        if e2 >= limit2:
-            out[COST] += limit2 / 3
+        r2 = r * r
+        out[HISTOGRAM + histogram_bin(r2 / own)] += 1
+        e2 = r2 / variance / limit2
+        if e2 >= 1:
             # Nearer than what the target saw there: it looked through this point.
-            if z * inverse_z < 1 and e2 > 4 * limit2:
+            if r < 0 and e2 > 4:
                 out[IN_FRONT] += 1
             continue
-        s0 = np.float64(normals[k, 0])
-        s1 = np.float64(normals[k, 1])
-        s2 = np.float64(normals[k, 2])
+        m0 = r00 * n0 + r10 * n1 + r20 * n2
+        m1 = r01 * n0 + r11 * n1 + r21 * n2
+        m2 = r02 * n0 + r12 * n1 + r22 * n2
+        s0 = np.float64(point[NORMAL])
+        s1 = np.float64(point[NORMAL + 1])
+        s2 = np.float64(point[NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
-            out[COST] += limit2 / 3
             continue
-        f = 1 - e2 / limit2
+        f = 1 - e2
         out[INLIERS] += 1
-        out[SQUARES_M] += r * r
-        out[COST] += limit2 / 3 * (1 - f * f * f)
-        weight = f * f / variance
+        out[SQUARES_M] += r2
+        out[SUPPORT] += f * f * f
         # The mean of both views' normals: noise in one of them then counts half.
-        jacobian_row(J, m0, m1, m2, px, py, pz)
-        jacobian_row(K, s0, s1, s2, px, py, pz)
-        for p in range(6):
-            J[p] = 0.5 * (J[p] + K[p])
+        jacobian_row(J, 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2), px, py, pz)
         J[EXPOSURE] = 0.0
-        if asked:
-            for p in range(asked):
-                J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
-                    a * Bq[p, 0] + b * Bq[p, 1] + c * Bq[p, 2]
-                ) / length
-        for p in range(unknowns):
-            gj = weight * J[p]
-            g[p] += gj * r
-            for o in range(p, unknowns):
-                A[p, o] += gj * J[o]
+        for p in range(asked):
+            J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
+                n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2]
+            )
+        _add(A, g, J, r, f * f / variance, unknowns)
 
-        tx = np.float64(target_photo[i, j, 1])
-        ty = np.float64(target_photo[i, j, 2])
-        level = np.float64(source_photo[k, 0])
+        tx = np.float64(pixel[ALBEDO_SLOPE])
+        level = np.float64(point[LIGHT])
         if scale_p <= 0 or np.isnan(tx) or np.isnan(level):
             continue
-        # To first order the albedo where the point lands exactly, not at the pixel's centre.
-        xu = 1.0 / (lookup_frame[2] * (lookup[iv, iu + 1, 0] - lookup[iv, iu, 0]))
-        yv = 1.0 / (lookup_frame[3] * (lookup[iv + 1, iu, 1] - lookup[iv, iu, 1]))
-        here = target_photo[i, j, 0] + tx * (u - j) * xu + ty * (v - i) * yv
-        rp = here - level - exposure
-        e2 = rp * rp / (scale_p * scale_p)
-        if e2 >= limit2:
-            out[COST] += limit2 / 3
+        ty = np.float64(pixel[ALBEDO_SLOPE + 1])
+        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - level - exposure
+        out[TERMS] += 1
+        r2 = r * r
+        e2 = r2 / (scale_p * scale_p) / limit2
+        if e2 >= 1:
             continue
-        f = 1 - e2 / limit2
+        f = 1 - e2
         out[WEIGHT_P] += f * f
-        out[SQUARES_P] += f * f * rp * rp
-        out[COST] += limit2 / 3 * (1 - f * f * f)
-        weight = f * f / (scale_p * scale_p)
+        out[SQUARES_P] += f * f * r2
+        out[SUPPORT] += f * f * f
+        # d(x/z, y/z) by the moved point, then back into the source frame.
         d0 = tx / (z * wider)
         d1 = ty / (z * wider)
-        d2 = -(tx * x + ty * y) / (z * z * wider)
+        d2 = -(tx * xn + ty * yn) / z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        jacobian_row(J, m0, m1, m2, px, py, pz)
-        gx = np.float64(source_photo[k, 1])
-        gy = np.float64(source_photo[k, 2])
-        if not np.isnan(gx):
-            jacobian_row(K, gx / pz, gy / pz, -(gx * px + gy * py) / (pz * pz), px, py, pz)
-            for p in range(6):
-                J[p] = 0.5 * (J[p] + K[p])
+        s0 = np.float64(point[LIGHT_SLOPE])
+        s1 = np.float64(point[LIGHT_SLOPE + 1])
+        s2 = np.float64(point[LIGHT_SLOPE + 2])
+        jacobian_row(J, 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2), px, py, pz)
         J[EXPOSURE] = -1.0
-        if asked:
+        for p in range(asked):
+            J[7 + p] = m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
+        if asked > FOCAL:
             # Where the target's own pixels look is moved by its focal length alone.
-            for p in range(asked):
-                J[7 + p] = m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
-            if asked > FOCAL:
-                J[7 + FOCAL] -= (tx * x + ty * y) / z
-        for p in range(unknowns):
-            gj = weight * J[p]
-            g[p] += gj * rp
-            for o in range(p, unknowns):
-                A[p, o] += gj * J[o]
+            J[7 + FOCAL] -= tx * xn + ty * yn
+        _add(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
     q = H
     for p in range(UNKNOWNS):
         out[G + p] = g[p]
@@ -268,10 +237,19 @@ def pair_equations(
 
 
 @kernel
+def _add(A: Float64, g: Float64, J: Float64, r: float, weight: float, unknowns: int) -> None:
+    """Add w J J^T to the upper triangle of A, and w r J to g."""
+    for p in range(unknowns):
+        weighted = weight * J[p]
+        g[p] += weighted * r
+        for o in range(p, unknowns):
+            A[p, o] += weighted * J[o]
+
+
+@kernel
 def overlap(
     points: Float32,
-    normals: Float32,
-    planes: Float32,
+    target: Float32,
     lookup: Float32,
     lookup_frame: Float64,
     T: Float64,
@@ -280,19 +258,17 @@ def overlap(
 ) -> float:
     """Share of a view's points that another view sees too, if T (4, 4) T_target_source is right.
 
-    Such points land where the target has a surface, at about its depth (within the share
-    `tolerance`), which faces the same way.
+    Such points land where the target has a surface, lie within a share `tolerance` of its
+    distance from it, and face the same way.
 
     Parameters
     ----------
-    points, normals
-        (N, 3), (N, 3) of the source.
-    planes, lookup, lookup_frame
-        Of the target, as in `pair_equations`.
+    points, target, lookup, lookup_frame
+        As in `pair_equations`.
     """
     seen = 0
     for k in range(points.shape[0]):
-        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         if z <= 0.02:
             continue
@@ -301,20 +277,18 @@ def overlap(
         u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
         if iu < 0:
             continue
-        if not (u > -0.5 and v > -0.5 and u < planes.shape[1] - 0.5 and v < planes.shape[0] - 0.5):
+        if not (u > -0.5 and v > -0.5 and u < target.shape[1] - 0.5 and v < target.shape[0] - 0.5):
             continue
-        i = int(v + 0.5)
-        j = int(u + 0.5)
-        if planes[i, j, 3] <= 0 or abs(z * planes[i, j, 3] - 1) > tolerance:
+        pixel = target[int(v + 0.5), int(u + 0.5)]
+        n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
+        if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
             continue
-        a = planes[i, j, 0]
-        b = planes[i, j, 1]
-        c = planes[i, j, 2]
+        nx, ny, nz = points[k, NORMAL], points[k, NORMAL + 1], points[k, NORMAL + 2]
         cosine = (
-            a * (T[0, 0] * normals[k, 0] + T[0, 1] * normals[k, 1] + T[0, 2] * normals[k, 2])
-            + b * (T[1, 0] * normals[k, 0] + T[1, 1] * normals[k, 1] + T[1, 2] * normals[k, 2])
-            + c * (T[2, 0] * normals[k, 0] + T[2, 1] * normals[k, 1] + T[2, 2] * normals[k, 2])
+            n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
+            + n1 * (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz)
+            + n2 * (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz)
         )
-        if cosine >= min_cosine * np.sqrt(a * a + b * b + c * c):
+        if cosine >= min_cosine:
             seen += 1
     return seen / max(points.shape[0], 1)

@@ -134,7 +134,7 @@ def _solve(A: Float64, b: Float64) -> None:
 
 
 @kernel
-def scale_of_distances(total: Float64) -> float:
+def scale_of_distances(histogram: Float64) -> float:
     """Sigma of all compared points' distances, in the sigmas they claim; NaN if there are none.
 
     Of all that was compared, not of what fitted: a scale from inliers would confirm itself. From
@@ -142,10 +142,10 @@ def scale_of_distances(total: Float64) -> float:
     """
     count = 0.0
     for k in range(sums.BINS):
-        count += total[sums.HISTOGRAM + k]
+        count += histogram[k]
     below = 0.0
     for k in range(sums.BINS):
-        here = total[sums.HISTOGRAM + k]
+        here = histogram[k]
         if here > 0 and 2 * (below + here) >= count:
             low, high = bin_edge(k), bin_edge(k + 1)
             return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - below) / here)

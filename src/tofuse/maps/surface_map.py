@@ -217,7 +217,7 @@ class SurfaceMap:
             )
         )
         lookup = (self.projection.lookup - np.float32(first)) / np.float32(step)
-        projection = Projection(lookup, self.projection.frame)
+        projection = Projection(rays, lookup, self.projection.frame)
         return SurfaceMap(
             self.index, rays, z, sigma, planes, variance, photo, projection, self.has_photo
         )

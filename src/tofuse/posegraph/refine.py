@@ -19,6 +19,7 @@ from scipy.sparse import linalg
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
+from tofuse.kernels import steps
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.views import KeptView, overlaps
 
@@ -93,29 +94,30 @@ class RefineOptions:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """How well each directed pair agrees: counts of points as in `Aligned`.
+    """How well each directed pair agrees.
 
     Attributes
     ----------
     target, source
         (P,) positions of the views.
-    compared, inliers, in_front
-        (P,) counts.
+    good
+        (P,) sum over its residuals, of 1 where there is none to 0 where it is beyond the robust
+        limit, less twice the points in free space.
+    terms
+        (P,) number of its residuals.
     """
 
     target: Integers
     source: Integers
-    compared: Float64
-    inliers: Float64
-    in_front: Float64
+    good: Float64
+    terms: Float64
 
     def of_views(self, count: int) -> Float64:
-        """(N,) inliers less twice the points in free space, as a share of those compared."""
-        good = self.inliers - 2 * self.in_front
+        """(N,) support of each view by all that it overlaps with, up to 1."""
         total, most = np.zeros(count), np.zeros(count)
         for ends in (self.target, self.source):
-            np.add.at(total, ends, good)
-            np.add.at(most, ends, self.compared)
+            np.add.at(total, ends, self.good)
+            np.add.at(most, ends, self.terms)
         return total / np.maximum(most, 1)
 
 
@@ -251,15 +253,10 @@ def _evaluate(
 
     def work(a: int, b: int) -> None:
         for k in range(a, b):
-            target, p = views[state.target[k]].surface, views[state.source[k]].points
+            target = views[state.target[k]].surface
             kernels.pair_equations(
-                p.points,
-                p.normals,
-                p.sigma,
-                p.photo,
-                target.planes,
-                target.plane_variance,
-                target.photo,
+                views[state.source[k]].points,
+                target.target,
                 target.projection.lookup,
                 target.projection.frame,
                 np.ascontiguousarray(T_target_source[k]),
@@ -288,8 +285,8 @@ def _support(
     options: RefineOptions,
 ) -> Support:
     _evaluate(views, poses, errors, known, state, stage, options)
-    counts = (kernels.COMPARED, kernels.INLIERS, kernels.IN_FRONT)
-    return Support(state.target, state.source, *(state.rows[:, k] for k in counts))
+    good = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
+    return Support(state.target, state.source, good, state.rows[:, kernels.TERMS])
 
 
 def _solve(poses: Float64, state: _Pairs, known: Int64) -> tuple[Float64, Float64]:
@@ -375,16 +372,10 @@ class _System:
 
 def _rescale(state: _Pairs, stage: Round) -> None:
     """Take the sigmas of each pair from its residuals, as the tracker does."""
-    counts = state.rows[:, kernels.HISTOGRAM :]
-    total = counts.sum(1)
-    share = np.cumsum(counts, 1) / np.maximum(total, 1)[:, None]
-    place = np.argmax(share >= 0.5, 1)
-    row = np.arange(len(place))
-    below = np.where(place > 0, share[row, place - 1], 0)
-    inside = (0.5 - below) / np.maximum(share[row, place] - below, 1e-9)
-    median = 2 ** ((place - 16 + inside) / 4)
-    enough = total >= _LEAST_COMPARED
-    state.scale_g[enough] = np.clip(1.48 * median, 0.7, state.most)[enough]
+    counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
+    enough = counts.sum(1) >= _LEAST_COMPARED
+    seen = np.array([steps.scale_of_distances(row) for row in counts[enough]])
+    state.scale_g[enough] = np.clip(seen, 0.7, state.most[enough])
     weight = state.rows[:, kernels.WEIGHT_P]
     seen = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
     lit = (weight > 0) & (state.scale_p > 0)

@@ -44,7 +44,7 @@ class Refinement:
     moved_m, moved_rad
         Largest motions of a view.
     support
-        Share of the compared points that agree, less twice those in free space, before and after.
+        How well the views agree, up to 1, before and after: see `refine.Support`.
     errors
         Of the camera, by name, where they were estimated: what is missing from the range (m), from
         the depth (share), and by how much rays are wider than thought (share).
@@ -119,7 +119,7 @@ class Joint(Refining):
     calibrate
         Errors of the camera that are estimated as well: "offset", "scale", "focal".
     loss
-        A view has lost support if its share fell by more.
+        A view has lost support if it fell by more.
     """
 
     spacing: Spacing = Spacing()  # noqa: RUF009 - immutable

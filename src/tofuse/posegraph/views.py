@@ -11,16 +11,18 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
+from tofuse.kernels.alignment import POINT, SIGMA
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.registration.projective import Points
+from tofuse.registration.projective import points_of
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 # Of every view, to tell which views overlap.
 _OVERLAP_POINTS = 150
-# Points see the same surface if they lie within this share of its depth, and face it like this.
+# Points see a surface if they are as near to it, as a share of their z, and face it like this.
 _NEAR = 0.1
 _FACING = 0.5
 
@@ -30,18 +32,19 @@ class KeptView:
     """A prepared view of few pixels, and the points that it gives as a source."""
 
     surface: SurfaceMap
-    points: Points
+    points: Float32
 
     @classmethod
     def of(cls, surface: SurfaceMap, points: int) -> KeptView:
         """Take about so many points of a view."""
         every = max(1, round(np.sqrt(surface.z.size / points)))
-        return cls(surface, Points.of(surface, every))
+        return cls(surface, points_of(surface, every))
 
     @cached_property
     def sigma(self) -> float:
         """Median sigma of the points' z, m."""
-        return float(np.median(self.points.sigma)) if len(self.points.sigma) else 0.01
+        p = self.points
+        return float(np.median(p[:, SIGMA] * p[:, POINT + 2])) if len(p) else 0.01
 
 
 @dataclass(frozen=True)
@@ -117,11 +120,9 @@ def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[I
     -------
     pairs (M, 2), i < j, in the order of j, then i; shares (M,).
     """
-    some = []
-    for v in views:
-        thin = slice(None, None, max(1, len(v.points.points) // _OVERLAP_POINTS))
-        points, normals = v.points.points[thin], v.points.normals[thin]
-        some.append((np.ascontiguousarray(points), np.ascontiguousarray(normals)))
+    some = [
+        np.ascontiguousarray(v.points[:: max(1, len(v.points) // _OVERLAP_POINTS)]) for v in views
+    ]
     axes = poses[:, :3, 2]
     inverse = se3.inverse(poses)
 
@@ -129,8 +130,8 @@ def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[I
         surface = views[target].surface
         return float(
             kernels.overlap(
-                *some[source],
-                surface.planes,
+                some[source],
+                surface.target,
                 surface.projection.lookup,
                 surface.projection.frame,
                 np.ascontiguousarray(inverse[target] @ poses[source]),

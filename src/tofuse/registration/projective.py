@@ -361,7 +361,7 @@ def _doubt(
 def _rescale(state: _State, level: Level, photometric: bool) -> None:
     """Take the sigmas from the residuals: the views show only their own noise, not their bias."""
     t = state.total
-    seen = steps.scale_of_distances(t)
+    seen = steps.scale_of_distances(t[kernels.HISTOGRAM :])
     if not math.isnan(seen):
         state.scale_g = min(max(seen, 0.7), state.most)
     if photometric and t[kernels.WEIGHT_P] > 0:
