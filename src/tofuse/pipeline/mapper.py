@@ -15,6 +15,7 @@ from tofuse.filters.base import apply_filters
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
+from tofuse.odometry.prediction import prediction_sigma, with_prediction
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
@@ -320,15 +321,24 @@ class Mapper:
         )
 
     def _graph(self, loops: Sequence[ClosedLoop]) -> PoseGraph:
-        ids, poses, sequence = [], [], []
-        for record, step in zip(self._records, self._steps, strict=True):
-            if step is None or step.T_world_camera is None:
-                continue
-            ids.append(record.index)
-            poses.append(step.T_world_camera)
+        posed = [
+            (record, step, step.T_world_camera)
+            for record, step in zip(self._records, self._steps, strict=True)
+            if step is not None and step.T_world_camera is not None
+        ]
+        ids = [record.index for record, _, _ in posed]
+        poses = [T for _, _, T in posed]
+        place = {index: k for k, index in enumerate(ids)}
+        sigma = prediction_sigma(np.stack(poses), [record.unobservable for record, _, _ in posed])
+        sequence = []
+        for record, step, _ in posed:
             r = step.registration
             if step.reference is not None and r is not None:
-                edge = Measured(step.reference, record.index, r.T_target_source, r.information)
+                # What was predicted frame by frame since then adds up.
+                frames = place[record.index] - place[step.reference]
+                predicted = (sigma[0] * frames, sigma[1] * frames)
+                information = with_prediction(r.information, r.unobservable, predicted)
+                edge = Measured(step.reference, record.index, r.T_target_source, information)
                 sequence.append(edge)
         closed = [
             Measured(c.record.i, c.record.j, c.T_i_j, c.information)
