@@ -174,12 +174,13 @@ def test_every_candidate_is_recorded_and_what_a_person_gives_counts():
     poses = turning(20)
     motion = se3.inverse(poses[0]) @ poses[20]
     confirmation = Confirmation((Scripted(motion),))
-    loops = Nearby(max_yaw_rad=0.01, min_gap=8, confirmation=confirmation).start(0)
+    by_hand = pose(0.05)
+    given = [GivenLoop(0, 20, by_hand), GivenLoop(5, 21), GivenLoop(3, 17)]
+    loops = Nearby(max_yaw_rad=0.01, min_gap=8, confirmation=confirmation).start(0, given)
     for k in range(22):
         if k != 5:  # lost
             loops.push(view(k), poses[k])
-    by_hand = pose(0.05)
-    closed = loops.finish([GivenLoop(0, 20, by_hand), GivenLoop(5, 21), GivenLoop(3, 17)])
+    closed = loops.finish()
     pairs = {(c.record.i, c.record.j): c for c in closed}
     assert list(pairs) == [(3, 17), (0, 20), (1, 21), (5, 21)]
     np.testing.assert_array_equal(pairs[0, 20].T_i_j, by_hand)

@@ -22,6 +22,7 @@ from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.posegraph.refinement import Refinement
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registration
 from tofuse.results.types import Diagnostics, FrameRecord, Reconstruction
@@ -275,7 +276,8 @@ class Mapper:
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
             refinement = self._refiner.finish(graph.ids.tolist(), graph.poses)
-            graph = graph.with_poses(refinement.poses)
+            if refinement.kept:
+                graph = self._graph(loops, refinement)
         moved = bool(graph.loop.any()) or refinement.kept
         self._progress.stage("fusing", len(graph.ids) * (2 if moved else 1))
         with self._watch.timing("fusion"):
@@ -320,19 +322,25 @@ class Mapper:
             threads=self.threads,
         )
 
-    def _graph(self, loops: Sequence[ClosedLoop]) -> PoseGraph:
+    def _graph(self, loops: Sequence[ClosedLoop], refined: Refinement | None = None) -> PoseGraph:
+        """The graph as the tracker left it, or with what the refinement measured instead."""
         posed = [
             (record, step, step.T_world_camera)
             for record, step in zip(self._records, self._steps, strict=True)
             if step is not None and step.T_world_camera is not None
         ]
         ids = [record.index for record, _, _ in posed]
-        poses = [T for _, _, T in posed]
+        tracked = np.array([T for _, _, T in posed])
+        poses = tracked if refined is None else refined.poses
+        again = () if refined is None else refined.edges
+        replaced = {index for edge in again for index in (edge.i, edge.j)}
         place = {index: k for k, index in enumerate(ids)}
-        sigma = prediction_sigma(np.stack(poses), [record.unobservable for record, _, _ in posed])
+        sigma = prediction_sigma(tracked, [record.unobservable for record, _, _ in posed])
         sequence = []
         for record, step, _ in posed:
             r = step.registration
+            if {step.reference, record.index} <= replaced:
+                continue
             if step.reference is not None and r is not None:
                 # What was predicted frame by frame since then adds up.
                 frames = place[record.index] - place[step.reference]
@@ -345,7 +353,7 @@ class Mapper:
             for c in loops
             if c.T_i_j is not None and c.information is not None
         ]
-        return build_graph(ids, np.stack(poses), sequence, closed)
+        return build_graph(ids, poses, [*sequence, *again], closed)
 
     def _fuse(self, graph: PoseGraph) -> Cloud:
         builder = CloudBuilder(self.config.fusion, self._voxel_m)

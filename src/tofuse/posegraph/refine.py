@@ -137,6 +137,9 @@ class Refined:
         Largest motion of each iteration, in units of 1 cm and 1 degree.
     before, after
         Support at the poses to start from and at those found, with the same sigmas.
+    measured, information
+        (M, 4, 4) T_i_j that each pair would have if it were alone, and (M, 6, 6) of its right
+        perturbation, as far as the noise of the views tells.
     """
 
     poses: Float64
@@ -145,6 +148,8 @@ class Refined:
     moved: tuple[float, ...]
     before: Support
     after: Support
+    measured: Float64
+    information: Float64
 
 
 @dataclass(eq=False)
@@ -199,8 +204,9 @@ def refine(
     pairs = np.stack([state.target[:half], state.source[:half]], 1)
     last = options.rounds[-1]
     after = _support(views, poses, errors, known, state, last, options)
+    measured = _alone(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
-    return Refined(poses, errors, pairs, tuple(moved), before, after)
+    return Refined(poses, errors, pairs, tuple(moved), before, after, *measured)
 
 
 def chosen(pairs: Integers, neighbours: int) -> Integers:
@@ -287,6 +293,22 @@ def _support(
     _evaluate(views, poses, errors, known, state, stage, options)
     good = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
     return Support(state.target, state.source, good, state.rows[:, kernels.TERMS])
+
+
+def _alone(poses: Float64, pairs: Integers, state: _Pairs) -> tuple[Float64, Float64]:
+    """What each pair measures by itself: T_i_j, and its information."""
+    H, g = _without_exposure(state)
+    H, g = H[:, :6, :6], g[:, :6]
+    half = len(pairs)
+    T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
+    # The way back moves against the way there, as seen from the other end.
+    A = -se3.adjoint(T_i_j)
+    At = np.swapaxes(A, 1, 2)
+    H = H[:half] + At @ H[half:] @ A
+    g = g[:half] + (At @ g[half:, :, None])[..., 0]
+    scaled = H * np.outer(UNITS, UNITS) + 1e-3 * np.eye(6)
+    step = -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS
+    return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
 
 
 def _solve(poses: Float64, state: _Pairs, known: Int64) -> tuple[Float64, Float64]:

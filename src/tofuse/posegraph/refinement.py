@@ -13,6 +13,7 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
+from tofuse.posegraph.build import Measured
 from tofuse.posegraph.refine import Refined, RefineOptions, refine
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore
 
@@ -21,6 +22,8 @@ CameraError = Literal["offset", "scale", "focal"]
 
 # Images as targets: more pixels would not say more.
 _COLUMNS = 200
+# Neighbouring pixels share their noise: so many count as one.
+_SHARED_NOISE = 5.0
 _ERRORS: dict[CameraError, int] = {
     "offset": kernels.OFFSET,
     "scale": kernels.SCALE,
@@ -48,6 +51,8 @@ class Refinement:
     errors
         Of the camera, by name, where they were estimated: what is missing from the range (m), from
         the depth (share), and by how much rays are wider than thought (share).
+    edges
+        What each pair measures by itself, in frame indices; none unless kept.
     """
 
     poses: Float64
@@ -58,6 +63,7 @@ class Refinement:
     moved_rad: float = 0.0
     support: tuple[float, float] = (0.0, 0.0)
     errors: dict[str, float] = field(default_factory=dict)
+    edges: tuple[Measured, ...] = ()
 
 
 class Refiner(Protocol):
@@ -170,6 +176,12 @@ class _Joint(Refiner):
             moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
             moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
+            edges=tuple(
+                Measured(views[i].surface.index, views[j].surface.index, T, H / _SHARED_NOISE)
+                for (i, j), T, H in zip(
+                    refined.pairs, refined.measured, refined.information, strict=True
+                )
+            ),
         )
 
 

@@ -1,0 +1,210 @@
+"""Refinement over all overlapping views, on views of a corner with exact poses."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from test_kernels_refinement import corner
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.posegraph.refine import RefineOptions, chosen, refine
+from tofuse.posegraph.refinement import Joint, NoRefinement, followed
+from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
+
+OPTIONS = RefineOptions()
+
+
+def path(count: int) -> np.ndarray:
+    """Poses that swing round in front of the corner and come back, the first the identity."""
+    a = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    twists = np.stack(
+        [
+            0.3 * np.sin(a),
+            0.2 * (1 - np.cos(a)),
+            0.2 * np.sin(2 * a),
+            0.15 * np.sin(a),
+            -0.3 * np.sin(a),
+            0.2 * (np.cos(a) - 1),
+        ],
+        axis=-1,
+    )
+    return se3.exp(twists)
+
+
+def surfaces(poses, noise=0.0, **kwargs):
+    rng = np.random.default_rng(3)
+    out = []
+    for k, T in enumerate(poses):
+        frame = replace(corner(T, **kwargs), index=k)
+        depth = frame.depth + noise * rng.standard_normal(frame.depth.shape).astype(np.float32)
+        out.append(surface_map(replace(frame, depth=depth), SurfaceOptions(radii=(2,))))
+    return out
+
+
+def drifted(poses):
+    """Poses of an odometry that errs by the same little motion in every step."""
+    step = se3.exp(np.array([0.004, -0.003, 0.002, 0.003, -0.002, 0.003]))
+    out = [poses[0]]
+    for a, b in itertools.pairwise(poses):
+        out.append(out[-1] @ se3.inverse(a) @ b @ step)
+    return np.stack(out)
+
+
+def away(found, truth) -> float:
+    """Largest distance of a camera from where it is, m."""
+    return float(np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max())
+
+
+@pytest.fixture(scope="module")
+def swing():
+    truth = path(12)
+    kept = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
+    return kept, truth
+
+
+def test_drift_is_taken_out_by_all_views_together(swing):
+    views, truth = swing
+    start = drifted(truth)
+    found = refine(views, start, OPTIONS)
+    assert away(start, truth) > 0.04
+    assert away(found.poses, truth) < 0.006
+    assert np.array_equal(found.poses[0], start[0])
+    assert found.moved[-1] < found.moved[0] / 20
+    assert found.after.of_views(12).min() > found.before.of_views(12).max() - 0.05
+    # What a pair says by itself is near what all say together.
+    i, j = found.pairs.T
+    together = se3.inverse(found.poses[i]) @ found.poses[j]
+    assert np.abs(se3.log(se3.inverse(found.measured) @ together)).max() < 0.02
+    assert np.linalg.eigvalsh(found.information).min() > 0
+
+
+def test_threads_change_nothing(swing):
+    views, truth = swing
+    results = []
+    for count in (1, 2, 3):
+        with threads(count):
+            results.append(refine(views, drifted(truth), OPTIONS).poses)
+    np.testing.assert_array_equal(results[0], results[1])
+    np.testing.assert_array_equal(results[0], results[2])
+
+
+def test_errors_of_the_camera_are_found_where_the_views_hold_them():
+    truth = path(12)
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, offset=0.05)]
+    start = drifted(truth)
+    plain = refine(views, start, OPTIONS)
+    found = refine(views, start, OPTIONS, calibrate=[kernels.OFFSET])
+    assert found.errors[kernels.OFFSET] == pytest.approx(0.05, abs=0.01)
+    assert away(found.poses, truth) < 0.5 * away(plain.poses, truth)
+    # A camera without errors is found to have none.
+    good = [KeptView.of(s, 1500) for s in surfaces(truth)]
+    none = refine(good, start, OPTIONS, calibrate=[kernels.OFFSET, kernels.FOCAL])
+    assert np.abs(none.errors).max() < 0.01
+
+
+def test_overlaps_are_those_of_views_that_look_at_the_same_side(swing):
+    views, truth = swing
+    pairs, shares = overlaps(views, truth, 0.3)
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    assert ((shares >= 0.3) & (shares <= 1)).all()
+    assert {(0, 1), (0, 11)} <= set(map(tuple, pairs.tolist()))
+    turned = truth.copy()
+    turned[5] = turned[5] @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    assert 5 not in overlaps(views, turned, 0.3)[0]
+
+
+def test_partners_are_spread_evenly():
+    pairs = np.array([(i, 9) for i in range(9)] + [(3, 4)])
+    pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
+    kept = chosen(pairs, 3)
+    assert kept[kept[:, 1] == 9, 0].tolist() == [0, 4, 8]
+    assert (3, 4) in map(tuple, kept.tolist())
+    assert len(chosen(pairs[:0], 3)) == 0
+
+
+def test_frames_in_between_follow():
+    before = path(9)
+    at = np.array([0, 4, 8])
+    step = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
+    after = before[at].copy()
+    after[1:] = step @ after[1:]
+    found = followed(before, at, after)
+    np.testing.assert_allclose(found[at], after, atol=1e-12)
+    np.testing.assert_allclose(found[6], step @ before[6], atol=1e-12)
+    moved = found[:5, 0, 3] - before[:5, 0, 3]
+    np.testing.assert_allclose(moved, [0, 0.025, 0.05, 0.075, 0.1], atol=1e-9)
+
+
+def refiner(part, views, poses):
+    out = part.start()
+    for view, T in zip(views, poses, strict=True):
+        out.push(view, T)
+    return out.finish(list(range(len(poses))), poses)
+
+
+def test_a_refinement_is_kept_only_where_the_views_support_it():
+    truth = path(12)
+    views = surfaces(truth, noise=0.005)
+    start = drifted(truth)
+    better = refiner(Joint(), views, start)
+    assert better.kept
+    assert better.support[1] > better.support[0]
+    assert away(better.poses, truth) < 0.006
+    assert better.moved_m > 0.03
+    assert {(e.i, e.j) for e in better.edges} >= {(0, 1), (1, 2)}
+    # Views of which nothing overlaps stay where they are.
+    apart = np.stack([se3.exp(np.array([100.0 * k, 0, 0, 0, 0, 0])) for k in range(12)])
+    same = refiner(Joint(), views, apart)
+    assert not same.kept
+    assert not same.edges
+    np.testing.assert_array_equal(same.poses, apart)
+    np.testing.assert_array_equal(refiner(NoRefinement(), views, start).poses, start)
+
+
+def test_a_view_that_loses_support_stays_with_its_neighbours():
+    """One view is of another place: it must not be dragged about to fit what it can't."""
+    truth = path(12)
+    views = surfaces(truth, noise=0.002)
+    strange = surfaces(truth @ se3.exp(np.array([0, 0, -0.5, 0.3, 0, 0])))[6]
+    views[6] = replace(strange, index=6)
+    found = refiner(Joint(), views, drifted(truth))
+    others = np.delete(np.arange(12), 6)
+    assert away(found.poses[others], truth[others]) < 0.012
+
+
+def test_the_store_never_holds_more_than_it_may():
+    view = surfaces(path(1))[0]
+    store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10))
+    for k in range(400):
+        store.push(replace(view, index=k), se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])))
+        assert len(store.surfaces) <= 10
+    kept = [s.index for s in store.surfaces]
+    assert kept[0] == 0
+    assert kept[-1] > 300
+    assert max(np.diff(kept)) <= 2 * min(np.diff(kept))
+    still = ViewStore(Spacing())
+    for k in range(5):
+        still.push(replace(view, index=k), np.eye(4))
+    assert [s.index for s in still.surfaces] == [0]
+
+
+@pytest.mark.parametrize(
+    ("cls", "options"),
+    [
+        (Spacing, {"most": 1}),
+        (Spacing, {"angle": -1}),
+        (RefineOptions, {"overlap": 0}),
+        (RefineOptions, {"rounds": ()}),
+        (RefineOptions, {"neighbours": 0}),
+        (Joint, {"loss": 2}),
+    ],
+)
+def test_options_are_checked(cls, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        cls(**options)
