@@ -23,17 +23,9 @@ OPTIONS = RefineOptions()
 def path(count: int) -> np.ndarray:
     """Poses that swing round in front of the corner and come back, the first the identity."""
     a = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    twists = np.stack(
-        [
-            0.3 * np.sin(a),
-            0.2 * (1 - np.cos(a)),
-            0.2 * np.sin(2 * a),
-            0.15 * np.sin(a),
-            -0.3 * np.sin(a),
-            0.2 * (np.cos(a) - 1),
-        ],
-        axis=-1,
-    )
+    sine, rise = np.sin(a), 1 - np.cos(a)
+    shift = [0.3 * sine, 0.2 * rise, 0.2 * np.sin(2 * a)]
+    twists = np.stack([*shift, 0.15 * sine, -0.3 * sine, -0.2 * rise], axis=-1)
     return se3.exp(twists)
 
 
