@@ -11,10 +11,12 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.odometry import keyframes as module
-from tofuse.odometry.keyframes import Acceptance, Keyframes
+from tofuse.odometry.keyframes import Acceptance, Keyframes, Recovery
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.open import open_recording
+from tofuse.registration.agreement import Agreement
+from tofuse.registration.search import Candidate, Match
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
@@ -365,7 +367,8 @@ def test_options_that_make_no_sense_are_refused_with_their_name(path, value):
 def test_what_is_refused_is_told():
     strict = replace(Acceptance(), inliers=10**6)
     scene = Sequence("corner", [0, 3])
-    steps = run(scene.frames, Keyframes(acceptance=strict, relocated=strict))
+    options = Keyframes(acceptance=strict, relocated=strict, recovery=Recovery(keyframes=0))
+    steps = run(scene.frames, options)
     assert_marked(steps[1])
     assert "1000000 are needed" in steps[1].reason
     assert "keyframe 0" in steps[1].reason
@@ -381,3 +384,24 @@ def test_a_real_camera_that_was_carried_on_is_found_again(shared_data):
         if step.T_world_camera is not None:
             assert step.T_world_camera[2, 3] == pytest.approx(0.305, abs=0.02)
     assert steps[-1].status == "tracked"
+
+
+def test_what_is_searched_for_in_vain_stays_lost(room, elsewhere):
+    steps = run([room.frames[0], elsewhere[0]])
+    assert_marked(steps[1])
+
+
+def test_a_search_is_believed_only_with_a_lead_and_without_contradiction():
+    def match(score, rival, violation):
+        said = Agreement(0.6, score + 2 * violation, violation, 0.0, 0.01, 1000, score)
+        other = Agreement(0.6, rival, 0.0, 0.0, 0.01, 1000, rival)
+        return Match((Candidate(np.eye(4), said), Candidate(np.eye(4), other)), "full")
+
+    recovery = Recovery()
+    assert recovery.believes(match(0.5, 0.4, 0.0))
+    assert not recovery.believes(match(0.2, 0.0, 0.0))
+    assert not recovery.believes(match(0.5, 0.49, 0.0))
+    assert not recovery.believes(match(0.5, 0.4, 0.1))
+    # A camera that was lost may stand anywhere, and rooms look alike.
+    assert not recovery.believes(match(0.5, 0.4, 0.0), lost=True)
+    assert recovery.believes(match(0.5, 0.2, 0.0), lost=True)

@@ -26,6 +26,7 @@ from tofuse.registration.projective import (
     Target,
     align,
 )
+from tofuse.registration.search import Match, SearchOptions, search
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
 Float64 = NDArray[np.float64]
@@ -100,6 +101,62 @@ class Acceptance:
         return ""
 
 
+@dataclass(frozen=True)
+class Recovery:
+    """When a frame that fits no prediction is searched for exhaustively, and what is believed.
+
+    Attributes
+    ----------
+    keyframes
+        In how many of the newest keyframes a frame is searched for; 0 never searches.
+    patience
+        After so many frames in a row that the search did not find, only every so many-th is
+        searched for.
+    score
+        Least share of both views' points that support the pose, less those that contradict it.
+    margin, lost_margin
+        Least lead in score before the best other pose; the second after a frame was lost, when
+        the keyframe may show another place that looks alike.
+    contradiction
+        Largest share of what lands on a surface that lies where the other view saw through, or
+        reflects otherwise.
+    prior_m, prior_rad
+        Sigma of the pose found, as the prediction of the last alignment.
+    search
+        How far and how finely is searched.
+    """
+
+    keyframes: int = 1
+    patience: int = 10
+    score: float = 0.25
+    margin: float = 0.025
+    lost_margin: float = 0.15
+    contradiction: float = 0.08
+    prior_m: float = 0.03
+    prior_rad: float = 0.03
+    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.keyframes <= _REMEMBERED:
+            raise ValueError(f"keyframes is {self.keyframes}, not 0 to {_REMEMBERED}")
+        if not 1 <= self.patience <= 1_000_000:
+            raise ValueError(f"patience is {self.patience}, not 1 or more")
+        for name in ("score", "margin", "lost_margin", "contradiction"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
+        for name in ("prior_m", "prior_rad"):
+            if not 1e-6 <= getattr(self, name) <= 1e6:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+
+    def believes(self, match: Match, lost: bool = False) -> bool:
+        """Whether what both views say of the best pose, and of its rivals, is convincing."""
+        return (
+            match.score >= self.score
+            and match.margin >= (self.lost_margin if lost else self.margin)
+            and match.agreement.contradiction <= self.contradiction
+        )
+
+
 @part("odometry", "keyframes")
 @dataclass(frozen=True)
 class Keyframes(Odometry):
@@ -119,6 +176,8 @@ class Keyframes(Odometry):
         How its covariance is told.
     acceptance
         When an alignment is believed; `relocated` when nothing predicted it.
+    recovery
+        How a frame that fits no prediction is searched for.
     guess
         Where an alignment starts: "previous" (the last motion goes on), "identity" (the camera
         stands still), "odometry" (the motion between the poses of an odometry file).
@@ -135,6 +194,7 @@ class Keyframes(Odometry):
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     acceptance: Acceptance = Acceptance()
     relocated: Acceptance = Acceptance(0.85, 0.4, 0.05, 300, 0.02, 0.62)
+    recovery: Recovery = Recovery()
     guess: Guess = "previous"
     keyframe_angle: float = 0.2
     keyframe_distance: float = 0.1
@@ -173,6 +233,7 @@ class _KeyframeTracker(Tracker):
         self._motion = Motion()
         self._lost = False
         self._depth = 0.0  # median of the last frame with a pose, m
+        self._searched = 0  # frames in a row that only a search could find, or not even that
 
     def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
         """See `Tracker.push`."""
@@ -202,6 +263,10 @@ class _KeyframeTracker(Tracker):
             return self._lose(f"the typical depth was {self._depth:.2g} m and is {depth:.2g} m")
         found = self._track(view, expected, reasons) or self._relocate(view)
         if found is None:
+            found = self._search(view)
+        else:
+            self._searched = 0
+        if found is None:
             return self._lose(reasons[0])
         aligned, reference, chosen = found
         T = aligned.T_world_source
@@ -212,6 +277,8 @@ class _KeyframeTracker(Tracker):
         notes = [chosen] if chosen else []
         if self._motion.follow(T):
             notes.append("the camera jumped, and this view goes on from there")
+        if self._searched:  # a camera that is put down anew for each view has no velocity
+            self._motion.interrupt()
         if frame.amplitude_image is not None and not aligned.photometric:
             notes.append("the albedo took no part")
         self._T, self._T_odometry, self._lost = T, T_odometry, False
@@ -319,6 +386,30 @@ class _KeyframeTracker(Tracker):
             objection = options.relocated.objection(aligned)
             if not objection and aligned.converged and not len(aligned.unobservable):
                 return aligned, keyframe, f"found again at keyframe {keyframe.view.index}"
+        return None
+
+    def _search(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe, str] | None:
+        """Search the newest keyframes exhaustively, from no guess at all."""
+        options = self._options
+        recovery = options.recovery
+        self._searched += 1
+        if self._searched > recovery.patience and self._searched % recovery.patience:
+            return None
+        for keyframe in self._keyframes[: -recovery.keyframes - 1 : -1]:
+            match = search(view, keyframe.view, recovery.search)
+            if match is None or not recovery.believes(match, self._lost):
+                continue
+            T = keyframe.T_world_camera @ match.T_target_source
+            target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+            near = replace(
+                options.alignment,
+                levels=_PATIENT,
+                prior_m=recovery.prior_m,
+                prior_rad=recovery.prior_rad,
+            )
+            lead = f"leading by {match.margin:.0%} of the points"
+            how = f"found by a search of keyframe {keyframe.view.index}, {lead}"
+            return align(view, target, T, near), keyframe, how
         return None
 
     def _is_new(self, T: Float64, reference: _Keyframe) -> bool:

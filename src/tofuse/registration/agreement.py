@@ -36,8 +36,9 @@ class AgreementOptions:
         Largest angle between the normals of surfaces that support each other, rad.
     albedo
         Largest difference in log albedo, exposure apart, of points that support.
-    violation_weight
-        How many supporting points a point in free space outweighs.
+    violation_weight, clash_weight
+        How many supporting points are outweighed by a point in free space, and by one that lies
+        on a surface of another albedo.
     """
 
     points: int = 2500
@@ -47,11 +48,20 @@ class AgreementOptions:
     max_angle: float = 0.7
     albedo: float = 0.3
     violation_weight: float = 2.0
+    clash_weight: float = 1.0
 
     def __post_init__(self) -> None:
         if not 10 <= self.points <= 10_000_000:
             raise ValueError(f"points is {self.points}, not 10 or more")
-        for name in ("sigmas", "floor_m", "floor_share", "max_angle", "albedo", "violation_weight"):
+        for name in (
+            "sigmas",
+            "floor_m",
+            "floor_share",
+            "max_angle",
+            "albedo",
+            "violation_weight",
+            "clash_weight",
+        ):
             if not 0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -75,7 +85,8 @@ class Agreement:
     points
         How many were compared, of both images.
     score
-        Support less twice the violation. Points that are hidden, or out of view, say nothing.
+        Support less twice the violation and less the clash. Points that are hidden, or out of
+        view, say nothing.
     """
 
     overlap: float
@@ -85,6 +96,11 @@ class Agreement:
     rms_m: float
     points: int
     score: float
+
+    @property
+    def contradiction(self) -> float:
+        """Violations and clashes, as a share of the points that land on a surface."""
+        return (self.violation + self.clash) / max(self.overlap, 1e-9)
 
 
 def agreement(
@@ -118,6 +134,7 @@ def agreement(
     if len(lighter):
         clash = int(np.count_nonzero(np.abs(lighter - np.median(lighter)) > options.albedo))
     support = on_surface - clash
+    against = options.violation_weight * violation + options.clash_weight * clash
     share = 1 / max(count, 1)
     return Agreement(
         overlap=float(total[kernels.COMPARED] * share),
@@ -126,7 +143,7 @@ def agreement(
         clash=float(clash * share),
         rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
         points=count,
-        score=float((support - options.violation_weight * violation) * share),
+        score=float(share * (support - against)),
     )
 
 

@@ -38,6 +38,10 @@ Mode = Literal["auto", "both", "planar", "full"]
 _PHOTOMETRIC = ProjectiveOptions(
     levels=(Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02)), common_tilt=0.0, common_slope=0.0
 )
+# Best candidates that are settled once more, by so many pixels and as closely as noise allows.
+_POLISHED, _POLISH_POINTS = 10, 2500
+# Score that a candidate may lose by being aligned by albedo.
+_GIVEN_UP = 0.05
 # Nodes of the grid on which an image is looked up, along its wider side.
 _GRID = 128
 # Points without which a view is not searched.
@@ -103,7 +107,7 @@ class SearchOptions:
     planar_candidates: int = 20
     full_candidates: int = 60
     settle_points: int = 700
-    photo_candidates: int = 12
+    photo_candidates: int = 30
     convincing: float = 0.4
     distinct_m: float = 0.1
     distinct_rad: float = 0.0873
@@ -268,7 +272,12 @@ def _finished(
         Candidate(T, agreement(source, target, T, options.agreement))
         for T in (aligned.T_world_source for aligned in moved)
     ]
-    return _distinct([*best, *placed, *rest], options)
+    # Where geometry leaves a pose open, it may fit a little better off the place that albedo knows.
+    kept = [
+        new if new.score > old.score - _GIVEN_UP else old
+        for old, new in zip(best, placed, strict=True)
+    ]
+    return _distinct([*kept, *rest], options)
 
 
 def _prepare(view: SurfaceMap) -> _View:
@@ -424,20 +433,50 @@ def _settled(
     options: SearchOptions,
 ) -> list[Candidate]:
     """Settle poses by two-way ICP, and judge them."""
+    floor = _noise_floor(s, t, options)
     depth = 0.5 * (s.depth + t.depth)
+    reaches = np.maximum(0.25 * depth * 0.85 ** np.arange(28), 3 * floor)
+    _settle(s, t, poses, reaches, options.settle_points, options)
+    judged = _judged(source, target, poses, options)
+    best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
+    finer = np.stack([candidate.T_target_source for candidate in best])
+    _settle(
+        s,
+        t,
+        finer,
+        np.maximum(8 * floor * 0.85 ** np.arange(28), 1.3 * floor),
+        _POLISH_POINTS,
+        options,
+    )
+    return judged + _judged(source, target, finer, options)
+
+
+def _noise_floor(s: _View, t: _View, options: SearchOptions) -> float:
+    """Distance that errors of the sensor explain at the depth of the views, m."""
     a = options.agreement
-    floor = 3 * (a.floor_m + a.floor_share * depth)
-    reaches = np.maximum(0.25 * depth * 0.8 ** np.arange(18), floor)
-    points = (*s.some(options.settle_points), *t.some(options.settle_points))
-    cosine = float(np.cos(a.max_angle))
+    return a.floor_m + a.floor_share * 0.5 * (s.depth + t.depth)
+
+
+def _settle(
+    s: _View, t: _View, poses: Float64, reaches: Float64, points: int, options: SearchOptions
+) -> None:
+    """Settle poses (N, 4, 4) in place by two-way ICP."""
+    some = (*s.some(points), *t.some(points))
+    cosine = float(np.cos(options.agreement.max_angle))
+    depth = 0.5 * (s.depth + t.depth)
     run_chunks(
         lambda i, j: kernels.settle(
-            *points, s.grid, s.frame, t.grid, t.frame, reaches, cosine, depth, poses, i, j
+            *some, s.grid, s.frame, t.grid, t.frame, reaches, cosine, depth, poses, i, j
         ),
         len(poses),
         _CHUNKS,
     )
-    return [Candidate(T, agreement(source, target, T, a)) for T in poses]
+
+
+def _judged(
+    source: SurfaceMap, target: SurfaceMap, poses: Float64, options: SearchOptions
+) -> list[Candidate]:
+    return [Candidate(T, agreement(source, target, T, options.agreement)) for T in poses]
 
 
 def _distinct(found: list[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:
