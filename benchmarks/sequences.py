@@ -6,7 +6,6 @@ ones are made once, with every error of the camera and its factory correction, a
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import deque
@@ -19,12 +18,9 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import poses_of_frames
-from tofuse.files.images import read_image
 from tofuse.files.trajectory import read_tum
 from tofuse.filters.base import apply_filters
 from tofuse.filters.foreground import Foreground
-from tofuse.geometry import se3
-from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.pipeline.methods import default
 from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -131,29 +127,6 @@ def _kinect_loop(data: Path) -> Recording:
     return recording
 
 
-def _scanner_app(data: Path) -> Recording:
-    """3d Scanner App, "all data": depth, confidence and a JSON file with a pose for each frame."""
-    folder = data / "iphone_chair_3dscannerapp"
-    if not folder.is_dir():
-        raise FileNotFoundError(folder)
-    frames, poses = [], []
-    for index, file in enumerate(sorted(folder.glob("frame_*.json"))):
-        facts = json.loads(file.read_text())
-        number = file.stem.removeprefix("frame_")
-        depth = read_image(folder / f"depth_{number}.png").astype(np.float32) / 1000
-        fx, _, cx, _, fy, cy = facts["intrinsics"][:6]
-        camera = scaled(Pinhole(1920, 1440, fx, fy, cx, cy), depth.shape[1], depth.shape[0])
-        confidence = read_image(folder / f"conf_{number}.png")
-        frames.append(RangeFrame(index, facts["time"], camera, depth, confidence_image=confidence))
-        # ARKit looks along -z with y up.
-        T = np.array(facts["cameraPoseARFrame"]).reshape(4, 4) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        poses.append(se3.orthonormalise(T))
-    metadata = {"depth_unit_m": 0.001, "confidence_max": 2}
-    return Recording.of(
-        ArraySource(frames, np.stack(poses), metadata=metadata), folder, "3d Scanner App"
-    )
-
-
 def _simulated(name: str, scene: str, *, texture: bool = True) -> Callable[[Path], Recording]:
     def opened(_data: Path) -> Recording:
         path = OUT / "recordings" / name
@@ -173,7 +146,9 @@ KINDS = {
     "kitchen": _Kind(
         "7-Scenes kitchen, Kinect v1, 640 x 480", _recorded("sevenscenes_kitchen"), False
     ),
-    "iphone": _Kind("Chair, iPhone LiDAR, 256 x 192", _scanner_app, False),
+    "iphone": _Kind(
+        "Chair, iPhone LiDAR, 256 x 192", _recorded("iphone_chair_3dscannerapp"), False
+    ),
     "kinect": _Kind("Loop round boxes, Kinect v2, 512 x 424", _kinect_loop, False),
     "room": _Kind(f"Furnished room, {_SR4000}", _simulated("room", "room"), True),
     "empty-room": _Kind(

@@ -133,7 +133,17 @@ def read_image(
     InputError
         If it can't be read, is cut off or damaged, or isn't of that size and type.
     """
-    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    return parse_image(read_bytes(path, limit=MAX_IMAGE_BYTES), path, size=size, dtype=dtype)
+
+
+def parse_image(
+    data: bytes,
+    path: str | Path,
+    *,
+    size: tuple[int, int] | None = None,
+    dtype: str | None = None,
+) -> NDArray[Any]:
+    """Decode a PNG or JPEG that is in memory; `path` names it in errors. See `read_image`."""
     header = _header(data, path)
     if size is not None and (header.width, header.height) != size:
         raise InputError(
@@ -175,7 +185,11 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
 
 def read_color(path: str | Path) -> NDArray[np.uint8]:
     """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is repeated, 16 bits are cut to 8."""
-    image = read_image(path)
+    return as_color(read_image(path))
+
+
+def as_color(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return an image of `read_image` as (H, W, 3) uint8 RGB."""
     if image.dtype == np.uint16:
         image = (image.astype(np.uint16) >> 8).astype(np.uint8)
     if image.ndim == 2:

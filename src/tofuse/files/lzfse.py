@@ -1,0 +1,134 @@
+"""LZFSE streams (Apple's codec), which Record3D stores its depth in.
+
+The layout is that of Apple's reference, github.com/lzfse/lzfse: blocks, each begun by four bytes
+that tell its kind.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+
+_END, _RAW, _TABLED, _PACKED, _SMALL = b"bvx$", b"bvx-", b"bvx1", b"bvx2", b"bvxn"
+_HEADER = 32
+_SYMBOLS = 360
+
+# A symbol's count is coded by 2 to 14 bits, of which the lowest five tell how many.
+_TWO = {0b00: 0, 0b10: 1}
+_THREE = {0b001: 2, 0b101: 3}
+_FIVE = {0b00011: 4, 0b01011: 5, 0b10011: 6, 0b11011: 7}
+
+
+def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
+    """Decompress a stream that must hold exactly `size` bytes.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, cut off, of another size, or of a kind that is not read.
+    """
+    out = np.empty(size, np.uint8)
+    at = done = 0
+    while True:
+        kind = data[at : at + 4]
+        if kind == _END:
+            break
+        if kind not in (_RAW, _PACKED):
+            names = {_TABLED: "uncompressed tables", _SMALL: "LZVN"}
+            what = f"uses {names[kind]}, which isn't read" if kind in names else "is damaged"
+            raise InputError(f"{what} (LZFSE)", where=path, remedy="export the recording again")
+        (count,) = _unpack("<I", data, at + 4, path)
+        if done + count > size:
+            raise _damaged(path)
+        if kind == _RAW:
+            block = np.frombuffer(data[at + 8 : at + 8 + count], np.uint8)
+            if len(block) < count:
+                raise _damaged(path)
+            out[done : done + count] = block
+            at += 8 + count
+        else:
+            at = _packed(data, at, out[: done + count], done, path)
+        done += count
+    if done != size:
+        raise InputError(f"unpacks to {done} bytes, not {size}", where=path, remedy="copy it again")
+    return out.tobytes()
+
+
+def _packed(data: bytes, at: int, out: NDArray[np.uint8], done: int, path: str | Path) -> int:
+    """Decode a block with packed tables to the end of `out`; return where the next one begins."""
+    from tofuse.kernels.lzfse import STATES, lzfse_block
+
+    _, _, first, second, third = _unpack("<4sIQQQ", data, at, path)
+
+    def field(word: int, offset: int, bits: int) -> int:
+        return int(word) >> offset & ((1 << bits) - 1)
+
+    literal_bytes, copy_bytes = field(first, 20, 20), field(second, 40, 20)
+    literal_skip, copy_skip = 7 - field(first, 60, 3), 7 - field(second, 60, 3)
+    header = field(third, 0, 32)
+    literal_states = np.array([field(second, 10 * k, 10) for k in range(4)], np.int64)
+    copy_states = np.array([field(third, 32 + 10 * k, 10) for k in range(3)], np.int64)
+    end = at + header + literal_bytes + copy_bytes
+    if (
+        header < _HEADER
+        or end > len(data)
+        or (copy_states >= STATES[:3]).any()
+        or literal_skip > 8 * literal_bytes
+        or copy_skip > 8 * copy_bytes
+    ):
+        raise _damaged(path)
+    counts = _counts(data[at + _HEADER : at + header], path)
+    payload = np.frombuffer(data, np.uint8, literal_bytes + copy_bytes, at + header)
+    stop = lzfse_block(
+        payload[:literal_bytes],
+        literal_skip,
+        literal_states,
+        field(first, 0, 20),
+        payload[literal_bytes:],
+        copy_skip,
+        copy_states,
+        field(first, 40, 20),
+        counts,
+        out,
+        done,
+    )
+    if stop != len(out):
+        raise _damaged(path)
+    return end
+
+
+def _counts(data: bytes, path: str | Path) -> NDArray[np.int64]:
+    """Unpack how many states each of the 360 symbols has."""
+    bits, left = int.from_bytes(data, "little"), 8 * len(data)
+    out = np.zeros(_SYMBOLS, np.int64)
+    for k in range(_SYMBOLS if data else 0):
+        if bits & 3 in _TWO:
+            used, out[k] = 2, _TWO[bits & 3]
+        elif bits & 7 in _THREE:
+            used, out[k] = 3, _THREE[bits & 7]
+        elif bits & 31 in _FIVE:
+            used, out[k] = 5, _FIVE[bits & 31]
+        elif bits & 15 == 7:
+            used, out[k] = 8, 8 + (bits >> 4 & 15)
+        else:
+            used, out[k] = 14, 24 + (bits >> 4 & 1023)
+        bits >>= used
+        left -= used
+        if left < 0:
+            raise _damaged(path)
+    return out
+
+
+def _unpack(form: str, data: bytes, at: int, path: str | Path) -> tuple[int, ...]:
+    if at + struct.calcsize(form) > len(data):
+        raise _damaged(path)
+    return struct.unpack_from(form, data, at)
+
+
+def _damaged(path: str | Path) -> InputError:
+    return InputError("is a damaged or cut off LZFSE stream", where=path, remedy="copy it again")

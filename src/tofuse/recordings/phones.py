@@ -1,0 +1,153 @@
+"""What recordings of phones share: ARKit's axes, lenses given for a larger image, confidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import read_color, read_header, read_image
+from tofuse.geometry.cameras import Pinhole, scaled
+from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.frames import Float32, RangeFrame, UInt8
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.reader import ReaderOptions
+from tofuse.recordings.sources import FileSource, read_matrix_pose
+
+Float64 = NDArray[np.float64]
+
+# ARKit's camera looks along -z with y up.
+ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+SENSOR = "iPhone or iPad LiDAR (direct ToF)"
+IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, which its intrinsics are for
+CONFIDENCE_MAX = 2.0
+
+
+def arkit_pose(table: Float64, where: str) -> Float64:
+    """T_world_camera (4, 4) with x right, y down, z forward, of ARKit's pose; NaN where lost."""
+    return read_matrix_pose(table, where) @ ARKIT_AXES
+
+
+def lens(
+    K: Float64, image_size: tuple[int, int], size: tuple[int, int], where: str | Path
+) -> Pinhole:
+    """Make the camera of depth images of `size` from the (3, 3) matrix of larger colour images."""
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    full = checked_lens(Pinhole, image_size, {k: float(v) for k, v in values.items()}, where)
+    try:
+        return scaled(full, *size)
+    except InputError as error:
+        raise InputError(error.problem, where=where, remedy=error.remedy) from error
+
+
+def first_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Return (width, height) of the first image that has a readable header."""
+    error: InputError | None = None
+    for path in files:
+        try:
+            header = read_header(path)
+        except InputError as trouble:
+            error = error or trouble
+            continue
+        return header.width, header.height
+    raise error or InputError("has no images", where="depth", remedy="check the recording")
+
+
+def refuse_replacement(options: ReaderOptions, name: str) -> None:
+    """Raise InputError if a camera was given for a format that brings one for each frame."""
+    if options.camera is not None:
+        raise InputError(
+            f"means nothing for the format {name!r}, which stores a camera with its frames",
+            where="--camera",
+            remedy="leave it out",
+        )
+
+
+class PhoneSource(FileSource):
+    """Depth images in mm of one camera for each frame, with confidence and colour where found.
+
+    ARKit's depth is of the colour camera's view, so colour made small is registered to it.
+
+    Parameters
+    ----------
+    depth
+        One 16-bit PNG for each frame.
+    timestamps
+        (N,) seconds.
+    confidence, color
+        One path for each frame; None where there is none.
+    """
+
+    def __init__(
+        self,
+        depth: Sequence[Path],
+        timestamps: Float64,
+        *,
+        confidence: Sequence[Path | None],
+        color: Sequence[Path | None],
+    ) -> None:
+        super().__init__(timestamps)
+        self.files = list(depth)
+        self.confidence = list(confidence)
+        self.color = list(color)
+        self.cameras: list[Pinhole | InputError] = []
+        self.metadata |= {
+            "sensor": SENSOR,
+            "depth_kind": "z",
+            "depth_unit_m": 0.001,
+            "confidence_max": CONFIDENCE_MAX,
+        }
+        colored = sum(path is not None for path in self.color)
+        if 0 < colored < len(self.color):
+            self.warnings.append(f"only {colored} of {len(self.color)} frames have colour")
+        sure = sum(path is not None for path in self.confidence)
+        if sure < len(self.confidence):
+            self.warnings.append(f"{len(self.confidence) - sure} frames have no confidence image")
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        camera = self.cameras[index]
+        if isinstance(camera, InputError):
+            raise camera
+        size = (camera.width, camera.height)
+        confidence = self.confidence[index]
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            camera,
+            self.read_depth(index, size),
+            confidence_image=None if confidence is None else _confidence(confidence, size),
+            color_image=self.read_color(index, size),
+        )
+
+    def read_depth(self, index: int, size: tuple[int, int]) -> Float32:
+        """Return the depth (H, W) of a frame in m."""
+        return depth_from_counts(read_image(self.files[index], size=size, dtype="uint16"), 0.001)
+
+    def read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
+        """Return the colour (H, W, 3) of a frame at the pixels of depth, or None."""
+        path = self.color[index]
+        return None if path is None else resized(read_color(path), size, path)
+
+
+def _confidence(path: Path, size: tuple[int, int]) -> UInt8:
+    return read_image(path, size=size, dtype="uint8").astype(np.uint8, copy=False)
+
+
+def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:
+    """Return an image at the size (width, height) of depth, each pixel the mean of its area."""
+    import cv2
+
+    height, width = image.shape[:2]
+    # Of another shape, it doesn't show what depth shows.
+    if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
+        raise InputError(
+            f"is {width} x {height} pixels, depth {size[0]} x {size[1]}: another shape",
+            where=where,
+            remedy="export the images again",
+        )
+    out: UInt8 = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return out

@@ -1,0 +1,321 @@
+"""Reader of Record3D's exports (iPhone and iPad): the EXR + JPG folder, and .r3d files."""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.exr import parse_exr
+from tofuse.files.images import as_color, parse_image
+from tofuse.files.lzfse import lzfse_decompress
+from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes, read_head
+from tofuse.geometry import quaternion
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.phones import (
+    ARKIT_AXES,
+    CONFIDENCE_MAX,
+    SENSOR,
+    lens,
+    refuse_replacement,
+    resized,
+)
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.sources import FARTHEST_M, FileSource
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+MAX_MEMBER_BYTES = 1 << 26
+_MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
+_EXR = re.compile(r"([0-9]{1,9})\.exr", re.IGNORECASE)
+
+
+@part("reader", "record3d", label="validated")
+@dataclass(frozen=True)
+class Record3D:
+    """Folders with metadata.json, depth/*.exr and rgb/*.jpg; or .r3d files."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if is_folder(path):
+            if is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
+                return Sniff(1.0, "metadata.json and depth/*.exr")
+            return None
+        try:
+            if path.suffix.lower() == ".r3d" and read_head(path, 4) == b"PK\x03\x04":
+                return Sniff(1.0, "a .r3d archive")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> Record3DSource:
+        """See `Reader.open`."""
+        refuse_replacement(options, "record3d")
+        return Record3DSource(_Folder(path) if is_folder(path) else _Archive(path))
+
+
+class Record3DSource(FileSource):
+    """Frames of one lens with ARKit's poses; colour is registered once it is made small."""
+
+    def __init__(self, store: _Folder | _Archive) -> None:
+        self.store = store
+        about = _Metadata(store.metadata(), store.where)
+        self.size = about.depth_size(store.default_size)
+        self.camera = about.lens(self.size)
+        times = about.times()
+        numbers = np.array(store.numbers)
+        # Poses and times are of all frames; an export may hold only some.
+        if times is None or numbers.max() >= len(times):
+            rate = about.frame_rate()
+            times = np.arange(numbers.max() + 1) / rate
+            known = False
+        else:
+            known = True
+        super().__init__(times[numbers])
+        if not known:
+            self.warnings.append(f"{store.where}: no times of all frames: taken to come evenly")
+        poses = about.poses()
+        if poses is not None:
+            inside = numbers < len(poses)
+            self.reference = np.full((len(numbers), 4, 4), np.nan)
+            self.reference[inside] = poses[numbers[inside]]
+        self.metadata |= {"sensor": SENSOR, "depth_kind": "z"}
+        if store.has_confidence:
+            self.metadata["confidence_max"] = CONFIDENCE_MAX
+        else:
+            self.warnings.append("the export holds no confidence")
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        number = self.store.numbers[index]
+        depth = self.store.depth(number, self.size)
+        color = self.store.color(number)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth,
+            confidence_image=self.store.confidence(number, self.size),
+            color_image=None
+            if color is None
+            else resized(as_color(parse_image(*color)), self.size, color[1]),
+        )
+
+
+class _Folder:
+    """The EXR + JPG export."""
+
+    has_confidence = False
+    default_size: tuple[int, int] | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.where = path / "metadata.json"
+        self.path = path
+        self.files = _numbered(path / "depth", _EXR)
+        if not self.files:
+            raise InputError("has no .exr files", where=path / "depth", remedy="export it again")
+        self.numbers = sorted(self.files)
+
+    def metadata(self) -> dict[str, Any]:
+        return read_json(self.where)
+
+    def depth(self, number: int, size: tuple[int, int]) -> Float32:
+        path = self.files[number]
+        channels = parse_exr(read_bytes(path, limit=MAX_MEMBER_BYTES), path)
+        # The one channel of a grey image, whatever the writer calls it.
+        depth = next((channels[n] for n in ("R", "Z", "Y") if n in channels), None)
+        if depth is None:
+            depth = next(iter(channels.values()))
+        return _checked(depth, size, path)
+
+    def confidence(self, number: int, size: tuple[int, int]) -> None:
+        return None
+
+    def color(self, number: int) -> tuple[bytes, Path] | None:
+        for suffix in (".jpg", ".png"):
+            path = self.path / "rgb" / f"{number}{suffix}"
+            if is_file(path):
+                return read_bytes(path, limit=MAX_MEMBER_BYTES), path
+        return None
+
+
+class _Archive:
+    """A .r3d file: a ZIP archive of `metadata` and, for each frame, rgbd/N.depth, .conf, .jpg."""
+
+    default_size = (192, 256)
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.where = Path(f"{path}: metadata")
+        try:
+            self.archive = zipfile.ZipFile(path)
+            self.names = set(self.archive.namelist())
+        except OSError as error:
+            raise input_error(error, path) from error
+        except (zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
+            raise InputError(
+                f"is a damaged archive ({error})", where=path, remedy="copy the file again"
+            ) from error
+        matches = (_MEMBER.fullmatch(name) for name in self.names)
+        self.numbers = sorted({int(m.group(1)) for m in matches if m})
+        if not self.numbers:
+            raise InputError("holds no rgbd/*.depth", where=path, remedy="export it again")
+        self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
+
+    def metadata(self) -> dict[str, Any]:
+        try:
+            data = json.loads(self._member("metadata"))
+        except (ValueError, RecursionError) as error:
+            raise InputError("is broken JSON", where=self.where, remedy="export again") from error
+        if not isinstance(data, dict):
+            raise InputError("holds no JSON object", where=self.where, remedy="export it again")
+        return data
+
+    def depth(self, number: int, size: tuple[int, int]) -> Float32:
+        name = f"rgbd/{number}.depth"
+        raw = self._unpacked(name, 4 * size[0] * size[1])
+        return _checked(
+            np.frombuffer(raw, "<f4").reshape(size[1], size[0]), size, f"{self.path}: {name}"
+        )
+
+    def confidence(self, number: int, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+        name = f"rgbd/{number}.conf"
+        if name not in self.names:
+            return None
+        raw = self._unpacked(name, size[0] * size[1])
+        return np.frombuffer(raw, np.uint8).reshape(size[1], size[0])
+
+    def color(self, number: int) -> tuple[bytes, Path] | None:
+        name = f"rgbd/{number}.jpg"
+        if name not in self.names:
+            return None
+        return self._member(name), Path(f"{self.path}: {name}")
+
+    def _unpacked(self, name: str, size: int) -> bytes:
+        return lzfse_decompress(self._member(name), size, f"{self.path}: {name}")
+
+    def _member(self, name: str) -> bytes:
+        where = f"{self.path}: {name}"
+        try:
+            with self.archive.open(name) as file:
+                data = file.read(MAX_MEMBER_BYTES + 1)
+        except KeyError as error:
+            raise InputError("is missing", where=where, remedy="export it again") from error
+        except OSError as error:
+            raise input_error(error, where) from error
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            ValueError,
+            NotImplementedError,
+            RuntimeError,
+            EOFError,
+        ) as error:
+            raise InputError("is damaged", where=where, remedy="copy the file again") from error
+        if len(data) > MAX_MEMBER_BYTES:
+            raise InputError("is too large", where=where, remedy="check the file")
+        return data
+
+
+class _Metadata:
+    """Checked access to what Record3D tells of a recording."""
+
+    def __init__(self, data: dict[str, Any], where: Path) -> None:
+        self.data, self.where = data, where
+
+    def depth_size(self, default: tuple[int, int] | None) -> tuple[int, int]:
+        """Return (width, height) of depth, which older versions of the app don't tell."""
+        if default is not None and not ("dw" in self.data and "dh" in self.data):
+            return default
+        width, height = (self._numbers(name, 1)[0] for name in ("dw", "dh"))
+        if not (2 <= width <= 16384 and 2 <= height <= 16384):
+            raise self._error("dw", f"is {width:g}, dh {height:g}")
+        return int(width), int(height)
+
+    def lens(self, size: tuple[int, int]) -> Pinhole:
+        K = self._numbers("K", 9).reshape(3, 3).T
+        width, height = (self._numbers(name, 1)[0] for name in ("w", "h"))
+        if not (2 <= width <= 16384 and 2 <= height <= 16384):
+            raise self._error("w", f"is {width:g}, h {height:g}")
+        return lens(K, (int(width), int(height)), size, f"{self.where}: K")
+
+    def frame_rate(self) -> float:
+        rate = self._numbers("fps", 1)[0] if "fps" in self.data else 60.0
+        return float(rate) if 0.01 <= rate <= 1e4 else 60.0
+
+    def times(self) -> Float64 | None:
+        """Return the seconds of all frames, or None if they aren't told."""
+        if "frameTimestamps" not in self.data:
+            return None
+        times = self._numbers("frameTimestamps", None)
+        return times if len(times) else None
+
+    def poses(self) -> Float64 | None:
+        """T_world_camera (N, 4, 4) of all frames, NaN where it was lost; or None."""
+        if "poses" not in self.data:
+            return None
+        table = self._numbers("poses", None, columns=7)
+        norms = np.linalg.norm(table[:, :4], axis=1)
+        good = (np.abs(norms - 1) < 0.01) & (np.abs(table[:, 4:]) < 1e6).all(1)
+        poses = np.full((len(table), 4, 4), np.nan)
+        poses[good] = np.eye(4)
+        poses[good, :3, :3] = quaternion.to_matrix(table[good, :4])
+        poses[good, :3, 3] = table[good, 4:]
+        return poses @ ARKIT_AXES
+
+    def _numbers(self, field: str, count: int | None, columns: int = 0) -> Float64:
+        if field not in self.data:
+            raise self._error(field, "is missing")
+        try:
+            values = np.array(self.data[field], float)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise self._error(field, "isn't made of numbers") from error
+        if columns:
+            values = values.reshape(-1, columns) if values.size == 0 else values
+            if values.ndim != 2 or values.shape[1] != columns:
+                raise self._error(field, f"isn't rows of {columns} numbers")
+            return values
+        values = values.ravel()
+        if (count is not None and len(values) != count) or not np.isfinite(values).all():
+            raise self._error(field, "isn't the finite numbers that belong there")
+        return values
+
+    def _error(self, field: str, problem: str) -> InputError:
+        return InputError(
+            problem, where=f"{self.where}: {field}", remedy="export the recording again"
+        )
+
+
+def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
+    if not is_folder(folder):
+        return {}
+    try:
+        found = [(pattern.fullmatch(p.name), p) for p in list_folder(folder)]
+    except InputError:
+        return {}
+    return {int(match.group(1)): p for match, p in found if match}
+
+
+def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:
+    """Return depth in m; values that aren't finite, or are absurd, become 0."""
+    if depth.shape != (size[1], size[0]):
+        raise InputError(
+            f"is {depth.shape[1]} x {depth.shape[0]} pixels, metadata says {size[0]} x {size[1]}",
+            where=where,
+            remedy="export the recording again",
+        )
+    return np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))

@@ -1,0 +1,154 @@
+"""Reader of the "all data" export of 3d Scanner App (iPhone and iPad)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import is_file, is_folder, list_folder
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.phones import (
+    IMAGE_SIZE,
+    PhoneSource,
+    arkit_pose,
+    first_size,
+    lens,
+    refuse_replacement,
+)
+from tofuse.recordings.reader import ReaderOptions, Sniff
+
+Float64 = NDArray[np.float64]
+
+_DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
+
+
+@part("reader", "3dscannerapp", label="validated")
+@dataclass(frozen=True)
+class ScannerApp:
+    """Folders of depth_NNNNN.png, conf_NNNNN.png, frame_NNNNN.json and some .jpg."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = _depth_files(path)
+        if any(is_file(_beside(file, "frame", ".json")) for file in files[:9]):
+            return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
+        """See `Reader.open`."""
+        refuse_replacement(options, "3dscannerapp")
+        files = _depth_files(path)
+        if not files:
+            raise InputError("has no depth_*.png", where=path, remedy="export with all data")
+        size = first_size(files)
+        source = PhoneSource(
+            files,
+            np.full(len(files), np.nan),
+            confidence=[_found(_beside(file, "conf", ".png")) for file in files],
+            color=[_found(_beside(file, "frame", ".jpg")) for file in files],
+        )
+        poses = np.full((len(files), 4, 4), np.nan)
+        unknown: list[InputError] = []
+        for k, file in enumerate(files):
+            try:
+                facts = _Facts.read(_beside(file, "frame", ".json"))
+                source.timestamps[k] = facts.time
+                source.cameras.append(facts.lens(size))
+            except InputError as error:
+                # Without its camera, the frame can't be used; the others can.
+                source.cameras.append(error)
+                continue
+            try:
+                poses[k] = facts.pose()
+            except InputError as error:
+                unknown.append(error)
+        if unknown:
+            source.warnings.append(f"{len(unknown)} poses can't be read, the first: {unknown[0]}")
+        _fill_times(source)
+        if np.isfinite(poses).any():
+            source.reference = poses
+        return source
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What a frame_NNNNN.json tells."""
+
+    path: Path
+    data: dict[str, Any]
+    time: float
+
+    @classmethod
+    def read(cls, path: Path) -> _Facts:
+        data = read_json(path)
+        return cls(path, data, float(_numbers(path, data, "time", 1)[0]))
+
+    def lens(self, size: tuple[int, int]) -> Pinhole:
+        K = _numbers(self.path, self.data, "intrinsics", 9).reshape(3, 3)
+        image = IMAGE_SIZE
+        if "projectionMatrix" in self.data:
+            # Its diagonal is twice the focal length over the size of the image.
+            P = _numbers(self.path, self.data, "projectionMatrix", 16).reshape(4, 4)
+            with np.errstate(all="ignore"):
+                width, height = 2 * np.diag(K)[:2] / np.diag(P)[:2]
+            if 100 < width < 16384 and 100 < height < 16384:
+                image = (round(float(width)), round(float(height)))
+        return lens(K, image, size, f"{self.path}: intrinsics")
+
+    def pose(self) -> Float64:
+        if "cameraPoseARFrame" not in self.data:
+            return np.full((4, 4), np.nan)
+        table = _numbers(self.path, self.data, "cameraPoseARFrame", 16, finite=False).reshape(4, 4)
+        return arkit_pose(table, f"{self.path}: cameraPoseARFrame")
+
+
+def _numbers(
+    path: Path, data: dict[str, Any], field: str, count: int, *, finite: bool = True
+) -> Float64:
+    where = f"{path}: {field}"
+    if field not in data:
+        raise InputError("is missing", where=where, remedy="export the recording again")
+    try:
+        values = np.atleast_1d(np.array(data[field], float)).ravel()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError("isn't made of numbers", where=where, remedy="export it again") from error
+    if len(values) != count or (finite and not np.isfinite(values).all()):
+        raise InputError(
+            f"isn't {count} finite numbers", where=where, remedy="export the recording again"
+        )
+    return values
+
+
+def _fill_times(source: PhoneSource) -> None:
+    known = np.isfinite(source.timestamps)
+    index = np.arange(len(known))
+    if not known.any():
+        raise next(c for c in source.cameras if isinstance(c, InputError))
+    source.timestamps[~known] = np.interp(index[~known], index[known], source.timestamps[known])
+
+
+def _depth_files(path: Path) -> list[Path]:
+    if not is_folder(path):
+        return []
+    try:
+        return [p for p in list_folder(path) if _DEPTH.fullmatch(p.name) and is_file(p)]
+    except InputError:
+        return []
+
+
+def _beside(file: Path, name: str, suffix: str) -> Path:
+    return file.with_name(f"{name}_{file.stem.split('_', 1)[1]}{suffix}")
+
+
+def _found(path: Path) -> Path | None:
+    return path if is_file(path) else None

@@ -1,0 +1,176 @@
+"""Reader of Stray Scanner's folders (iPhone and iPad)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.tables import read_columns, read_numbers
+from tofuse.files.video import Video
+from tofuse.geometry import quaternion
+from tofuse.parts import part
+from tofuse.recordings.frames import UInt8
+from tofuse.recordings.phones import (
+    IMAGE_SIZE,
+    PhoneSource,
+    first_size,
+    lens,
+    refuse_replacement,
+    resized,
+)
+from tofuse.recordings.reader import ReaderOptions, Sniff
+
+Float64 = NDArray[np.float64]
+
+FRAME_RATE_HZ = 60.0
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_LENS = ("fx", "fy", "cx", "cy")
+
+
+@part("reader", "stray", label="validated")
+@dataclass(frozen=True)
+class Stray:
+    """Folders with depth/, confidence/, odometry.csv, camera_matrix.csv, imu.csv and rgb.mp4."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if is_folder(path / "depth") and is_file(path / "odometry.csv"):
+            return Sniff(1.0, "depth/ and odometry.csv")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> StraySource:
+        """See `Reader.open`."""
+        refuse_replacement(options, "stray")
+        return StraySource(path)
+
+
+class StraySource(PhoneSource):
+    """Frames with ARKit's poses, which the app writes in the axes that are used here.
+
+    Attributes
+    ----------
+    imu
+        Columns of imu.csv by name, or None.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        files = files_with(folder / "depth", ".png")
+        if not files:
+            raise InputError("has no .png files", where=folder / "depth", remedy="copy it again")
+        sure = {p.stem: p for p in _images(folder / "confidence")}
+        super().__init__(
+            files,
+            np.arange(len(files)) / FRAME_RATE_HZ,
+            confidence=[sure.get(f.stem) for f in files],
+            color=[None] * len(files),
+        )
+        self.numbers = [int(f.stem) if f.stem.isdecimal() else k for k, f in enumerate(files)]
+        self.video = self._open_video(folder / "rgb.mp4")
+        self.imu = self._read_imu(folder / "imu.csv")
+        self._read_odometry(folder)
+
+    def read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
+        """See `PhoneSource.read_color`."""
+        if self.video is None:
+            return None
+        return resized(self.video.read(self.numbers[index]), size, self.video.path)
+
+    def _open_video(self, path: Path) -> Video | None:
+        if not is_file(path):
+            self.warnings.append(f"{path.name} is missing: there is no colour")
+            return None
+        try:
+            video = Video(path)
+        except InputError as error:
+            self.warnings.append(f"{error}: colour is left out")
+            return None
+        if 0 < video.count <= max(self.numbers):
+            self.warnings.append(
+                f"{path.name} has {video.count} frames, depth/ counts to {max(self.numbers)}: "
+                "colour is left out"
+            )
+            return None
+        return video
+
+    def _read_imu(self, path: Path) -> dict[str, Float64] | None:
+        if not is_file(path):
+            return None
+        try:
+            return read_columns(path)
+        except InputError as error:
+            self.warnings.append(f"{error}: left out")
+            return None
+
+    def _read_odometry(self, folder: Path) -> None:
+        """Take times, poses and, where newer versions of the app tell it, each frame's lens."""
+        path = folder / "odometry.csv"
+        columns = read_columns(path)
+        missing = [name for name in ("timestamp", "frame", *_POSE) if name not in columns]
+        if missing:
+            raise InputError(
+                f"has no column {missing[0]!r}", where=path, remedy="copy the recording again"
+            )
+        rows = {int(n): k for k, n in enumerate(columns["frame"]) if np.isfinite(n)}
+        row = np.array([rows.get(number, -1) for number in self.numbers])
+        # A number that isn't finite is as good as a missing row.
+        times = np.where(row < 0, np.nan, columns["timestamp"][row])
+        known = np.isfinite(times)
+        if not known.any():
+            raise InputError(
+                "has no time of any image in depth/", where=path, remedy="copy it again"
+            )
+        if not known.all():
+            self.warnings.append(f"{path}: {int((~known).sum())} frames have no row: interpolated")
+        index = np.arange(len(times))
+        times[~known] = np.interp(index[~known], index[known], times[known])
+        self.timestamps = times
+        poses = np.full((len(row), 4, 4), np.nan)
+        table = np.stack([columns[name] for name in _POSE], 1)[row]
+        good = (row >= 0) & np.isfinite(table).all(1) & (np.abs(table) < 1e6).all(1)
+        good &= np.abs(np.linalg.norm(np.where(good[:, None], table, 0)[:, 3:], axis=1) - 1) < 0.01
+        poses[good] = np.eye(4)
+        poses[good, :3, :3] = quaternion.to_matrix(table[good, 3:])
+        poses[good, :3, 3] = table[good, :3]
+        self.reference = poses if good.any() else None
+        self._read_lenses(folder, columns, row)
+
+    def _read_lenses(
+        self, folder: Path, columns: dict[str, Float64], row: NDArray[np.intp]
+    ) -> None:
+        size = first_size(self.files)
+        image = IMAGE_SIZE if self.video is None else (self.video.width, self.video.height)
+        if is_file(folder / "camera_matrix.csv"):
+            path = folder / "camera_matrix.csv"
+            K = read_numbers(path)
+            if K.shape != (3, 3):
+                raise InputError("holds no 3x3 matrix", where=path, remedy="copy it again")
+            common = lens(K, image, size, path)
+            self.cameras = [common] * len(row)
+        elif not all(name in columns for name in _LENS):
+            raise InputError(
+                "is missing, and odometry.csv has no fx, fy, cx, cy",
+                where=folder / "camera_matrix.csv",
+                remedy="copy the recording again",
+            )
+        else:
+            self.cameras = [InputError("has no row", where=folder / "odometry.csv")] * len(row)
+        if all(name in columns for name in _LENS):
+            for k in np.flatnonzero(row >= 0):
+                fx, fy, cx, cy = (columns[name][row[k]] for name in _LENS)
+                K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+                try:
+                    self.cameras[k] = lens(K, image, size, f"{folder / 'odometry.csv'}, frame {k}")
+                except InputError as error:
+                    self.cameras[k] = error
+
+
+def _images(folder: Path) -> list[Path]:
+    return files_with(folder, ".png") if is_folder(folder) else []

@@ -1,0 +1,80 @@
+"""Damaged recordings of cameras and phones: only the package's own errors come out, on one line."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import made_phones
+from test_recordings_fuzz import damage
+from tofuse.errors import TofuseError
+from tofuse.recordings.open import open_recording
+
+# What makes a recording, the name of its file (None: a folder), and its format.
+MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
+    "3dscannerapp": (made_phones.make_scanner_app, None, "3dscannerapp"),
+    "stray": (made_phones.make_stray, None, "stray"),
+    "record3d": (made_phones.make_record3d, None, "record3d"),
+    "r3d": (made_phones.make_r3d, "scan.r3d", "record3d"),
+}
+ROUNDS = 60
+CUTS = 40
+
+
+def read_through(path: Path, format_: str | None) -> tuple[int, int, int]:
+    """Read every frame; return how many were whole, how many not, and whether all was refused."""
+    whole = unread = 0
+    errors: list[TofuseError] = []
+    try:
+        for item in open_recording(path, format=format_).read_all():
+            if isinstance(item, TofuseError):
+                unread += 1
+                errors.append(item)
+            else:
+                assert np.isfinite(item.points).all()
+                whole += 1
+    except TofuseError as error:
+        errors.append(error)
+    assert all(len(str(error).splitlines()) == 1 and error.where for error in errors)
+    return whole, unread, len(errors) - unread
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_only_our_errors_come_out(tmp_path: Path, name: str) -> None:
+    make, file, format_ = MAKERS[name]
+    original = tmp_path / "original"
+    make(original / (file or "."))
+    assert open_recording(original / (file or ".")).format == format_
+    totals = np.zeros(3, int)
+    for k in range(ROUNDS):
+        rng = np.random.default_rng([70, len(name), k])
+        copy = tmp_path / "copy"
+        shutil.copytree(original, copy)
+        for _ in range(1 + int(rng.integers(2))):
+            if files := sorted(p for p in copy.rglob("*") if p.is_file()):
+                damage(files, rng)
+        totals += read_through(copy / (file or "."), format_ if k % 2 else None)
+        shutil.rmtree(copy)
+    whole, unread, refused = totals
+    # The damage must have been of all kinds: noticed, and harmless.
+    assert unread + refused > 0
+    assert whole > 0
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_files_cut_off_anywhere(tmp_path: Path, name: str) -> None:
+    make, file, format_ = MAKERS[name]
+    folder = tmp_path / "original"
+    make(folder / (file or "."))
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    rng = np.random.default_rng([71, len(name)])
+    for _ in range(CUTS):
+        path = files[rng.integers(len(files))]
+        data = path.read_bytes()
+        path.write_bytes(data[: rng.integers(len(data))])
+        read_through(folder / (file or "."), format_)
+        path.write_bytes(data)
