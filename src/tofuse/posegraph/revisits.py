@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.odometry.keyframes import Acceptance
+from tofuse.odometry.keyframes import Acceptance, Recovery
 from tofuse.parts import part
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import (
@@ -24,6 +24,7 @@ from tofuse.posegraph.loops import (
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import Frame
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.registration.search import Match, search
 from tofuse.registration.uncertainty import covariance
 
 Float64 = NDArray[np.float64]
@@ -37,6 +38,7 @@ _FAR = (Level(4, 20, 0.15, 0.3), *_NEAR)
 _ALIGNMENT = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 # Sigma, in units of 1 cm and 1 degree, above which a direction keeps the prediction: never.
 _NOT_HELD = 1e6
+_RECOVERY = Recovery()
 _ACCEPTANCE = Acceptance(0.8, 0.3, 0.05, 200, 0.02, 0.6)
 
 
@@ -45,8 +47,11 @@ _ACCEPTANCE = Acceptance(0.8, 0.3, 0.05, 200, 0.02, 0.6)
 class Revisits(LoopDetector):
     """Aligns views that, as the trajectory has it, overlap again after they did not.
 
-    A loop is accepted if it fits, holds the camera in every direction, and is found the same from
-    both ends.
+    A loop is accepted if it fits, holds the camera in most directions, and is found the same from
+    both ends. Where an alignment from the drifted pose does not fit, the best candidates are
+    searched exhaustively (`registration.search`). What a search found is accepted if it leads
+    clearly, or if another loop beside it says the same: places look alike, but not twice in the
+    same way.
 
     Attributes
     ----------
@@ -63,8 +68,17 @@ class Revisits(LoopDetector):
         Levels to try, and those where they fail; at least two each.
     acceptance
         When an alignment is believed.
+    weak
+        Most directions that a loop may leave open: there its covariance says that it knows nothing.
     both_ways_m, both_ways_rad
         How far apart the alignments of either view with the other may end.
+    searches
+        At most so many of the candidates that did not fit are searched, those of the largest
+        overlap.
+    recovery
+        How, and what is believed of what is found.
+    same_m, same_rad
+        How far apart two loops may put a camera that say the same.
     """
 
     spacing: Spacing = Spacing(angle=0.15, distance=0.08, most=200)  # noqa: RUF009 - immutable
@@ -77,12 +91,20 @@ class Revisits(LoopDetector):
     acceptance: Acceptance = _ACCEPTANCE
     both_ways_m: float = 0.03
     both_ways_rad: float = 0.03
+    weak: int = 2
+    searches: int = 6
+    recovery: Recovery = _RECOVERY
+    same_m: float = 0.15
+    same_rad: float = 0.1
 
     def __post_init__(self) -> None:
         if not 0 <= self.apart < self.overlap <= 1:
             raise ValueError("apart must be below overlap, both 0 to 1")
-        if self.per_view < 0:
-            raise ValueError(f"per_view is {self.per_view}, not 0 or more")
+        for name in ("per_view", "searches"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
+        if not 0 <= self.weak <= 5:
+            raise ValueError(f"weak is {self.weak}, not 0 to 5")
         if not (self.both_ways_m > 0 and self.both_ways_rad > 0):
             raise ValueError("both_ways_m and both_ways_rad must be above 0")
 
@@ -135,6 +157,12 @@ class _RevisitLoops(Loops):
             (surfaces[i].index, surfaces[j].index): self._confirm(surfaces[i], surfaces[j])
             for i, j in self._options.candidates(surfaces, poses)
         }
+        by_index = {s.index: s for s in surfaces}
+        refused = sorted(
+            (pair for pair, loop in closed.items() if not loop.record.accepted),
+            key=lambda pair: -(closed[pair].record.overlap or 0.0),
+        )
+        closed.update(self._searched(refused[: self._options.searches], by_index, closed))
         known = self._given_surfaces
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
@@ -152,6 +180,74 @@ class _RevisitLoops(Loops):
             again = self._align(target, source, guess, options.far)
             if not self._objection(again):
                 there, objection = again, ""
+        return self._decided(target, source, there, objection)
+
+    def _searched(
+        self,
+        pairs: Sequence[tuple[int, int]],
+        surfaces: Mapping[int, SurfaceMap],
+        closed: Mapping[tuple[int, int], ClosedLoop],
+    ) -> dict[tuple[int, int], ClosedLoop]:
+        """Search views in each other without a guess; what is found and believed."""
+        recovery = self._options.recovery
+        found = {}
+        for i, j in pairs:
+            match = search(surfaces[j], surfaces[i], recovery.search)
+            if match is not None and recovery.believes(match):
+                found[i, j] = match
+        said = {pair: loop.T_i_j for pair, loop in closed.items() if loop.T_i_j is not None}
+        said |= {pair: match.T_target_source for pair, match in found.items()}
+        believed = {}
+        for (i, j), match in found.items():
+            alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
+            if alone and not recovery.believes(match, lost=True):
+                continue
+            lead = f"found by a search, leading by {match.margin:.0%} of the points"
+            how = lead if alone else f"{lead}; another loop says the same"
+            believed[i, j] = self._measured(surfaces[i], surfaces[j], match, how)
+        return believed
+
+    def _same(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
+        """Whether the loop k, m, beside the loop i, j, puts the camera of j where that does."""
+        if (i, j) == (k, m):
+            return False
+        poses = self._poses
+        T_i_k = se3.inverse(poses[i]) @ poses[k]
+        T_m_j = se3.inverse(poses[m]) @ poses[j]
+        away = se3.inverse(T) @ T_i_k @ other @ T_m_j
+        return bool(
+            np.linalg.norm(away[:3, 3]) < self._options.same_m
+            and se3.angle(away) < self._options.same_rad
+        )
+
+    def _measured(
+        self, target: SurfaceMap, source: SurfaceMap, match: Match, how: str
+    ) -> ClosedLoop:
+        recovery = self._options.recovery
+        options = replace(
+            self._options.alignment,
+            levels=self._options.near,
+            prior_m=recovery.prior_m,
+            prior_rad=recovery.prior_rad,
+        )
+        there = align(source, [Target(target, np.eye(4))], match.T_target_source, options)
+        record = LoopRecord(
+            target.index,
+            source.index,
+            True,
+            how,
+            overlap=match.agreement.overlap,
+            rms_m=match.agreement.rms_m,
+            free_space_violation=match.agreement.violation,
+        )
+        C = covariance(source, [Target(target, np.eye(4))], there, options)
+        return ClosedLoop(record, there.T_world_source, np.asarray(np.linalg.inv(C), np.float64))
+
+    def _decided(
+        self, target: SurfaceMap, source: SurfaceMap, there: Aligned, objection: str
+    ) -> ClosedLoop:
+        """Accept an alignment to which there is no objection, if the way back agrees."""
+        options = self._options
         T = there.T_world_source
         if not objection:
             back = self._align(source, target, se3.inverse(T), options.near)
@@ -192,6 +288,6 @@ class _RevisitLoops(Loops):
             return found
         if not aligned.converged:
             return "the alignment does not settle"
-        if len(aligned.unobservable):
-            return "what both see does not hold the camera in every direction"
+        if len(aligned.unobservable) > self._options.weak:
+            return f"what both see leaves {len(aligned.unobservable)} directions open"
         return ""

@@ -1,0 +1,166 @@
+"""Loops of range images: the camera looks away from a corner, and comes back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from test_kernels_refinement import corner
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.posegraph import revisits
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.revisits import Revisits
+from tofuse.posegraph.views import Spacing
+from tofuse.registration.agreement import Agreement
+from tofuse.registration.search import Candidate, Match
+
+ALL = Spacing(angle=0, distance=0)
+DRIFT = se3.exp(np.array([0.004, -0.003, 0.004, 0.002, -0.003, 0.002]))
+
+
+def away_and_back(count=13, most=1.1):
+    """Yaw out to `most` and back, with a little sway, so that views in between differ."""
+    a = np.linspace(0, np.pi, count)
+    yaw = most * np.sin(a)
+    sway = 0.1 * np.sin(2 * a)
+    zero = np.zeros(count)
+    return se3.exp(np.stack([sway, zero, sway, zero, yaw, zero], axis=-1))
+
+
+@pytest.fixture(scope="module")
+def turn():
+    truth = away_and_back()
+    rng = np.random.default_rng(1)
+    frames = []
+    for k, T in enumerate(truth):
+        frame = replace(corner(T), index=k)
+        noise = 0.003 * rng.standard_normal(frame.depth.shape).astype(np.float32)
+        frames.append(replace(frame, depth=frame.depth + noise))
+    start = [truth[0]]
+    for k in range(1, len(truth)):
+        start.append(start[-1] @ se3.inverse(truth[k - 1]) @ truth[k] @ DRIFT)
+    return frames, truth, np.stack(start)
+
+
+def pushed(options, frames, poses, given=()):
+    loops = options.start(0, given)
+    for frame, T in zip(frames, poses, strict=True):
+        loops.push(frame, T, surface_map(frame, SurfaceOptions(radii=(2,))))
+    return loops
+
+
+def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
+    frames, truth, start = turn
+    found = pushed(Revisits(spacing=ALL, searches=0), frames, start).finish()
+    closed = [c for c in found if c.record.accepted]
+    assert closed
+    assert any(c.record.i == 0 and c.record.j >= 11 for c in closed)
+    for c in closed:
+        i, j = c.record.i, c.record.j
+        true = se3.inverse(truth[i]) @ truth[j]
+        drifted = se3.inverse(start[i]) @ start[j]
+        error = np.linalg.norm((se3.inverse(true) @ c.T_i_j)[:3, 3])
+        assert error < 0.01
+        assert error < 0.3 * np.linalg.norm((se3.inverse(true) @ drifted)[:3, 3])
+        assert np.linalg.eigvalsh(c.information).min() > 0
+        assert c.record.overlap > 0.3
+
+
+def test_views_that_never_left_each_other_are_no_loop(turn):
+    frames, _truth, start = turn
+    half = 6
+    assert pushed(Revisits(spacing=ALL), frames[:half], start[:half]).finish() == []
+    # Standing still sees the same all the time, and never left it.
+    still = [replace(frames[0], index=k) for k in range(5)]
+    assert pushed(Revisits(spacing=ALL), still, np.stack([np.eye(4)] * 5)).finish() == []
+
+
+def test_a_view_of_something_else_is_refused_with_a_reason(turn):
+    """The last views show another place: the trajectory says that they see the first again."""
+    frames, truth, start = turn
+    strange = [
+        *frames[:11],
+        *(
+            replace(corner(truth[k] @ se3.exp(np.array([0, 0, -0.8, 0.5, 0.4, 0.6]))), index=k)
+            for k in (11, 12)
+        ),
+    ]
+    options = Revisits(spacing=ALL, overlap=0.15, searches=0)
+    found = pushed(options, strange, start).finish()
+    late = [c for c in found if c.record.j >= 11]
+    assert late
+    for c in late:
+        assert not c.record.accepted
+        assert c.record.reason
+        assert c.T_i_j is None
+
+
+def test_what_a_person_gives_counts(turn):
+    frames, truth, start = turn
+    T = se3.inverse(truth[0]) @ truth[12]
+    given = [GivenLoop(0, 12, T), GivenLoop(1, 11), GivenLoop(0, 99)]
+    found = pushed(Revisits(spacing=ALL, per_view=0), frames, start, given).finish()
+    by_pair = {(c.record.i, c.record.j): c for c in found}
+    assert list(by_pair) == [(1, 11), (0, 12), (0, 99)]
+    np.testing.assert_array_equal(by_pair[0, 12].T_i_j, T)
+    measured = by_pair[1, 11]
+    assert measured.record.accepted
+    gap = se3.inverse(se3.inverse(truth[1]) @ truth[11]) @ measured.T_i_j
+    assert np.linalg.norm(gap[:3, 3]) < 0.01
+    assert by_pair[0, 99].record.reason == "frame 99 has no pose"
+
+
+def match(T, lead, score=0.6):
+    agreement = Agreement(
+        overlap=0.8, support=score, violation=0.0, clash=0.0, rms_m=0.003, points=2000, score=score
+    )
+    rival = replace(agreement, score=score - lead, support=score - lead)
+    far = T @ se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
+    return Match((Candidate(T, agreement), Candidate(far, rival)), "full")
+
+
+@pytest.mark.parametrize(
+    ("leads", "wrong", "accepted"),
+    [
+        ((0.3, 0.3), (), 2),  # each leads clearly
+        ((0.05, 0.05), (), 2),  # both say the same
+        ((0.05, 0.05), (1,), 0),  # each says something else
+        ((0.05, 0.3), (0,), 1),  # only the clear one counts
+        ((0.01, 0.01), (), 0),  # hardly any lead at all
+    ],
+)
+def test_searched_loops_lead_clearly_or_agree(turn, monkeypatch, leads, wrong, accepted):
+    frames, truth, start = turn
+    options = Revisits(spacing=ALL, per_view=3)
+    asked = []
+
+    def scripted(source, target, _options):
+        k = len(asked)
+        asked.append((target.index, source.index))
+        if k >= len(leads):
+            return None
+        T = se3.inverse(truth[target.index]) @ truth[source.index]
+        if k in wrong:
+            T = T @ se3.exp(np.array([0.5, 0, 0, 0, 0, 0]))
+        return match(T, leads[k])
+
+    monkeypatch.setattr(revisits, "search", scripted)
+    # Nothing fits from the drifted pose, so all is left to the search.
+    refuse = replace(options.acceptance, inliers=10**6)
+    found = pushed(replace(options, acceptance=refuse), frames, start).finish()
+    assert len(asked) >= 2
+    assert sum(c.record.accepted for c in found) == accepted
+    for c in found:
+        if c.record.accepted:
+            assert "search" in c.record.reason
+            gap = se3.inverse(se3.inverse(truth[c.record.i]) @ truth[c.record.j]) @ c.T_i_j
+            assert np.linalg.norm(gap[:3, 3]) < 0.05
+
+
+@pytest.mark.parametrize("options", [{"overlap": 0.05}, {"per_view": -1}, {"weak": 6}])
+def test_options_are_checked(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Revisits(**options)
