@@ -14,7 +14,7 @@ from tofuse.kernels import refinement as kernels
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph.refine import RefineOptions, chosen, refine
-from tofuse.posegraph.refinement import Joint, NoRefinement, followed
+from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 
 OPTIONS = RefineOptions()
@@ -98,6 +98,19 @@ def test_errors_of_the_camera_are_found_where_the_views_hold_them():
     good = [KeptView.of(s, 1500) for s in surfaces(truth)]
     none = refine(good, start, OPTIONS, calibrate=[kernels.OFFSET, kernels.FOCAL])
     assert np.abs(none.errors).max() < 0.01
+
+
+def test_points_are_put_where_they_are_without_the_errors():
+    T = np.eye(4)
+    right, wrong = corner(T), corner(T, offset=0.05)
+    found = without_errors(wrong.points.astype(np.float32), {"offset": 0.05})
+    np.testing.assert_allclose(found, right.points, atol=1e-5)
+    wide = right.points * np.array([1 / 1.02, 1 / 1.02, 1])
+    np.testing.assert_allclose(
+        without_errors(wide.astype(np.float32), {"focal": 0.02}), right.points, atol=1e-5
+    )
+    half = (right.points / 1.01).astype(np.float32)
+    np.testing.assert_allclose(without_errors(half, {"scale": 0.01}), right.points, atol=1e-5)
 
 
 def test_overlaps_are_those_of_views_that_look_at_the_same_side(swing):

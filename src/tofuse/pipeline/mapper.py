@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
-from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.refinement import Refinement, without_errors
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registration
 from tofuse.results.types import Diagnostics, FrameRecord, Reconstruction
@@ -281,7 +281,7 @@ class Mapper:
         moved = bool(graph.loop.any()) or refinement.kept
         self._progress.stage("fusing", len(graph.ids) * (2 if moved else 1))
         with self._watch.timing("fusion"):
-            cloud = self._fuse(graph)
+            cloud = self._fuse(graph, refinement.errors)
             before = self._fuse(graph.with_poses(sequential)) if moved else None
         self._progress.stage("checking")
         with self._watch.timing("checking"):
@@ -355,10 +355,14 @@ class Mapper:
         ]
         return build_graph(ids, poses, [*sequence, *again], closed)
 
-    def _fuse(self, graph: PoseGraph) -> Cloud:
+    def _fuse(self, graph: PoseGraph, errors: Mapping[str, float] | None = None) -> Cloud:
+        """Put all views together, without the errors of the camera that were estimated."""
         builder = CloudBuilder(self.config.fusion, self._voxel_m)
         for frame, T in zip(graph.ids, graph.poses, strict=True):
-            builder.add(self._views[int(frame)], T)
+            view = self._views[int(frame)]
+            if errors:
+                view = replace(view, points=without_errors(view.points, errors))
+            builder.add(view, T)
             self._progress.advance()
         return builder.finish()
 

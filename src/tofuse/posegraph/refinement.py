@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Protocol
 
@@ -17,6 +17,7 @@ from tofuse.posegraph.build import Measured
 from tofuse.posegraph.refine import Refined, RefineOptions, refine
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 CameraError = Literal["offset", "scale", "focal"]
 
@@ -193,6 +194,23 @@ def _without_losers(before: Float64, refined: Refined, lost: NDArray[np.bool_]) 
         near = good[np.argmin(np.abs(good - k))]
         after[k] = after[near] @ se3.inverse(before[near]) @ before[k]
     return se3.inverse(after[0]) @ after if lost[0] else after
+
+
+def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
+    """Points (N, 3) of a camera's frame where they are, if the camera errs like this.
+
+    Parameters
+    ----------
+    errors
+        As in `Refinement.errors`.
+    """
+    p = points.astype(np.float64)
+    length = np.linalg.norm(p, axis=1, keepdims=True)
+    moved = p * (
+        1 + errors.get("offset", 0.0) / np.maximum(length, 1e-9) + errors.get("scale", 0.0)
+    )
+    moved[:, :2] += errors.get("focal", 0.0) * p[:, :2]
+    return moved.astype(np.float32)
 
 
 def followed(poses: Float64, at: NDArray[np.intp], after: Float64) -> Float64:
