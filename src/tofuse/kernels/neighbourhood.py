@@ -79,7 +79,9 @@ def largest_angle(
                 np.float64(points[i, j, 1]),
                 np.float64(points[i, j, 2]),
             )
-            largest = 0.0
+            # The smallest cosine, squared with its sign: one root for all neighbours.
+            least = 2.0
+            square = x * x + y * y + z * z
             for v in range(max(0, i - 1), min(height, i + 2)):
                 for u in range(max(0, j - 1), min(width, j + 2)):
                     if (v == i and u == j) or not valid[v, u]:
@@ -87,8 +89,11 @@ def largest_angle(
                     dx = np.float64(points[v, u, 0]) - x
                     dy = np.float64(points[v, u, 1]) - y
                     dz = np.float64(points[v, u, 2]) - z
-                    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-                    sine = math.sqrt(cx * cx + cy * cy + cz * cz)
-                    angle = math.atan2(sine, -(x * dx + y * dy + z * dz))
-                    largest = max(largest, angle)
-            out[i, j] = largest
+                    away2 = dx * dx + dy * dy + dz * dz
+                    if away2 == 0:
+                        continue
+                    toward = -(x * dx + y * dy + z * dz)
+                    least = min(least, toward * abs(toward) / (away2 * square))
+            if least <= 1.0 + 1e-9:
+                least = min(max(least, -1.0), 1.0)
+                out[i, j] = math.acos(math.copysign(math.sqrt(abs(least)), least))
