@@ -186,3 +186,47 @@ def test_nearest_is_the_first_of_the_least_distances() -> None:
     # Equal ones: a place in the middle of a square.
     square = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0]])
     assert kernels.nearest(np.zeros(1), np.zeros(1), square)[0] == 0
+
+
+def test_recall_shows_the_nearest_surfaces_that_face_the_camera_in_each_cell() -> None:
+    rng = np.random.default_rng(5)
+    pitch = np.array([0.25, 0.2])
+    x, y = np.meshgrid(np.arange(-4, 5) * pitch[0], np.arange(-4, 5) * pitch[1])
+    rays = np.stack([x.ravel(), y.ravel()], 1)
+    rays = rays[np.abs(rays).max(1) > 0.3]
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    T = np.eye(4)
+    T[:3, :3] = turn * np.linalg.det(turn)
+    T[:3, 3] = 0.3, -0.2, 0.5
+    points = rng.uniform((-4, -4, -1), (4, 4, 4), (1500, 3))
+    normals = rng.normal(size=(1500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    light = rng.uniform(0.1, 1, (1500, 2))
+    R = T[:3, :3]
+    patches = np.concatenate([(points - T[:3, 3]) @ R, normals @ R, light], 1).astype(np.float32)
+    planes, albedo = np.zeros((len(rays), 3)), np.zeros(len(rays))
+    kernels.recall(patches, T, rays, pitch, planes, albedo)
+
+    filled = 0
+    for m, ray in enumerate(rays):
+        z = np.maximum(points[:, 2], 1e-9)
+        seen = points[:, :2] / z[:, None]
+        inside = (points[:, 2] > 0.05) & (np.abs(seen - ray) < pitch / 2).all(1)
+        line = np.concatenate([seen, np.ones((len(seen), 1))], 1)
+        inside &= (normals * line).sum(1) < -0.05 * np.linalg.norm(line, axis=1)
+        if not inside.any():
+            assert albedo[m] == 0
+            continue
+        inside &= z < z[inside].min() / 0.8
+        weight = light[inside, 1]
+        assert albedo[m] == pytest.approx(np.average(light[inside, 0], weights=weight), rel=1e-4)
+        direction = np.array([*ray, 1.0])
+        mean = weight @ normals[inside]
+        if mean @ direction >= 0:
+            continue
+        filled += 1
+        w = np.average(1 / z[inside], weights=weight)
+        assert planes[m] @ direction == pytest.approx(w, rel=1e-4)
+        across = np.cross(planes[m], mean) / np.linalg.norm(mean)
+        assert np.linalg.norm(across) < 1e-4 * np.linalg.norm(planes[m])
+    assert 20 < filled < len(rays)

@@ -5,19 +5,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
 
 
 class Corrector(Protocol):
     """A correction at work on one recording."""
 
-    def apply(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """Return the corrected view; the same one where there is nothing to correct it by.
 
         Points stay where they are in the image: what is valid stays valid, and nothing else
         becomes so.
+
+        Parameters
+        ----------
+        T_world_camera
+            (4, 4) where the camera is expected; None where that is not known.
         """
         ...
+
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Hear where the view that was corrected last has been found to be.
+
+        Parameters
+        ----------
+        frame
+            What the filters left of it: what stands still in the world.
+        T_world_camera
+            (4, 4), in the same frame as what `apply` is given.
+        """
+        return
 
 
 class Correction(Protocol):

@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.filters._options import above, at_least, whole
-from tofuse.filters.correction import Correction
+from tofuse.filters.correction import Correction, Corrector
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.multipath import Bounces, GainEstimator, Interference, LightImage, Reflections
+from tofuse.sensor.multipath_map import LightMap
 from tofuse.sensor.multipath_surfaces import FALLOFF
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 # Cameras of one frequency measure with periods up to this. A longer ambiguity is a beat of several
 # frequencies, which says nothing about the phase that was measured.
@@ -71,8 +73,11 @@ class Multipath(Correction):
         return MultipathCorrector(self)
 
 
-class MultipathCorrector:
+class MultipathCorrector(Corrector):
     """Corrects the frames of one recording, with a gain that it learns from them unless given.
+
+    Surfaces that the image does not show are those that earlier views have, where it is known how
+    the camera has moved.
 
     Attributes
     ----------
@@ -87,8 +92,10 @@ class MultipathCorrector:
             options.columns, options.iterations, options.lamp, options.bounces
         )
         self._estimator = GainEstimator(self._reflections)
+        self._map = LightMap()
+        self._last: tuple[int, Interference] | None = None
 
-    def apply(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. The amplitude loses its indirect share as well."""
         if not isinstance(frame, RangeFrame):
             return frame
@@ -98,8 +105,24 @@ class MultipathCorrector:
         if self._options.gain is None:
             self._estimator.add(image)
             self.gain = self._estimator.gain
-        found = None if self.gain is None else self._reflections.solve(image, self.gain)
-        return frame if found is None else _corrected(frame, image, found)
+        found = None
+        if self.gain is not None:
+            found = self._reflections.solve(image, self.gain, self._map, T_world_camera)
+        if found is None:
+            return frame
+        self._last = frame.index, found
+        return _corrected(frame, image, found)
+
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+        """See `Corrector.placed`."""
+        if self._last is None or not isinstance(frame, RangeFrame) or frame.index != self._last[0]:
+            return
+        found = self._last[1]
+        middle = [
+            np.minimum(np.arange(n) * found.step + found.step // 2, size - 1)
+            for n, size in zip(found.surfaces.good.shape, frame.valid.shape, strict=True)
+        ]
+        self._map.add(found.surfaces, frame.valid[np.ix_(*middle)], T_world_camera)
 
 
 def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from tofuse.filters.correction import Correction
+from tofuse.filters.correction import Correction, Corrector, Float64
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.noise import NoiseModel
@@ -13,7 +13,7 @@ from tofuse.sensor.noise import NoiseModel
 
 @part("correction", "noise")
 @dataclass(frozen=True)
-class Noise(Correction):
+class Noise(Correction, Corrector):
     """Give each frame the standard deviation of its range, for all that weighs by it.
 
     Depth itself is not changed. Frames that bring their camera's own sigma keep it; clouds are
@@ -34,7 +34,7 @@ class Noise(Correction):
         """See `Correction.start`. Nothing is learnt from frames."""
         return self
 
-    def apply(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`."""
         if self.model is None or not isinstance(frame, RangeFrame):
             return frame

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.filters._options import above, within
-from tofuse.filters.correction import Correction
+from tofuse.filters.correction import Correction, Corrector, Float64
 from tofuse.filters.multipath import light_image
 from tofuse.parts import part
 from tofuse.recordings.background import moving_object
@@ -94,7 +94,7 @@ class LensScattering(Correction):
         return ScatteringCorrector(self)
 
 
-class ScatteringCorrector:
+class ScatteringCorrector(Corrector):
     """Corrects the frames of one recording."""
 
     def __init__(self, options: LensScattering) -> None:
@@ -105,7 +105,7 @@ class ScatteringCorrector:
             else None
         )
 
-    def apply(self, frame: Frame) -> Frame:
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. The amplitude loses its scattered share as well."""
         if self._model is None or not isinstance(frame, RangeFrame):
             return frame

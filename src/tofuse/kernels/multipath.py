@@ -17,6 +17,9 @@ Float64 = NDArray[np.float64]
 
 X, Y, W, LIGHT, AREA, A, B, C, COLUMNS = range(9)
 
+# Of a remembered surface: point, unit normal, albedo in counts, and its weight.
+PATCH = 8
+
 # Of cos(2 pi t) in powers of t^2 and of sin(2 pi t) in odd powers of t, for |t| <= 1/2; good to
 # 1e-6.
 _C0, _C1, _C2, _C3, _C4, _C5 = (
@@ -201,6 +204,95 @@ def nearest(x: Float64, y: Float64, nodes: Float64) -> NDArray[np.int64]:
                 least = away
                 out[i] = j
     return out
+
+
+@kernel
+def recall(
+    patches: Float32,
+    T_camera_world: Float64,
+    rays: Float64,
+    pitch: Float64,
+    planes: Float64,
+    albedo: Float64,
+) -> None:
+    """Find what remembered surfaces show in given cells of the plane z = 1.
+
+    A cell takes the weighted mean over the patches in it that face the camera; only of the nearest
+    ones, as surfaces hide what is behind them.
+
+    Parameters
+    ----------
+    patches
+        (N, PATCH) in the world frame.
+    T_camera_world
+        (4, 4).
+    rays, pitch
+        (M, 2) centres of the cells, which lie on a lattice of this pitch (2,).
+    planes, albedo
+        (M, 3) a, b, c of 1/z = a x + b y + c, and (M,) in counts; set where a patch is.
+    """
+    T = T_camera_world
+    left, top = rays[0, 0], rays[0, 1]
+    right, bottom = left, top
+    for m in range(len(rays)):
+        left, right = min(left, rays[m, 0]), max(right, rays[m, 0])
+        top, bottom = min(top, rays[m, 1]), max(bottom, rays[m, 1])
+    columns = int(np.floor((right - left) / pitch[0] + 0.5)) + 1
+    rows = int(np.floor((bottom - top) / pitch[1] + 0.5)) + 1
+    cell = np.full((rows, columns), -1)
+    for m in range(len(rays)):
+        i = int(np.floor((rays[m, 1] - top) / pitch[1] + 0.5))
+        cell[i, int(np.floor((rays[m, 0] - left) / pitch[0] + 0.5))] = m
+    nearest = np.zeros(len(rays))
+    sums = np.zeros((len(rays), 5))
+    hit = np.empty(len(patches), np.int64)
+    depth = np.empty(len(patches))
+    for n in range(len(patches)):
+        hit[n] = -1
+        px, py, pz = patches[n, 0], patches[n, 1], patches[n, 2]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        if z < 0.05:
+            continue
+        x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / z
+        y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
+        j = int(np.floor((x - left) / pitch[0] + 0.5))
+        i = int(np.floor((y - top) / pitch[1] + 0.5))
+        if i < 0 or i >= rows or j < 0 or j >= columns or cell[i, j] < 0:
+            continue
+        u, v, w = patches[n, 3], patches[n, 4], patches[n, 5]
+        a = T[0, 0] * u + T[0, 1] * v + T[0, 2] * w
+        b = T[1, 0] * u + T[1, 1] * v + T[1, 2] * w
+        c = T[2, 0] * u + T[2, 1] * v + T[2, 2] * w
+        along = a * x + b * y + c
+        if along > -0.05 * np.sqrt(x * x + y * y + 1.0):
+            continue
+        hit[n], depth[n] = cell[i, j], z
+        nearest[hit[n]] = max(nearest[hit[n]], 1.0 / z)
+    for n in range(len(patches)):
+        m = hit[n]
+        if m < 0 or 1.0 / depth[n] < 0.8 * nearest[m]:
+            continue
+        u, v, w = patches[n, 3], patches[n, 4], patches[n, 5]
+        weight = patches[n, 7]
+        sums[m, 0] += weight * (T[0, 0] * u + T[0, 1] * v + T[0, 2] * w)
+        sums[m, 1] += weight * (T[1, 0] * u + T[1, 1] * v + T[1, 2] * w)
+        sums[m, 2] += weight * (T[2, 0] * u + T[2, 1] * v + T[2, 2] * w)
+        sums[m, 3] += weight / depth[n]
+        sums[m, 4] += weight * patches[n, 6]
+        planes[m, 0] += weight
+    for m in range(len(rays)):
+        weight = planes[m, 0]
+        if weight == 0.0:
+            continue
+        a, b, c = sums[m, 0], sums[m, 1], sums[m, 2]
+        # The plane with the mean normal that has the mean inverse depth in the cell's middle.
+        along = a * rays[m, 0] + b * rays[m, 1] + c
+        if along >= 0.0:
+            planes[m, 0] = 0.0
+            continue
+        scale = sums[m, 3] / weight / along
+        planes[m, 0], planes[m, 1], planes[m, 2] = a * scale, b * scale, c * scale
+        albedo[m] = sums[m, 4] / weight
 
 
 @kernel

@@ -15,6 +15,7 @@ from tofuse.filters.base import apply_filters
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
+from tofuse.odometry.motion import Motion
 from tofuse.odometry.prediction import prediction_sigma, with_prediction
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
@@ -92,6 +93,7 @@ class Mapper:
         self._tracker = self.config.odometry.start(self.seed)
         self._loops = self.config.loops.start(self.seed, self._given_loops)
         self._refiner = self.config.refinement.start()
+        self._motion = Motion()
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
 
     def push(
@@ -129,7 +131,7 @@ class Mapper:
             with self._watch.timing("filters"):
                 before = self._history if history is None else history
                 past = tuple(self._corrected(f) for f in before)
-                frame = self._corrected(frame)
+                frame = self._corrected(frame, self._expected())
                 filtered, removals = apply_filters(self.config.filters, frame, past)
                 clean, more = apply_filters(self.config.model_filters, filtered, past)
                 self._history.append(frame)
@@ -141,6 +143,7 @@ class Mapper:
             if repeated and step.status == "tracked":
                 reason = f"the same image as frame {self._records[-1].index}, to the last pixel"
                 step = replace(step, status="predicted", reason=reason)
+            self._follow(filtered, step)
             self._add(frame, clean, step)
             if step.T_world_camera is not None:
                 with self._watch.timing("loops"):
@@ -163,6 +166,7 @@ class Mapper:
         """Say that the next frame begins another recording: the camera may be elsewhere by then."""
         self._interruptions.append(len(self._records))
         self._tracker.interrupt()
+        self._motion.interrupt()
 
     def _is_repeated(self, frame: Frame) -> bool:
         """Whether an image is the one before: a camera that hangs, as noise never repeats."""
@@ -174,14 +178,30 @@ class Mapper:
         self._repeated.append(frame.index)
         return True
 
-    def _corrected(self, frame: Frame) -> Frame:
+    def _corrected(self, frame: Frame, T_expected: Float64 | None = None) -> Frame:
         """Correct a frame, unless it is among those that were corrected last."""
         for before in self._history:
             if before.index == frame.index:
                 return before
         for corrector in self._correctors:
-            frame = corrector.apply(frame)
+            frame = corrector.apply(frame, T_expected)
         return frame
+
+    def _expected(self) -> Float64 | None:
+        """Where the camera is expected; None where that is not known, or the camera was lost."""
+        lost = bool(self._steps) and (self._steps[-1] is None or self._steps[-1].status == "lost")
+        return None if lost else self._motion.expected
+
+    def _follow(self, frame: Frame, step: Step) -> None:
+        """Tell the corrections where a frame is, and note how the camera moves."""
+        T = step.T_world_camera
+        if T is None:
+            self._motion.miss()
+            return
+        self._motion.follow(T)
+        if step.status == "tracked":
+            for corrector in self._correctors:
+                corrector.placed(frame, T)
 
     def _check(self, frame: Frame) -> None:
         self._check_order(frame.index)

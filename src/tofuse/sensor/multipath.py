@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import W, X, Y
 from tofuse.kernels.threads import run_chunks
+from tofuse.sensor.multipath_map import Around, LightMap
 from tofuse.sensor.multipath_surfaces import (
     Surfaces,
     block_nodes,
     fit_planes,
     ray_ranges,
     seen_sources,
-    unseen_sources,
 )
 
 Float32 = NDArray[np.float32]
@@ -79,10 +79,16 @@ class Interference:
         (H, W) float32 z depth in m without it; 0 where invalid.
     factor
         (H, W) float32 by which it has raised the amplitude; 1 where nothing is known.
+    surfaces
+        What was found to reflect, at the nodes of a grid of blocks of `step` pixels.
+    step
+        Side of a block in pixels.
     """
 
     z: Float32
     factor: Float32
+    surfaces: Surfaces
+    step: int
 
 
 @dataclass(frozen=True)
@@ -106,20 +112,31 @@ class Reflections:
     lamp: float = 1.2
     bounces: Bounces = "one"
 
-    def solve(self, image: LightImage, gain: float) -> Interference | None:
+    def solve(
+        self,
+        image: LightImage,
+        gain: float,
+        known: LightMap | None = None,
+        T_world_camera: Float64 | None = None,
+    ) -> Interference | None:
         """Find the indirect light in an image; None where there is nothing to compute it from.
 
         Parameters
         ----------
         gain
             Counts of raw amplitude of a white wall (albedo 1) at 1 m on the axis.
+        known
+            What is known of the surfaces around the image, as seen by earlier ones.
+        T_world_camera
+            (4, 4) pose of the camera in the frame of `known`; without it, nothing is known.
         """
         step = self._step(image)
         nodes = block_nodes(image.z, image.rays, image.light, step)
-        found = self._at_nodes(nodes, image.period_m, gain, at_edges=True)
+        around = None if known is None or T_world_camera is None else (known, T_world_camera)
+        found = self._at_nodes(nodes, image.period_m, gain, at_edges=True, around=around)
         if found is None:
             return None
-        shift, ratio = found
+        shift, ratio, surfaces = found
         z, factor = np.empty_like(image.z), np.empty_like(image.z)
         over = np.abs(1 + ratio)
         run_chunks(
@@ -128,7 +145,7 @@ class Reflections:
             ),
             len(z),
         )
-        return Interference(z, factor)
+        return Interference(z, factor, surfaces, step)
 
     def bright(self, image: LightImage) -> float:
         """Counts at 1 m that a tenth of the surfaces exceeds, faced head-on; 0 if none is seen."""
@@ -157,9 +174,17 @@ class Reflections:
         return max(1, round(image.z.shape[1] / self.columns))
 
     def _at_nodes(
-        self, nodes: Float64, period_m: float, gain: float, *, at_edges: bool
-    ) -> tuple[Float64, Complex] | None:
-        """Bias of the range (Hn, Wn) in m and I / D (Hn, Wn); fits planes to the corrected nodes.
+        self,
+        nodes: Float64,
+        period_m: float,
+        gain: float,
+        *,
+        at_edges: bool,
+        around: tuple[LightMap, Float64] | None = None,
+    ) -> tuple[Float64, Complex, Surfaces] | None:
+        """Bias of the range (Hn, Wn) in m, I / D (Hn, Wn), and the surfaces that they are of.
+
+        Fits planes to the corrected nodes.
 
         `W` of the nodes is the corrected inverse depth of the last but one iteration. `at_edges`
         says whether nodes next to an edge are compared with planes as those are corrected: that
@@ -170,6 +195,9 @@ class Reflections:
         measured = ray_ranges(nodes)
         shift = np.zeros(seen.shape)
         ratio = np.zeros(seen.shape, complex)
+        grid = Around.of(nodes, self.lamp)
+        if around is not None:
+            grid.recall(*around)
         for _ in range(self.iterations):
             _correct(nodes, measured, shift)
             if at_edges:
@@ -188,12 +216,12 @@ class Reflections:
             sources = np.concatenate(
                 [
                     seen_sources(surfaces, radiosity, phase),
-                    unseen_sources(surfaces, self.lamp, gain, k),
+                    grid.sources(surfaces, gain, k),
                 ]
             )
             ratio = _arriving(surfaces, sources, k)
             shift = np.minimum(np.angle(1 + ratio) / (2 * k), measured / 2)
-        return shift, ratio
+        return shift, ratio, surfaces
 
 
 def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:

@@ -23,9 +23,7 @@ _JUMP = 0.03
 # A plane fits where the misfit is below this share of the depth.
 _FLAT = 0.006
 # The own light of slanter surfaces is too weak and too uncertain to divide by.
-_LEAST_COSINE = 0.12
-# The lamp is taken to light no wider than this.
-_WIDEST_LAMP = np.pi / 3
+LEAST_COSINE = 0.12
 
 
 def block_nodes(z: Float32, rays: Float32, light: Float32, step: int) -> Float64:
@@ -113,7 +111,7 @@ class Surfaces:
         good = (nodes[..., W] > 0) & (slope > 0) & (w > 0)
         w, slope = np.where(good, w, 1), np.where(good, slope, 1)
         length = np.sqrt(1 + x * x + y * y)
-        cosine = np.clip(w / (slope * length), _LEAST_COSINE, 1)
+        cosine = np.clip(w / (slope * length), LEAST_COSINE, 1)
         r = length / w
         # length is 1 / cosine of the ray's angle to the axis.
         half = length ** (-FALLOFF / 2)
@@ -179,56 +177,3 @@ def seen_sources(surfaces: Surfaces, radiosity: Float64, phase: Float64) -> Floa
     out[:, 3:6] /= np.linalg.norm(out[:, 3:6], axis=1, keepdims=True)
     out[:, 7:9] /= out[:, 6:7]
     return out.astype(np.float32)
-
-
-def unseen_sources(surfaces: Surfaces, lamp: float, gain: float, wave_number: float) -> Float32:
-    """Sources (S, 9) around the image, which the lamp lights as well.
-
-    The plane of the nearest node at the image's border is taken to go on there, and its albedo.
-
-    Parameters
-    ----------
-    lamp
-        Angle up to which the lamp lights, relative to that of the image's corner.
-    gain
-        Counts of a white wall at 1 m.
-    wave_number
-        Phase in rad per m of path.
-    """
-    none = np.zeros((0, 9), np.float32)
-    inside = surfaces.nodes[..., W] > 0
-    x, y = surfaces.nodes[..., X][inside], surfaces.nodes[..., Y][inside]
-    corner = float(np.arctan(np.sqrt((x * x + y * y).max())))
-    limit = float(np.tan(min(lamp * corner, _WIDEST_LAMP)))
-    pitch = float(x.max() - x.min()) / 12
-    border = np.ones(inside.shape, bool)
-    border[3:-3, 3:-3] = False
-    chosen = np.flatnonzero(border & surfaces.good & (surfaces.albedo > 0))
-    if pitch <= 0 or len(chosen) == 0:
-        return none
-    grid = np.arange(-limit, limit + pitch, pitch)
-    gx, gy = (g.ravel() for g in np.meshgrid(grid, grid))
-    outside = (gx < x.min() - pitch / 2) | (gx > x.max() + pitch / 2)
-    outside |= (gy < y.min() - pitch / 2) | (gy > y.max() + pitch / 2)
-    outside &= gx**2 + gy**2 < limit**2
-    gx, gy = gx[outside], gy[outside]
-    if len(gx) == 0:
-        return none
-    nodes = surfaces.nodes.reshape(-1, COLUMNS)[chosen]
-    near = kernels.nearest(gx, gy, np.ascontiguousarray(nodes[:, X : Y + 1]))
-    node = nodes[near]
-    w = node[:, A] * gx + node[:, B] * gy + node[:, C]
-    # A plane that runs away, or into the camera, says nothing about what is there.
-    fine = (w > 0.3 * node[:, W]) & (w < 3 * node[:, W])
-    w, gx, gy, chosen = w[fine], gx[fine], gy[fine], chosen[near[fine]]
-    normals = surfaces.normals.reshape(-1, 3)[chosen]
-    points = np.stack([gx, gy, np.ones_like(gx)], -1) / w[:, None]
-    r = np.linalg.norm(points, axis=1)
-    cosine = np.clip(-(normals * points).sum(1) / r, _LEAST_COSINE, 1)
-    length = r * w
-    lit = length ** (-FALLOFF / 2) * cosine / r**2
-    radiosity = surfaces.albedo.reshape(-1)[chosen] / gain * lit
-    phase = wave_number * r
-    area = pitch**2 / (w * w * length * cosine)
-    light = np.stack([area, radiosity * np.cos(phase), radiosity * np.sin(phase)], -1)
-    return np.concatenate([points, normals, light], 1).astype(np.float32)
