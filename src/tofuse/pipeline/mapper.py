@@ -13,12 +13,14 @@ from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, consistency_of_frames
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
+from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Motion
 from tofuse.odometry.prediction import prediction_sigma, with_prediction
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
+from tofuse.pipeline.live import LiveLoops
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
@@ -92,6 +94,8 @@ class Mapper:
         self._correctors = [correction.start() for correction in self.config.corrections]
         self._tracker = self.config.odometry.start(self.seed)
         self._loops = self.config.loops.start(self.seed, self._given_loops)
+        self._live = LiveLoops(self._loops)
+        self._T_map_tracked = np.eye(4)  # what loops that closed on the way have moved
         self._refiner = self.config.refinement.start()
         self._motion = Motion()
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
@@ -117,7 +121,8 @@ class Mapper:
 
         Returns
         -------
-        T_world_camera (4, 4) as known so far (loops move it later), or None where it is lost.
+        T_world_camera (4, 4) as known so far, or None where it is lost. A loop that closes on the
+        way counts some frames later; the end moves all poses once more.
 
         Raises
         ------
@@ -152,8 +157,17 @@ class Mapper:
                     self._refiner.push(step.surface, step.T_world_camera)
                     # Kept there as far as it is needed, and large.
                     self._steps[-1] = replace(step, surface=None)
+                with self._watch.timing("loops"):
+                    if self._live.step():
+                        self._follow_loops()
         self._progress.advance(self._records[-1])
-        return step.T_world_camera
+        return None if step.T_world_camera is None else self._T_map_tracked @ step.T_world_camera
+
+    def _follow_loops(self) -> None:
+        """Move the newest pose to where the loops so far put it."""
+        graph = self._graph(self._live.closed)
+        moved = self.config.optimiser.optimise(graph).graph
+        self._T_map_tracked = moved.poses[-1] @ se3.inverse(graph.poses[-1])
 
     def skip(self, index: int, timestamp: float, reason: str) -> None:
         """Say that a frame could not be read; InputError if its index does not grow."""
@@ -278,6 +292,7 @@ class Mapper:
                 where="recording",
                 remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
             )
+        self._live.finish()
         with threads(self.threads):
             return self._finish()
 

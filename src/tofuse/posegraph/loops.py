@@ -83,6 +83,13 @@ class Loops(Protocol):
         """Add the next frame that has a pose, and its surface if the tracker made one."""
         ...
 
+    def look(self) -> Callable[[], list[ClosedLoop]] | None:
+        """Return what finds the loops that the newest frame closes; None if it closes none.
+
+        It may run on another thread while frames are added. What it finds, `finish` returns too.
+        """
+        ...
+
     def finish(self) -> list[ClosedLoop]:
         """Return every candidate and given loop with its decision, in the order of j, then i."""
         ...

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,6 +97,12 @@ class _NearbyLoops(Loops):
         frames = list(self._poses)
         for k in self._options.candidates(np.stack(list(self._poses.values()))):
             self._closed[frames[k], view.index] = self._confirm(frames[k], view.index)
+
+    def look(self) -> Callable[[], list[ClosedLoop]] | None:
+        """See `Loops.look`. They were found when the frame was added."""
+        newest = next(reversed(self._poses))
+        found = [loop for (_, j), loop in self._closed.items() if j == newest]
+        return (lambda: found) if found else None
 
     def finish(self) -> list[ClosedLoop]:
         """See `Loops.finish`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,12 +112,16 @@ class Revisits(LoopDetector):
         """See `LoopDetector.start`. There is nothing random in it."""
         return _RevisitLoops(self, given)
 
-    def candidates(self, surfaces: Sequence[SurfaceMap], poses: Float64) -> list[tuple[int, int]]:
-        """Positions (i, j), i < j, of the views that may form a loop under the poses (N, 4, 4)."""
-        views = [KeptView.of(s, _POINTS) for s in surfaces]
-        pairs, shares = overlaps(views, poses, self.apart)
+    def candidates(
+        self, views: Sequence[KeptView], poses: Float64, *, first: int = 0
+    ) -> list[tuple[int, int]]:
+        """Positions (i, j), i < j, first <= j, of the views that may form a loop.
+
+        `poses` is (N, 4, 4) T_world_camera.
+        """
+        pairs, shares = overlaps(views, poses, self.apart, first=first)
         found: list[tuple[int, int]] = []
-        for j in range(len(views)):
+        for j in range(first, len(views)):
             mine = pairs[:, 1] == j
             partners, share = pairs[mine, 0], shares[mine]
             # The unbroken run of partners up to this view is what it never left.
@@ -138,6 +142,8 @@ class _RevisitLoops(Loops):
         self._given_loops = given
         self._asked = {frame for loop in given for frame in (loop.i, loop.j)}
         self._given_surfaces: dict[int, SurfaceMap] = {}
+        self._kept: dict[int, KeptView] = {}
+        self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
 
     def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
         """See `Loops.push`."""
@@ -149,13 +155,30 @@ class _RevisitLoops(Loops):
         if view.index in self._asked:
             self._given_surfaces[view.index] = thin
 
+    def look(self) -> Callable[[], list[ClosedLoop]] | None:
+        """See `Loops.look`."""
+        surfaces = self._store.surfaces
+        if not surfaces or surfaces[-1].index != next(reversed(self._poses)):
+            return None
+        newest = len(surfaces) - 1
+        pairs = self._options.candidates(self._views(), self._poses_of(surfaces), first=newest)
+        ends = [(surfaces[i], surfaces[j]) for i, j in pairs]
+        return (lambda: [self._confirm(*pair) for pair in ends]) if ends else None
+
+    def _views(self) -> list[KeptView]:
+        surfaces = self._store.surfaces
+        self._kept = {s.index: self._kept.get(s.index) or KeptView.of(s, _POINTS) for s in surfaces}
+        return list(self._kept.values())
+
+    def _poses_of(self, surfaces: Sequence[SurfaceMap]) -> Float64:
+        return np.array([self._poses[s.index] for s in surfaces]).reshape(-1, 4, 4)
+
     def finish(self) -> list[ClosedLoop]:
         """See `Loops.finish`. What a person gives takes the place of what was found."""
         surfaces = self._store.surfaces
-        poses = np.array([self._poses[s.index] for s in surfaces]).reshape(-1, 4, 4)
         closed = {
             (surfaces[i].index, surfaces[j].index): self._confirm(surfaces[i], surfaces[j])
-            for i, j in self._options.candidates(surfaces, poses)
+            for i, j in self._options.candidates(self._views(), self._poses_of(surfaces))
         }
         by_index = {s.index: s for s in surfaces}
         refused = sorted(
@@ -171,7 +194,13 @@ class _RevisitLoops(Loops):
         return in_order(closed)
 
     def _confirm(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
-        """Align the later view with the earlier one, and back."""
+        """Align the later view with the earlier one, and back; once for each pair."""
+        pair = target.index, source.index
+        if pair not in self._confirmed:
+            self._confirmed[pair] = self._aligned(target, source)
+        return self._confirmed[pair]
+
+    def _aligned(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
         options = self._options
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         there = self._align(target, source, guess, options.near)

@@ -105,7 +105,9 @@ class ViewStore:
         )
 
 
-def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[Integers, Float64]:
+def overlaps(
+    views: Sequence[KeptView], poses: Float64, least: float, *, first: int = 0
+) -> tuple[Integers, Float64]:
     """Pairs of views that see at least a share `least` of each other, and that share.
 
     The share is the smaller of both ways. It counts points that lie near a surface of the other
@@ -115,6 +117,8 @@ def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[I
     ----------
     poses
         (N, 4, 4) T_world_camera.
+    first
+        Pairs with j before this view are left out.
 
     Returns
     -------
@@ -142,7 +146,7 @@ def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[I
 
     def rows(a: int, b: int) -> list[tuple[int, int, float]]:
         found = []
-        for j in range(a, b):
+        for j in range(first + a, first + b):
             for i in np.flatnonzero(axes[:j] @ axes[j] > 0):
                 share = seen(int(i), j)
                 if share >= least:
@@ -151,6 +155,6 @@ def overlaps(views: Sequence[KeptView], poses: Float64, least: float) -> tuple[I
                     found.append((int(i), j, share))
         return found
 
-    found = [pair for chunk in run_chunks(rows, len(views), 32) for pair in chunk]
+    found = [pair for chunk in run_chunks(rows, len(views) - first, 32) for pair in chunk]
     pairs = np.array([pair[:2] for pair in found], np.intp).reshape(-1, 2)
     return pairs, np.array([pair[2] for pair in found])
