@@ -110,10 +110,15 @@ class Pinhole:
         """Invert `_distort` by Newton's method with a numeric Jacobian; NaN where it fails."""
         if type(self) is Pinhole:
             return xy
-        guess = xy.copy()
+        shape = xy.shape
+        xy = xy.reshape(-1, 2)
+        out = xy.copy()
+        # Only those that still move; where the lens folds, some never settle.
+        active = np.arange(len(xy))
         step = 1e-6
         for _ in range(30):
-            error = self._distort(guess) - xy
+            guess = out[active]
+            error = self._distort(guess) - xy[active]
             columns = [
                 (self._distort(guess + d) - self._distort(guess - d)) / (2 * step)
                 for d in np.eye(2) * step
@@ -131,12 +136,13 @@ class Pinhole:
                     )
                     / determinant[..., None]
                 )
-            guess = guess - np.clip(move, -0.5, 0.5)
-            if np.nanmax(np.abs(move), initial=0) < 1e-12:
+            out[active] = guess - np.clip(move, -0.5, 0.5)
+            active = active[np.abs(move).max(-1) >= 1e-12]
+            if len(active) == 0:
                 break
-        bad = ~(np.abs(self._distort(guess) - xy).max(-1) < 1e-7)
-        guess[bad] = np.nan
-        return guess
+        bad = ~(np.abs(self._distort(out) - xy).max(-1) < 1e-7)
+        out[bad] = np.nan
+        return out.reshape(shape)
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ from tofuse.geometry.cameras import Camera, RayTable, range_from_z, z_from_range
 from tofuse.recordings.camera_file import (
     SCHEMA,
     CameraFile,
-    ColorCamera,
     camera_fields,
     load_camera,
     read_camera_file,
 )
+from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import (
     SATURATED_AMPLITUDE,
     CloudFrame,
@@ -272,23 +272,6 @@ def read_correction(path: Path) -> DepthCorrection:
     raise InputError(
         "unpacks to more than a correction can be", where=path, remedy="write it again"
     )
-
-
-def sampled_color(
-    frame: RangeFrame, image: NDArray[np.uint8], color: ColorCamera
-) -> NDArray[np.uint8]:
-    """Colour (H, W, 3) of each valid depth pixel, from where its point lands in the image."""
-    T = color.T_color_depth
-    uv = color.camera.project(frame.points @ T[:3, :3].T + T[:3, 3])
-    with np.errstate(invalid="ignore"):
-        pixel = np.nan_to_num(np.rint(uv), nan=-1.0, posinf=-1.0, neginf=-1.0)
-    u, v = np.clip(pixel, -1, 1 << 20).astype(np.intp).T
-    inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
-    seen = np.zeros((len(u), 3), np.uint8)
-    seen[inside] = image[v[inside], u[inside]]
-    out = np.zeros((*frame.depth.shape, 3), np.uint8)
-    out[frame.valid] = seen
-    return out
 
 
 def corrected_depth(

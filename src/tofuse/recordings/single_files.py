@@ -1,0 +1,33 @@
+"""Recordings that are one file: given themselves, or by the folder that holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder
+
+
+def file_of(path: Path, *suffixes: str) -> Path | None:
+    """Return the file at `path`, or the only one with these suffixes in that folder; else None."""
+    if is_file(path):
+        return path if path.suffix.lower() in suffixes else None
+    if not is_folder(path):
+        return None
+    try:
+        files = files_with(path, *suffixes)
+    except InputError:
+        return None
+    return files[0] if len(files) == 1 else None
+
+
+def needed_file(path: Path, *suffixes: str) -> Path:
+    """Return what `file_of` returns, or any file that was given by name; refuse the rest."""
+    found = file_of(path, *suffixes)
+    if found is not None:
+        return found
+    if is_file(path):
+        return path
+    raise InputError(
+        f"doesn't hold one {' or '.join(suffixes)} file", where=path, remedy="give the file"
+    )
