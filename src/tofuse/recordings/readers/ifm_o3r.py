@@ -1,0 +1,200 @@
+"""Reader of the PCIC buffers of ifm's O3R heads."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.pcic import BEGIN, Chunk, chunk_image, pcic_frames
+from tofuse.files.reading import read_bytes, read_head
+from tofuse.geometry.cameras import RayTable
+from tofuse.parts import part
+from tofuse.recordings.camera_file import MAX_SLOPE
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.sources import FileSource
+
+Float64 = NDArray[np.float64]
+
+DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
+BOUGUET, FISHEYE = 0, 2
+INVALID = 1  # bit of the confidence
+
+_MAX_BYTES = 2 << 30
+# version, units of distance and amplitude, 3 factors, 6 of the mounting, then model and numbers.
+_INFO = struct.Struct("<I2f3f6fI32f")
+
+
+@part("reader", "ifm-o3r", label="validated")
+@dataclass(frozen=True)
+class IfmO3r:
+    """A .data or .pcic file of frames as the O3R sends them: range, noise, amplitude, lens."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        file = file_of(path, ".data", ".pcic", ".bin")
+        try:
+            if file is not None and BEGIN in read_head(file, 64):
+                return Sniff(1.0, "a PCIC stream")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> IfmO3rSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "ifm-o3r")
+        return IfmO3rSource(needed_file(path, ".data", ".pcic", ".bin"))
+
+
+class IfmO3rSource(FileSource):
+    """Frames of radial range with the camera's own noise and lens."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = read_bytes(path, limit=_MAX_BYTES)
+        self.frames = pcic_frames(self.data, path)
+        super().__init__(_times(self.frames))
+        self.metadata |= {
+            "sensor": "ifm O3R (ToF)",
+            "depth_kind": "range",
+            "amplitude_kind": "raw",
+        }
+        if (np.diff(self.timestamps) < 0).any():
+            self.warnings.append("time goes back; frames stay in the order of the file")
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        chunks = self.frames[index]
+        where = f"{self.path}: frame {index}"
+        if isinstance(chunks, InputError):
+            raise chunks
+        for kind, name in ((DISTANCE, "radial distance"), (INFO, "lens")):
+            if kind not in chunks:
+                raise InputError(
+                    f"has no {name} (chunk {kind})",
+                    where=where,
+                    remedy="record with the chunks 100 (distance) and 420 (information)",
+                )
+        info = _info(self.data, chunks[INFO], where)
+        counts = chunk_image(self.data, chunks[DISTANCE], where)
+        distance = counts.astype(np.float32)
+        if counts.dtype.kind == "u":
+            distance *= np.float32(info.distance_unit_m)
+        if CONFIDENCE in chunks:
+            flags = self._same_size(chunks[CONFIDENCE], counts.shape, where)
+            if flags.dtype.kind not in "ui":
+                raise InputError("has flags that are no whole numbers", where=where)
+            distance = np.where(flags & INVALID, np.float32(0), distance)
+        noise = amplitude = None
+        if NOISE in chunks:
+            own = self._same_size(chunks[NOISE], counts.shape, where)
+            noise = own.astype(np.float32)
+            if own.dtype.kind == "u":
+                noise *= np.float32(info.distance_unit_m)
+        if AMPLITUDE in chunks:
+            amplitude = self._same_size(chunks[AMPLITUDE], counts.shape, where).astype(np.float32)
+            amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            _camera(info.model, info.numbers, counts.shape[1], counts.shape[0], where),
+            distance,
+            "range",
+            amplitude,
+            sigma_image=None if noise is None else np.nan_to_num(noise, posinf=0, neginf=0),
+        )
+
+    def _same_size(self, chunk: Chunk, shape: tuple[int, ...], where: str) -> NDArray[Any]:
+        image: NDArray[Any] = chunk_image(self.data, chunk, where)
+        if image.shape != shape:
+            raise InputError(
+                f"chunk {chunk.kind} is {image.shape[1]} x {image.shape[0]}, distance "
+                f"{shape[1]} x {shape[0]}",
+                where=where,
+            )
+        return image
+
+
+@dataclass(frozen=True)
+class _Info:
+    distance_unit_m: float
+    model: int
+    numbers: tuple[float, ...]
+
+
+def _info(data: bytes, chunk: Chunk, where: str) -> _Info:
+    """Read what the head says of a frame: the unit of its distances, and its lens."""
+    if chunk.end - chunk.start < _INFO.size:
+        raise InputError(f"chunk {INFO} is cut off", where=where, remedy="copy the file again")
+    _, unit, *rest = _INFO.unpack_from(data, chunk.start)
+    model, numbers = rest[10], tuple(rest[11:21])
+    if not 1e-6 < unit < 1 or not np.isfinite(numbers).all():
+        raise InputError(f"chunk {INFO} makes no sense", where=where, remedy="copy it again")
+    return _Info(float(unit), int(model), numbers)
+
+
+@lru_cache(maxsize=16)
+def _camera(
+    model: int, numbers: tuple[float, ...], width: int, height: int, where: str
+) -> RayTable:
+    """Return the rays (H, W) of a lens, by the maker's model for image to space.
+
+    The polynomials work from pixel to ray, unlike OpenCV's, and count pixels from their corner.
+    """
+    if model not in (BOUGUET, FISHEYE):
+        raise InputError(f"has the lens model {model}, not 0 or 2", where=where)
+    fx, fy, mx, my, skew, *k = numbers
+    if not (1 < fx < 1e5 and 1 < fy < 1e5):
+        raise InputError(f"has focal lengths of {fx:g} and {fy:g} pixels", where=where)
+    v, u = np.mgrid[:height, :width] + 0.5
+    y = (v - my) / fy
+    x = (u - mx) / fx - skew * y
+    with np.errstate(all="ignore"):
+        rays = _bouguet(x, y, k) if model == BOUGUET else _fisheye(x, y, k)
+        rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
+    return RayTable(rays.astype(np.float32))
+
+
+def _bouguet(x: Float64, y: Float64, k: list[float]) -> Float64:
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    return np.stack(
+        [
+            radial * x + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
+            radial * y + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
+        ],
+        -1,
+    )
+
+
+def _fisheye(x: Float64, y: Float64, k: list[float]) -> Float64:
+    """Angle by a polynomial in the distance from the centre, which k[4] limits."""
+    radius = np.hypot(x, y)
+    s = np.minimum(radius, k[4]) ** 2
+    theta = radius * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
+    scale = np.where(radius > 0, np.tan(theta) / np.where(radius > 0, radius, 1), 1.0)
+    scale[~((theta >= 0) & (theta < np.pi / 2))] = np.nan
+    return np.stack([x * scale, y * scale], -1)
+
+
+def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:
+    """Seconds of each frame, interpolated where it is damaged."""
+    times = np.full(len(frames), np.nan)
+    for k, chunks in enumerate(frames):
+        if not isinstance(chunks, InputError) and chunks:
+            times[k] = next(iter(chunks.values())).time
+    known, index = np.isfinite(times), np.arange(len(times))
+    if not known.any():
+        return index.astype(float)
+    times[~known] = np.interp(index[~known], index[known], times[known])
+    return times

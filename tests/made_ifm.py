@@ -1,0 +1,58 @@
+"""PCIC streams of an O3R head, written by the maker's layout."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+
+WIDTH, HEIGHT = 24, 18
+UNIT = 0.00015
+RNG = np.random.default_rng(80)
+COUNTS = RNG.integers(2000, 20000, (3, HEIGHT, WIDTH)).astype(np.uint16)
+NOISE = RNG.integers(10, 90, (3, HEIGHT, WIDTH)).astype(np.uint16)
+AMPLITUDE = RNG.integers(1, 60000, (3, HEIGHT, WIDTH)).astype(np.uint16)
+FLAGS = RNG.integers(0, 128, (3, HEIGHT, WIDTH)).astype(np.uint8)
+# fx, fy, mx, my, skew, then k1 to k5 (Bouguet), or k1 to k4 and the largest angle (fisheye).
+BOUGUET = (20.0, 21.0, 12.25, 8.5, 0.01, 0.31, -0.14, 0.002, -0.003, 0.187)
+FISHEYE = (10.5, 10.4, 12.0, 9.0, 0.0, 0.05, -0.01, 0.002, -0.0003, 1.4)
+
+
+def chunk(kind: int, content: bytes, size: tuple[int, int], format_: int, k: int) -> bytes:
+    about = json.dumps({"Version": "0.0.1"}).encode() + b"\0"
+    head = 48 + len(about)
+    words = (
+        kind,
+        head + len(content),
+        head,
+        3,
+        *size,
+        format_,
+        100 * k,
+        k,
+        0,
+        1000,
+        50_000_000 * k,
+    )
+    return struct.pack("<12I", *words) + about + content
+
+
+def frame(k: int, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes:
+    size = (WIDTH, HEIGHT)
+    info = struct.pack("<I2f3f6fI32f", 1, UNIT, 1e-8, 1, 1, 1, *([0.0] * 6), model,
+                       *numbers, *([0.0] * 22))  # fmt: skip
+    info += bytes(4 + 128)  # the lens the other way round, which isn't used
+    data = chunk(100, COUNTS[k].astype("<u2").tobytes(), size, 2, k)
+    data += chunk(105, NOISE[k].astype("<u2").tobytes(), size, 2, k)
+    data += chunk(101, AMPLITUDE[k].astype("<u2").tobytes(), size, 2, k)
+    data += chunk(300, FLAGS[k].tobytes(), size, 0, k)
+    data += chunk(420, info, size, 0, k)
+    length = len(data) + 14
+    return b"0000L%09d\r\n0000star" % length + data + b"stop\r\n"
+
+
+def make_o3r(path: Path, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"".join(frame(k, model, numbers) for k in range(3)))
