@@ -265,7 +265,7 @@ def configuration(method: str, recorded: Recorded) -> Config:
         filters = [{"part": "distance", "maximum": depth}, *filters]
     changes = {
         "filters": filters,
-        "loops": {"per_frame": 0},
+        "loops": {"per_frame" if method == "thesis" else "per_view": 0},
         # The fused cloud is not looked at; coarse, it costs little.
         "fusion": {"voxel_m": 0.1},
     }
