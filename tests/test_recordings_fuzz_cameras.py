@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import made_arrays
 import made_ifm
 import made_kinect
 import made_phones
@@ -23,6 +24,8 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "record3d": (made_phones.make_record3d, None, "record3d"),
     "mkv": (made_kinect.make_small_mkv, "a.mkv", "azure-kinect"),
     "o3r": (made_ifm.make_o3r, "a.data", "ifm-o3r"),
+    "npz": (made_arrays.make_npz, "a.npz", "npz"),
+    "zense": (made_arrays.make_zense, None, "zense"),
     "r3d": (made_phones.make_r3d, "scan.r3d", "record3d"),
 }
 ROUNDS = {"mkv": 30}

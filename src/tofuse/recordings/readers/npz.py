@@ -1,0 +1,264 @@
+"""Reader of NumPy archives: a few named arrays, for whatever has no reader of its own."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import input_error, read_head
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable
+from tofuse.parts import part
+from tofuse.recordings.camera_file import (
+    AMPLITUDE_KINDS,
+    MAX_SLOPE,
+    checked_lens,
+    load_camera,
+)
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.sources import FARTHEST_M, FileSource, check_timestamps, read_matrix_pose
+
+Float64 = NDArray[np.float64]
+
+MAX_BYTES = 1 << 30
+_IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
+_TABLES = ("timestamps", "reference", "odometry", "K", "rays", "distortion")
+_VALUES = (
+    *("depth_unit_m", "depth_kind", "model", "frame_rate_hz", "ambiguity_m", "confidence_max"),
+    *("amplitude_kind", "sensor"),
+)
+_KNOWN = ("depth", *_IMAGES, *_TABLES, *_VALUES)
+
+
+@part("reader", "npz", label="validated")
+@dataclass(frozen=True)
+class Npz:
+    """A .npz file with depth (N, H, W), a camera (K or rays), and what else there is."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        file = file_of(path, ".npz")
+        try:
+            if file is not None and read_head(file, 2) == b"PK":
+                with zipfile.ZipFile(file) as archive:
+                    if "depth.npy" in archive.namelist():
+                        return Sniff(1.0, "a NumPy archive with depth")
+        except (InputError, OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> NpzSource:
+        """See `Reader.open`."""
+        return NpzSource(needed_file(path, ".npz"), options)
+
+
+class NpzSource(FileSource):
+    """Frames of arrays that are held in memory."""
+
+    def __init__(self, path: Path, options: ReaderOptions) -> None:
+        self.path = path
+        arrays = _load(path)
+        if "depth" not in arrays:
+            raise self._error("depth", "is missing", "save depth as (N, H, W)")
+        depth = arrays["depth"]
+        if depth.ndim == 2:
+            depth = depth[None]
+        if depth.ndim != 3 or depth.dtype.kind not in "fui" or min(depth.shape[1:]) < 2:
+            raise self._error(
+                "depth", f"has shape {depth.shape} and type {depth.dtype}", "save (N, H, W) numbers"
+            )
+        self.depth = depth
+        self.kind = self._text(arrays, "depth_kind", "z", ("z", "range"))
+        self.amplitude_kind = self._text(arrays, "amplitude_kind", "raw", AMPLITUDE_KINDS)
+        self.camera, self.unit = self._read_camera(arrays, options)
+        self.images = {
+            name: self._images(arrays[name], name, ndim)
+            for name, ndim in _IMAGES.items()
+            if name in arrays
+        }
+        super().__init__(self._times(arrays))
+        check_timestamps(self.timestamps, Path(f"{path}: timestamps"), self.warnings)
+        self.reference = self._poses(arrays, "reference")
+        self.odometry = self._poses(arrays, "odometry")
+        self.metadata |= {"depth_kind": self.kind}
+        for name in ("frame_rate_hz", "ambiguity_m", "confidence_max"):
+            if name in arrays:
+                self.metadata[name] = self._number(arrays, name)
+        if "sensor" in arrays:
+            self.metadata["sensor"] = str(arrays["sensor"])[:200]
+        unknown = [name for name in arrays if name not in _KNOWN]
+        if unknown:
+            self.warnings.append(f"{path}: means nothing here: {', '.join(unknown)[:200]}")
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        with np.errstate(all="ignore"):
+            depth = self.depth[index].astype(np.float32) * np.float32(self.unit)
+            if self.depth.dtype.kind != "f":
+                depth[self.depth[index] == 65535] = 0
+            depth = np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+            images = {name: stack[index] for name, stack in self.images.items()}
+            amplitude, sigma = (
+                np.nan_to_num(images[n].astype(np.float32), posinf=0, neginf=0)
+                if n in images
+                else None
+                for n in ("amplitude", "sigma")
+            )
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth,
+            self.kind,  # type: ignore[arg-type]
+            amplitude,
+            images.get("confidence"),
+            images.get("color"),
+            sigma,
+            amplitude_kind=self.amplitude_kind,  # type: ignore[arg-type]
+            ambiguity_m=self.metadata.get("ambiguity_m"),
+        )
+
+    def _read_camera(
+        self, arrays: dict[str, NDArray[Any]], options: ReaderOptions
+    ) -> tuple[Camera, float]:
+        unit = 1.0
+        if self.depth.dtype.kind != "f" or "depth_unit_m" in arrays:
+            if "depth_unit_m" not in arrays and options.camera is None:
+                raise self._error("depth_unit_m", "is missing", "save the metres of one count")
+            unit = self._number(arrays, "depth_unit_m") if "depth_unit_m" in arrays else 1.0
+        height, width = self.depth.shape[1:]
+        camera: Camera
+        if options.camera is not None:
+            about, camera = load_camera(options.camera)
+            unit, self.kind = about.depth_unit_m, about.depth_kind
+        elif "rays" in arrays:
+            rays = self._floats(arrays, "rays")
+            if rays.shape != (height, width, 2):
+                raise self._error("rays", f"has shape {rays.shape}", "save (H, W, 2), as depth")
+            rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
+            try:
+                camera = RayTable(rays.astype(np.float32))
+            except InputError as error:
+                raise self._error("rays", error.problem, "save x/z and y/z") from error
+        else:
+            camera = self._lens(arrays, width, height)
+        if (camera.width, camera.height) != (width, height):
+            raise self._error(
+                "depth",
+                f"is {width} x {height}, the camera {camera.width} x {camera.height}",
+                "give the camera of these images",
+            )
+        if not 1e-9 <= unit <= 1:
+            raise self._error("depth_unit_m", f"is {unit}", "save the metres of one count")
+        return camera, unit
+
+    def _lens(self, arrays: dict[str, NDArray[Any]], width: int, height: int) -> Camera:
+        if "K" not in arrays:
+            raise self._error("K", "is missing, and so is rays", "save one, or give --camera")
+        K = self._floats(arrays, "K")
+        if K.shape != (3, 3):
+            raise self._error("K", f"has shape {K.shape}", "save (3, 3)")
+        values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        distortion = np.zeros(0)
+        if "distortion" in arrays:
+            distortion = self._floats(arrays, "distortion").ravel()
+        default = (
+            "pinhole" if not len(distortion) else "rational" if len(distortion) > 5 else "brown"
+        )
+        model = self._text(arrays, "model", default, tuple(MODELS))
+        order = DISTORTION_ORDER[model]
+        if len(distortion) > len(order):
+            raise self._error(
+                "distortion", f"has {len(distortion)} numbers", f"{model} takes {len(order)}"
+            )
+        values |= dict(zip(order, distortion, strict=False))
+        numbers = {name: float(value) for name, value in values.items()}
+        return checked_lens(MODELS[model], (width, height), numbers, f"{self.path}: K")
+
+    def _images(self, stack: NDArray[Any], name: str, ndim: int) -> NDArray[Any]:
+        stack = stack[None] if stack.ndim == ndim - 1 else stack
+        expected = (*self.depth.shape, 3)[:ndim]
+        whole = name in ("confidence", "color")
+        if stack.shape != expected or stack.dtype.kind not in ("u" if whole else "fui"):
+            raise self._error(
+                name, f"has shape {stack.shape} and type {stack.dtype}", f"save {expected}"
+            )
+        if whole and stack.dtype != np.uint8:
+            raise self._error(name, f"has type {stack.dtype}", "save uint8")
+        return stack
+
+    def _times(self, arrays: dict[str, NDArray[Any]]) -> Float64:
+        count = len(self.depth)
+        if "timestamps" not in arrays:
+            rate = self._number(arrays, "frame_rate_hz") if "frame_rate_hz" in arrays else 1.0
+            return np.arange(count) / rate
+        times = self._floats(arrays, "timestamps").ravel()
+        if len(times) != count:
+            raise self._error("timestamps", f"has {len(times)} values", f"save {count}, as depth")
+        return times
+
+    def _poses(self, arrays: dict[str, NDArray[Any]], name: str) -> Float64 | None:
+        if name not in arrays:
+            return None
+        poses = self._floats(arrays, name)
+        if poses.shape != (len(self.depth), 4, 4):
+            raise self._error(name, f"has shape {poses.shape}", "save (N, 4, 4) T_world_camera")
+        where = f"{self.path}: {name}"
+        return np.stack([read_matrix_pose(T, f"{where}[{k}]") for k, T in enumerate(poses)])
+
+    def _floats(self, arrays: dict[str, NDArray[Any]], name: str) -> Float64:
+        if arrays[name].dtype.kind not in "fui":
+            raise self._error(name, f"has type {arrays[name].dtype}", "save numbers")
+        with np.errstate(all="ignore"):
+            return arrays[name].astype(float)
+
+    def _number(self, arrays: dict[str, NDArray[Any]], name: str) -> float:
+        values = self._floats(arrays, name).ravel()
+        if len(values) != 1 or not np.isfinite(values[0]) or values[0] <= 0:
+            raise self._error(name, "isn't a positive number", "save one number")
+        return float(values[0])
+
+    def _text(
+        self, arrays: dict[str, NDArray[Any]], name: str, default: str, choices: tuple[str, ...]
+    ) -> str:
+        value = str(arrays[name]) if name in arrays else default
+        if value not in choices:
+            raise self._error(name, f"is {value!r:.60}", f"save one of {', '.join(choices)}")
+        return value
+
+    def _error(self, name: str, problem: str, remedy: str) -> InputError:
+        return InputError(problem, where=f"{self.path}: {name}", remedy=remedy)
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    """Read all arrays, unless they unpack to more than memory should hold."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+            if size > MAX_BYTES:
+                raise InputError(
+                    f"unpacks to {size >> 20} MiB, more than {MAX_BYTES >> 20} MiB",
+                    where=path,
+                    remedy="write it as a native folder",
+                )
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: np.asarray(arrays[name]) for name in arrays.files}
+    except InputError:
+        raise
+    except OSError as error:
+        raise input_error(error, path) from error
+    except Exception as error:  # NumPy parses the headers as Python: anything may come out
+        raise InputError(
+            f"is a damaged NumPy archive ({type(error).__name__})",
+            where=path,
+            remedy="save it again by numpy.savez",
+        ) from error

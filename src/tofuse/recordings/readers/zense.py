@@ -1,0 +1,108 @@
+"""Reader of Pico Zense folders: depth images beside a .toml with the lens."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_folder, read_text
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.depth_images import DepthImageSource
+from tofuse.recordings.phones import first_size
+from tofuse.recordings.reader import ReaderOptions, Sniff
+
+FRAME_RATE_HZ = 30.0
+_LENS = {"fx": "camera_fx", "fy": "camera_fy", "cx": "camera_cx", "cy": "camera_cy"}
+
+
+@part("reader", "zense", label="validated")
+@dataclass(frozen=True)
+class Zense:
+    """Folders of depth*.png in mm and a .toml that holds camera_fx, _fy, _cx and _cy."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            settings = _settings(path)
+            if settings is not None and (files := _depth_files(path)):
+                return Sniff(1.0, f"{len(files)} depth*.png and {settings.name}")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
+        """See `Reader.open`."""
+        files = _depth_files(path) if is_folder(path) else []
+        if not files:
+            raise InputError("has no depth*.png", where=path, remedy="give the recording's folder")
+        settings = _settings(path)
+        camera: Pinhole | None = None
+        rate = FRAME_RATE_HZ
+        if settings is not None:
+            values = _read(settings)
+            rate = _number(values, "capture_fps", settings, FRAME_RATE_HZ)
+            if options.camera is None:
+                lens = {name: _number(values, key, settings) for name, key in _LENS.items()}
+                camera = checked_lens(Pinhole, _size(values, files, settings), lens, settings)
+        if not 0.01 <= rate <= 1e4:
+            rate = FRAME_RATE_HZ
+        source = DepthImageSource(
+            files, np.arange(len(files)) / rate, camera, 0.001, options=options
+        )
+        source.metadata |= {"sensor": "Pico Zense (ToF)", "frame_rate_hz": rate}
+        source.warnings.append(f"no time stamps: frames are taken to come at {rate:g} Hz")
+        return source
+
+
+def _depth_files(path: Path) -> list[Path]:
+    return [p for p in files_with(path, ".png") if p.name.lower().startswith("depth")]
+
+
+def _settings(path: Path) -> Path | None:
+    """Return the .toml that tells a lens, if there is one."""
+    if not is_folder(path):
+        return None
+    found = [p for p in files_with(path, ".toml") if "camera_fx" in read_text(p, limit=1 << 20)]
+    return found[0] if found else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the values of all tables of a file by their own names."""
+    try:
+        data = tomllib.loads(read_text(path))
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise InputError(f"is broken TOML ({error})", where=path, remedy="correct it") from error
+    values: dict[str, Any] = {}
+    for key, value in data.items():
+        values |= value if isinstance(value, dict) else {key: value}
+    return values
+
+
+def _number(values: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
+    value = values.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        problem = "is missing" if value is None else f"is {value!r:.60}"
+        raise InputError(problem, where=f"{path}: {key}", remedy="give a number")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError("is too large", where=f"{path}: {key}", remedy="correct it") from error
+
+
+def _size(values: dict[str, Any], files: list[Path], path: Path) -> tuple[int, int]:
+    """Return (width, height) as the file tells, or else of the images."""
+    if "image_width" not in values or "image_height" not in values:
+        return first_size(files)
+    size = tuple(_number(values, key, path) for key in ("image_width", "image_height"))
+    if not all(2 <= side <= 16384 for side in size):
+        raise InputError(f"is {size[0]:g} x {size[1]:g}", where=f"{path}: image_width")
+    return int(size[0]), int(size[1])
