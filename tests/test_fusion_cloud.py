@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tofuse.fusion import cloud as fusion
-from tofuse.fusion.cloud import CloudBuilder, CloudFusion, as_cloud, choose_voxel
+from tofuse.fusion.cloud import CloudBuilder, as_cloud, choose_voxel
+from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
@@ -22,7 +23,7 @@ def view(points, index=0, **channels) -> CloudFrame:
 
 
 def fuse(views, *, voxel=0.1, poses=None, **options):
-    builder = CloudBuilder(CloudFusion(**options), voxel)
+    builder = CloudBuilder(Fusion(**options), voxel)
     for k, item in enumerate(views):
         builder.add(item, EYE if poses is None else poses[k])
     return builder.finish()
@@ -165,7 +166,7 @@ def test_colour_is_averaged_and_goes_before_amplitude() -> None:
 def test_memory_does_not_grow_with_the_number_of_views(monkeypatch) -> None:
     monkeypatch.setattr(fusion, "_BUFFER_ROWS", 20_000)
     item = view(plane(np.random.default_rng(4)))
-    builder = CloudBuilder(CloudFusion(), 0.01)
+    builder = CloudBuilder(Fusion(), 0.01)
     most = 0
     for k in range(50):
         builder.add(view(item.points, k), EYE)
@@ -175,14 +176,11 @@ def test_memory_does_not_grow_with_the_number_of_views(monkeypatch) -> None:
     assert set(found.views.tolist()) == {50}
 
 
-def test_a_voxel_fits_the_sensor() -> None:
-    camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
-    depth = np.full((80, 100), 2.0, np.float32)
-    assert choose_voxel(RangeFrame(0, 0.0, camera, depth)) == pytest.approx(0.01)  # 2 m / 200
-    assert choose_voxel(RangeFrame(0, 0.0, camera, depth / 1000)) == 0.002
-    assert choose_voxel(RangeFrame(0, 0.0, camera, depth * 1000)) == 0.1
+def test_a_voxel_fits_the_spacing_of_a_cloud() -> None:
     square = np.mgrid[0:50, 0:50, 0:1].reshape(3, -1).T * 0.02
     assert choose_voxel(view(square)) == pytest.approx(0.02, rel=0.1)
+    assert choose_voxel(view(square / 1000)) == 0.002
+    assert choose_voxel(view(square * 1000)) == 0.1
     assert choose_voxel(view(np.zeros((0, 3)))) > 0
 
 
@@ -215,4 +213,4 @@ def test_thinning_keeps_every_channel_together() -> None:
 )
 def test_options_that_make_no_sense(options) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
-        CloudFusion(**options)
+        Fusion(**options)

@@ -69,7 +69,8 @@ def test_result_of_a_whole_run(whole, recording) -> None:
     assert whole.trajectory.shape == (8, 4, 4)
     np.testing.assert_array_equal(whole.trajectory[0], np.eye(4))
     np.testing.assert_array_equal(whole.timestamps, recording.timestamps)
-    assert whole.mesh is None
+    assert len(whole.mesh.faces) > 1000
+    np.testing.assert_array_equal(whole.mesh.vertices, whole.cloud.points)
     assert whole.graph.ids.tolist() == list(range(8))
     assert len(whole.cloud) > 1000
     assert {"filters", "tracking", "loops", "fusion", "checking"} <= set(whole.diagnostics.seconds)

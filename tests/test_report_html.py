@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.fusion.cloud import Cloud, CloudBuilder, CloudFusion, empty_cloud
+from tofuse.fusion.cloud import Cloud, CloudBuilder, empty_cloud
+from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
@@ -77,7 +78,7 @@ def make_room(frames=24, width=64, height=48):
     sequential = truth @ se3.exp(drift)
     estimate = truth @ se3.exp(0.06 * drift)
     views = [view(k, T, camera, rng) for k, T in enumerate(truth)]
-    builder = CloudBuilder(CloudFusion(), 0.03)
+    builder = CloudBuilder(Fusion(), 0.03)
     for frame, T in zip(views, estimate, strict=True):
         builder.add(frame, T)
     records = [

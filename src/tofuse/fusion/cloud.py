@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
@@ -35,6 +36,8 @@ class Cloud:
         (N,) int32, how many frames saw each point.
     offset
         (3,) float64.
+    sigma
+        (N,) float32, how well each point is known along its normal, m; or None.
     """
 
     points: Float32
@@ -42,53 +45,20 @@ class Cloud:
     color: NDArray[np.uint8] | None
     views: NDArray[np.int32]
     offset: Float64
+    sigma: Float32 | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-@dataclass(frozen=True)
-class CloudFusion:
-    """How the fused cloud is made.
-
-    Attributes
-    ----------
-    voxel_m
-        Edge of a voxel; None chooses the distance between neighbouring pixels at the median
-        depth, which keeps what the sensor resolved, or 0.4 % of that depth if that is more.
-    min_views
-        Points seen by fewer frames are left out.
-    normal_neighbours
-        Points in the plane fit of each normal.
-    """
-
-    voxel_m: float | None = None
-    min_views: int = 1
-    normal_neighbours: int = 12
-
-    def __post_init__(self) -> None:
-        if self.voxel_m is not None and not 1e-5 < self.voxel_m < 100:
-            raise ValueError(f"voxel_m is {self.voxel_m}; give metres, such as 0.01")
-        if self.min_views < 1:
-            raise ValueError(f"min_views is {self.min_views}, not 1 or more")
-        if not 3 <= self.normal_neighbours <= 1000:
-            raise ValueError(f"normal_neighbours is {self.normal_neighbours}, not 3 to 1000")
-
-
-def choose_voxel(frame: Frame) -> float:
-    """Return a voxel edge in m that fits the sensor and the scene: 2 mm to 10 cm."""
+def choose_voxel(frame: CloudFrame) -> float:
+    """Return a voxel edge in m that fits a cloud: 2 mm to 10 cm."""
     points = frame.points
     if len(points) == 0:
         return 0.01
-    if isinstance(frame, RangeFrame):
-        rays = frame.camera.rays()
-        pitch = float(np.nanmedian(np.abs(np.diff(rays[..., 0], axis=1))))
-        # Depth noise grows with depth: finer voxels than this would hold little but noise.
-        size = max(pitch, 0.004) * float(np.median(points[:, 2]))
-    else:
-        # A surface of N points: the spacing is about the root of the area over N.
-        extent = np.sort(np.ptp(points.astype(float), axis=0))
-        size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
+    # A surface of N points: the spacing is about the root of the area over N.
+    extent = np.sort(np.ptp(points.astype(float), axis=0))
+    size = float(np.sqrt(max(extent[2] * extent[1], 1e-6) / len(points)))
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 
 
@@ -96,7 +66,7 @@ def choose_voxel(frame: Frame) -> float:
 class CloudBuilder:
     """Adds views one after another; memory grows with the surface, not with the frames."""
 
-    config: CloudFusion
+    config: Fusion
     voxel_m: float
     _keys: list[NDArray[np.int64]] = field(default_factory=list)
     _sums: list[Float64] = field(default_factory=list)
@@ -136,8 +106,8 @@ class CloudBuilder:
         # Grow the buffer with the model, or a large model would be merged at every frame.
         self._rows = 0 if len(keys) > _BUFFER_ROWS // 2 else len(keys)
 
-    def finish(self) -> Cloud:
-        """Return the cloud, in an order that depends on the voxels alone."""
+    def finish(self, *, normals: bool = True) -> Cloud:
+        """Return the cloud, with or without `normals`; its order depends on the voxels alone."""
         if not self._keys:
             return empty_cloud()
         self._merge()
@@ -147,10 +117,9 @@ class CloudBuilder:
             return empty_cloud()
         views = sums[:, 6]
         points = sums[:, 0:3] / views[:, None]
-        normals = _normals(points, sums[:, 3:6], self.config.normal_neighbours)
         return Cloud(
             points.astype(np.float32),
-            normals,
+            _normals(points, sums[:, 3:6], self.config.normal_neighbours) if normals else None,
             _colors(sums),
             np.round(views).astype(np.int32),
             np.zeros(3),
@@ -216,12 +185,18 @@ def _colors(sums: Float64) -> NDArray[np.uint8] | None:
     out[rgb] = np.round(sums[rgb, 7:10] / sums[rgb, 10:11]).clip(0, 255).astype(np.uint8)
     grey &= ~rgb
     if grey.any():
-        value = sums[grey, 11] / sums[grey, 12]
-        low, high = np.percentile(value, [1, 99])
-        # Gamma 1/2.2: albedo is linear, screens are not.
-        share = ((value - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)
-        out[grey] = np.round(255 * share).astype(np.uint8)[:, None]
+        out[grey] = grey_of(sums[grey, 11] / sums[grey, 12])
     return out
+
+
+def grey_of(albedo: Float64) -> NDArray[np.uint8]:
+    """Colours (N, 3) as grey, of albedos (N,) in any unit."""
+    if len(albedo) == 0:
+        return np.zeros((0, 3), np.uint8)
+    low, high = np.percentile(albedo, [1, 99])
+    # Gamma 1/2.2: albedo is linear, screens are not.
+    share = ((albedo - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)
+    return np.repeat(np.round(255 * share).astype(np.uint8)[:, None], 3, axis=1)
 
 
 def _normals(points: Float64, towards: Float64, neighbours: int) -> Float32 | None:

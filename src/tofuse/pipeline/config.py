@@ -12,7 +12,7 @@ from tofuse import parts
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
 from tofuse.filters.correction import Correction
-from tofuse.fusion.cloud import CloudFusion
+from tofuse.fusion.options import Fusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import LoopDetector
@@ -55,7 +55,7 @@ class Config:
     odometry: Odometry
     loops: LoopDetector
     optimiser: Optimiser
-    fusion: CloudFusion
+    fusion: Fusion
     refinement: Refining = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, consistency_of_frames
 from tofuse.filters.base import apply_filters
-from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
+from tofuse.fusion.cloud import as_cloud
+from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
@@ -25,14 +26,14 @@ from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
-from tofuse.posegraph.refinement import Refinement, without_errors
-from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.posegraph.refinement import Refinement
+from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
-from tofuse.results.types import Diagnostics, FrameRecord, Reconstruction
+from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
 Float64 = NDArray[np.float64]
 
-_KEPT_POINTS = 50_000  # of each view, for loops and fusion; bounds the memory of a long run
+_KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
 _CHECKED_IMAGES = 60  # how many images the map-consistency check looks at
 
 
@@ -78,8 +79,7 @@ class Mapper:
         self._begin()
         self._records: list[FrameRecord] = []
         self._steps: list[Step | None] = []  # None where a frame could not be read
-        self._views: dict[int, CloudFrame] = {}  # filtered and thinned, of frames with a pose
-        self._voxel_m = 0.01
+        self._posed = 0
         self._checks = _EvenSample(_CHECKED_IMAGES)
         self._depths: list[float] = []  # typical ranges of the frames with a pose, m
         self._ambiguity_m: float | None = None
@@ -98,6 +98,7 @@ class Mapper:
         self._T_map_tracked = np.eye(4)  # what loops that closed on the way have moved
         self._refiner = self.config.refinement.start()
         self._motion = Motion()
+        self._model = ModelBuilder(self.config.fusion)
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
 
     def push(
@@ -152,7 +153,10 @@ class Mapper:
             self._add(frame, clean, step)
             if step.T_world_camera is not None:
                 with self._watch.timing("loops"):
-                    self._loops.push(self._views[frame.index], step.T_world_camera, step.surface)
+                    view = as_cloud(clean, _KEPT_POINTS)
+                    self._loops.push(view, step.T_world_camera, step.surface)
+                with self._watch.timing("fusion"):
+                    self._model.add(clean, step.surface, _KEPT_POINTS)
                 if step.surface is not None:
                     self._refiner.push(step.surface, step.T_world_camera)
                     # Kept there as far as it is needed, and large.
@@ -263,9 +267,7 @@ class Mapper:
         self._steps.append(step)
         if step.T_world_camera is None:
             return
-        if not self._views:
-            self._voxel_m = self.config.fusion.voxel_m or choose_voxel(filtered)
-        self._views[frame.index] = as_cloud(filtered, _KEPT_POINTS)
+        self._posed += 1
         if isinstance(frame, RangeFrame):
             ranges = frame.radial_range[::4, ::4]
             self._depths.append(float(np.median(ranges[ranges > 0])) if ranges.any() else 0.0)
@@ -285,7 +287,7 @@ class Mapper:
         if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
         self._finished = True
-        if not self._views:
+        if not self._posed:
             raise InputError(
                 f"none of the {len(self._records)} frames has enough valid points for a pose"
                 + (f" (first: {self._records[0].reason})" if self._records else ""),
@@ -314,10 +316,16 @@ class Mapper:
             if refinement.kept:
                 graph = self._graph(loops, refinement)
         moved = bool(graph.loop.any()) or refinement.kept
-        self._progress.stage("fusing", len(graph.ids) * (2 if moved else 1))
+        self._progress.stage("fusing", self._model.views)
         with self._watch.timing("fusion"):
-            cloud = self._fuse(graph, refinement.errors)
-            before = self._fuse(graph.with_poses(sequential)) if moved else None
+            ids = graph.ids.tolist()
+            model = self._model.fuse(
+                dict(zip(ids, graph.poses, strict=True)),
+                self._progress.advance,
+                refinement.errors,
+            )
+            started = dict(zip(ids, sequential, strict=True))
+            before = self._model.sketch(started) if moved else None
         self._progress.stage("checking")
         with self._watch.timing("checking"):
             evidence = Evidence(
@@ -334,11 +342,13 @@ class Mapper:
                 tuple(self._interruptions),
             )
             verdict, reasons = judge(evidence)
+        reasons = (*reasons, *self._about_surface(model))
         return Reconstruction(
             trajectory=self._scatter(graph.poses),
             timestamps=np.array([r.timestamp for r in self._records]),
             graph=graph,
-            cloud=cloud,
+            cloud=model.cloud,
+            mesh=model.mesh,
             diagnostics=Diagnostics(
                 verdict,
                 reasons,
@@ -390,16 +400,14 @@ class Mapper:
         ]
         return build_graph(ids, poses, [*sequence, *again], closed)
 
-    def _fuse(self, graph: PoseGraph, errors: Mapping[str, float] | None = None) -> Cloud:
-        """Put all views together, without the errors of the camera that were estimated."""
-        builder = CloudBuilder(self.config.fusion, self._voxel_m)
-        for frame, T in zip(graph.ids, graph.poses, strict=True):
-            view = self._views[int(frame)]
-            if errors:
-                view = replace(view, points=without_errors(view.points, errors))
-            builder.add(view, T)
-            self._progress.advance()
-        return builder.finish()
+    def _about_surface(self, model: Model) -> tuple[Reason, ...]:
+        """What is to be said where there is no surface."""
+        if model.mesh is not None and len(model.mesh):
+            return ()
+        text = "the views show no surface of some size; mesh.ply and mesh.glb are empty"
+        if model.mesh is None:
+            text = "clouds without a camera make no surface; there is no mesh.ply and no mesh.glb"
+        return (Reason("no_surface", (self._records[0].index, self._records[-1].index), text),)
 
     def _agreement(self, graph: PoseGraph) -> Consistency | None:
         """How well overlapping images agree under the final poses."""

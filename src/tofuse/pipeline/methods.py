@@ -9,7 +9,7 @@ from tofuse.filters.confidence import Confidence
 from tofuse.filters.multipath import Multipath
 from tofuse.filters.neighbours import NeighbourShare
 from tofuse.filters.noise import Noise
-from tofuse.fusion.cloud import CloudFusion
+from tofuse.fusion.options import Fusion
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.config import Config, ViewKind
@@ -43,7 +43,7 @@ def thesis(kind: ViewKind) -> Config:
             confirmation=Confirmation(min_share=0.45),
         ),
         optimiser=Castellani(normalisation="thesis"),
-        fusion=CloudFusion(),
+        fusion=Fusion(),
     )
 
 

@@ -15,8 +15,11 @@ import numpy as np
 
 from tofuse._version import __version__
 from tofuse.errors import InputError, OutputError
+from tofuse.files.glb import write_glb
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.upright import upright
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.results.types import Reconstruction
 
@@ -172,12 +175,36 @@ def write_result(
             cloud.points,
             normals=cloud.normals,
             color=cloud.color,
-            scalars={"views": cloud.views},
+            scalars={"views": cloud.views}
+            | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
         )
+        if result.mesh is not None:
+            _write_mesh(result.mesh, result, staging)
         if report is not None:
             report(result, staging)
         text = json.dumps(run_json(result), indent=1, allow_nan=False)
         (staging / "run.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path) -> None:
+    """Write `mesh.ply`, in the world frame, and `mesh.glb`, which stands upright."""
+    write_ply(
+        folder / "mesh.ply",
+        mesh.vertices,
+        normals=mesh.normals,
+        color=mesh.color,
+        scalars={"views": mesh.views, "sigma": mesh.sigma},
+        faces=mesh.faces,
+    )
+    R = upright(mesh, result.trajectory)
+    write_glb(
+        folder / "mesh.glb",
+        mesh.vertices @ R.T,
+        mesh.faces,
+        normals=mesh.normals @ R.T,
+        color=mesh.color,
+        generator=f"tofuse {__version__}",
+    )
 
 
 def run_json(result: Reconstruction) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.mesh import Mesh
 from tofuse.odometry.base import Status
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
 from tofuse.posegraph.refinement import Refinement
@@ -90,7 +91,7 @@ class Reconstruction:
     cloud
         The fused model, in the world frame.
     mesh
-        None until a surface is made.
+        The fused surface, in the world frame; None for clouds without a camera.
     config
         The resolved configuration, as plain data.
     recording
@@ -106,7 +107,7 @@ class Reconstruction:
     recording: dict[str, Any]
     seed: int
     threads: int
-    mesh: None = None
+    mesh: Mesh | None = None
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:

@@ -25,6 +25,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
     "single_frame": ("note", "Only one frame has a pose: there was nothing to register."),
     "stood_still": ("note", "The camera never moved: the model is what one view sees."),
+    "no_surface": ("note", "No surface could be made, only a cloud."),
     "loop_rejected": ("note", "A loop given by hand could not be confirmed."),
 }
 

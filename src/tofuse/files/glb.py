@@ -1,0 +1,146 @@
+"""glTF 2.0 in one binary file (Khronos Group, 2021): a mesh with normals and vertex colours."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.atomic import write_bytes
+
+_FLOAT, _USHORT, _UINT = 5126, 5123, 5125
+_VERTICES, _INDICES = 34962, 34963
+
+
+def write_glb(
+    path: str | Path,
+    points: ArrayLike,
+    faces: ArrayLike,
+    *,
+    normals: ArrayLike | None = None,
+    color: ArrayLike | None = None,
+    name: str = "model",
+    generator: str = "tofuse",
+) -> None:
+    """Write a mesh; without faces, a file with an empty scene.
+
+    Parameters
+    ----------
+    path
+        The file; see `replacing` for errors.
+    points
+        (N, 3) in m: x right, y up, z towards the viewer.
+    faces
+        (M, 3) rows of points, counter-clockwise seen from outside.
+    normals
+        (N, 3) unit normals.
+    color
+        (N, 3) uint8 RGB as shown on a screen (sRGB); the file holds linear light.
+
+    Raises
+    ------
+    InputError
+        If the shapes disagree.
+    """
+    points, faces = np.asarray(points, np.float32), np.asarray(faces)
+    columns: dict[str, NDArray[np.generic]] = {"POSITION": points}
+    if normals is not None:
+        columns["NORMAL"] = np.asarray(normals, np.float32)
+    if color is not None:
+        columns["COLOR_0"] = _linear(np.asarray(color, np.uint8))
+    for what, values in columns.items():
+        if values.shape[:1] != points.shape[:1] or values.ndim != 2 or points.shape[1:] != (3,):
+            raise InputError(
+                f"{what} has shape {values.shape}", where=path, remedy=f"give {len(points)} rows"
+            )
+    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and faces.max() >= len(points)):
+        raise InputError(
+            f"faces of shape {faces.shape} don't fit {len(points)} points",
+            where=path,
+            remedy="give (M, 3) rows of points",
+        )
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": generator},
+        "scene": 0,
+        "scenes": [{"nodes": []}],
+    }
+    body = bytearray()
+    if len(faces) == 0:
+        del document["scenes"][0]["nodes"]
+    else:
+        document["scenes"] = [{"nodes": [0]}]
+        document["nodes"] = [{"mesh": 0, "name": name}]
+        parts = [*columns.values(), faces.astype("<u4").reshape(-1, 1)]
+        views, accessors = [], []
+        for k, values in enumerate(parts):
+            data = np.ascontiguousarray(values).tobytes()
+            is_index = k == len(columns)
+            target = _INDICES if is_index else _VERTICES
+            views.append(
+                {"buffer": 0, "byteOffset": len(body), "byteLength": len(data), "target": target}
+            )
+            body += data
+            accessors.append(_accessor(k, values))
+        # Asked for by the standard, for positions.
+        accessors[0] |= {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+        document["materials"] = [
+            {
+                "name": "surface",
+                "doubleSided": True,
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+            }
+        ]
+        attributes = {what: k for k, what in enumerate(columns)}
+        document["meshes"] = [
+            {
+                "name": name,
+                "primitives": [
+                    {
+                        "attributes": attributes,
+                        "indices": len(columns),
+                        "material": 0,
+                        "mode": 4,
+                    }
+                ],
+            }
+        ]
+        document |= {
+            "accessors": accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": len(body)}],
+        }
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    if body:
+        chunks += struct.pack("<I4s", len(body), b"BIN\0") + bytes(body)
+    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
+    component = {"f": _FLOAT, "u2": _USHORT, "u4": _UINT}
+    code = values.dtype.kind if values.dtype.kind == "f" else f"u{values.dtype.itemsize}"
+    accessor: dict[str, Any] = {
+        "bufferView": view,
+        "componentType": component[code],
+        "count": len(values),
+        "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+    }
+    if code == "u2":
+        accessor["normalized"] = True
+    return accessor
+
+
+def _linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Linear light and opacity (N, 4) of sRGB colours (IEC 61966-2-1)."""
+    s = np.arange(256) / 255
+    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    table = np.round(65535 * light).astype("<u2")
+    out = np.full((*color.shape[:-1], 4), 65535, "<u2")
+    out[..., :3] = table[color]
+    return out

@@ -1,0 +1,292 @@
+"""The surface of many range images: signed distances in sparse blocks, and their zero."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.cloud import grey_of
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.options import Fusion
+from tofuse.fusion.views import RangeView
+from tofuse.geometry import se3
+from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
+from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.tsdf import (
+    EDGE,
+    EMPTY,
+    VOXELS,
+    integrate,
+    neighbours_of,
+    ray_cells,
+    settle_free,
+    touch_blocks,
+)
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_CHUNKS = 16
+# A view says nothing of a surface within a voxel of what it can't place: the distances it gives
+# would be cut off on one side more than on the other.
+_REACH_SIGMAS = 3.0
+_LARGEST_REACH = 8.0  # voxels: the noise of a bad sensor is no reason to fill space
+# How much larger voxels get when there are too many.
+_COARSER = 1.25
+
+
+def fitting_voxel(views: Sequence[RangeView]) -> float:
+    """Return a voxel edge in m that fits the sensor and the scene: 2 mm to 10 cm."""
+    seen = [view for view in views if view.depth > 0]
+    if not seen:
+        return 0.01
+    depth = float(np.median([view.depth for view in seen]))
+    # Depth noise grows with depth: finer voxels than this would hold little but noise.
+    size = max(float(np.median([view.pitch for view in seen])), 0.004) * depth
+    return float(f"{np.clip(size, 0.002, 0.1):.2g}")
+
+
+@dataclass(eq=False)
+class Volume:
+    """Signed distances to the surfaces that views saw, in blocks near these surfaces.
+
+    All blocks are laid out first, so their order and memory depend on the surfaces alone; then each
+    view is added to the blocks it sees. Blocks are shared out among threads, and each is changed by
+    one of them.
+
+    Attributes
+    ----------
+    voxel_m, reach_m
+        Edge of a voxel, and the largest distance that is told.
+    keys
+        (B,) the blocks, ascending.
+    distance, weight, seen, color, free
+        See `tofuse.kernels.tsdf.integrate`.
+    """
+
+    voxel_m: float
+    reach_m: float
+    keys: Int64
+    distance: Float32
+    weight: Float32
+    seen: NDArray[np.uint16]
+    color: Float32
+    free: Float32
+
+    @classmethod
+    def around(
+        cls, views: Sequence[RangeView], poses: Float64, voxel_m: float, options: Fusion
+    ) -> Volume:
+        """Lay out the blocks near the surfaces of views at their poses (N, 4, 4), all empty.
+
+        Where that would take more memory than allowed, voxels are made larger.
+        """
+        channels = max((view.channels for view in views), default=0)
+        block_bytes = VOXELS * (4 + 4 + 2 + 4 * channels)
+        most = max(1, options.memory_mb * 1_000_000 // block_bytes)
+        noise = [view.sigma_m for view in views if view.sigma_m > 0]
+        sigma = float(np.median(noise)) if noise else 0.0
+        while True:
+            reach = voxel_m * float(
+                np.clip(
+                    _REACH_SIGMAS * sigma / voxel_m,
+                    options.reach,
+                    max(_LARGEST_REACH, options.reach),
+                )
+            )
+            keys = _touched(views, poses, EDGE * voxel_m, reach, most)
+            if keys is not None:
+                break
+            voxel_m = float(f"{_COARSER * voxel_m:.3g}")
+        blocks = len(keys)
+        return cls(
+            voxel_m,
+            reach,
+            keys,
+            np.zeros((blocks, VOXELS), np.float32),
+            np.zeros((blocks, VOXELS), np.float32),
+            np.zeros((blocks, VOXELS), np.uint16),
+            np.zeros((blocks, VOXELS, channels), np.float32),
+            np.zeros(blocks, np.float32),
+        )
+
+    def add(self, view: RangeView, T_world_camera: Float64) -> None:
+        """Add a view at its pose (4, 4)."""
+        if len(self.keys) == 0:
+            return
+        projection = view.projection
+        pixels = view.pixels()
+        light = view.light_image(self.color.shape[2])
+        lookup = projection.lookup
+        cells = np.empty((lookup.shape[0] - 1, lookup.shape[1] - 1, 3), np.float32)
+        ray_cells(pixels, projection.rays, projection.frame, self.reach_m, cells)
+        T = se3.inverse(T_world_camera)
+        run_chunks(
+            lambda a, b: integrate(
+                self.keys,
+                self.voxel_m,
+                T,
+                pixels,
+                light,
+                lookup,
+                projection.frame,
+                cells,
+                self.reach_m,
+                self.distance,
+                self.weight,
+                self.seen,
+                self.color,
+                self.free,
+                a,
+                b,
+            ),
+            len(self.keys),
+            _CHUNKS,
+        )
+
+    def surface(self, min_views: int = 1) -> Mesh:
+        """Return where the distances change sign, between voxels that views saw."""
+        blocks = len(self.keys)
+        run_chunks(
+            lambda a, b: settle_free(self.distance, self.weight, self.free, self.reach_m, a, b),
+            blocks,
+            _CHUNKS,
+        )
+        neighbours = np.empty((blocks, 27), np.int32)
+        neighbours_of(self.keys, neighbours)
+        cells = np.empty((blocks, VOXELS), np.int32)
+        counts = np.zeros(blocks, np.int64)
+        run_chunks(
+            lambda a, b: mark_cells(
+                neighbours,
+                self.distance,
+                self.weight,
+                self.seen,
+                0.0,
+                min_views,
+                cells,
+                counts,
+                a,
+                b,
+            ),
+            blocks,
+            _CHUNKS,
+        )
+        starts = np.cumsum(counts) - counts
+        total = int(counts.sum())
+        channels = self.color.shape[2]
+        points = np.empty((total, 3))
+        normals = np.empty((total, 3), np.float32)
+        tints = np.empty((total, channels), np.float32)
+        sigma = np.empty(total, np.float32)
+        views = np.empty(total, np.int32)
+        run_chunks(
+            lambda a, b: make_vertices(
+                self.keys,
+                self.voxel_m,
+                neighbours,
+                self.distance,
+                self.weight,
+                self.seen,
+                self.color,
+                cells,
+                starts,
+                points,
+                normals,
+                tints,
+                sigma,
+                views,
+                a,
+                b,
+            ),
+            blocks,
+            _CHUNKS,
+        )
+        faces = self._faces(neighbours, cells, starts, points)
+        color = None
+        if channels == 3:
+            color = np.round(tints).clip(0, 255).astype(np.uint8)
+        elif channels:
+            color = grey_of(tints[:, 0].astype(float) ** 2)
+        return Mesh(points.astype(np.float32), faces, normals, color, sigma, views, np.zeros(3))
+
+    def _faces(
+        self,
+        neighbours: NDArray[np.int32],
+        cells: NDArray[np.int32],
+        starts: Int64,
+        points: Float64,
+    ) -> NDArray[np.int32]:
+        blocks = len(self.keys)
+        counts = np.zeros(blocks, np.int64)
+
+        def run(firsts: Int64, faces: NDArray[np.int32], fill: bool) -> NDArray[np.int32]:
+            run_chunks(
+                lambda a, b: make_faces(
+                    neighbours,
+                    self.distance,
+                    cells,
+                    starts,
+                    points,
+                    firsts,
+                    faces,
+                    counts,
+                    fill,
+                    a,
+                    b,
+                ),
+                blocks,
+                _CHUNKS,
+            )
+            return faces
+
+        run(counts, np.empty((0, 3), np.int32), fill=False)
+        found = np.empty((int(counts.sum()), 3), np.int32)
+        return run(np.cumsum(counts) - counts, found, fill=True)
+
+
+def _touched(
+    views: Sequence[RangeView], poses: Float64, block_m: float, reach: float, most: int
+) -> Int64 | None:
+    """Keys of the blocks near surfaces, ascending; None if there are more than `most`."""
+    table, count = np.full(1 << 12, EMPTY, np.int64), 0
+    for view, T in zip(views, poses, strict=True):
+        pixels = view.pixels()
+        table, count = touch_blocks(pixels, view.projection.rays, T, block_m, reach, table, count)
+        if count > most:
+            return None
+    return np.sort(table[table != EMPTY])
+
+
+def fuse_surface(
+    views: Sequence[RangeView],
+    poses: Float64,
+    options: Fusion | None = None,
+    advance: Callable[[], None] | None = None,
+) -> Mesh:
+    """Fuse range images at their final poses into one surface.
+
+    Parameters
+    ----------
+    views
+        All of one camera or several.
+    poses
+        (N, 4, 4) T_world_camera.
+    advance
+        Called after each view.
+
+    Returns
+    -------
+    The surface without its islands; no faces where the views show none.
+    """
+    options = options or Fusion()
+    volume = Volume.around(views, poses, options.voxel_m or fitting_voxel(views), options)
+    for view, T in zip(views, poses, strict=True):
+        volume.add(view, T)
+        if advance is not None:
+            advance()
+    return volume.surface(options.min_views).without_islands(options.island)

@@ -1,0 +1,250 @@
+"""Range images as fusion keeps them: small, until the poses are final."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.kernels.tsdf import unpack_view
+from tofuse.maps.surface_map import (
+    Projection,
+    SurfaceMap,
+    SurfaceOptions,
+    surface_map,
+)
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+
+Float32 = NDArray[np.float32]
+
+# Weights, in 1/m^2, are kept as logarithms: six steps an octave, from 2^-14 on.
+_STEPS, _LEAST = 6.0, -14.0
+_DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS + _LEAST)].astype(np.float32)
+# Below this cosine of the incidence a pixel's light comes from too much of the surface.
+_LEAST_COSINE = 0.1
+# Size of what surfaces have of relief within a window of a few pixels, as a share of the depth.
+_DETAIL = 0.002
+# Two neighbours differ by more than so many sigmas only where there are two surfaces.
+_JUMP_SIGMAS = 4.0
+# Where no plane could be fitted little is known of the surface.
+_UNFITTED = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class RangeView:
+    """What fusion needs of a range image, at most 320 columns, 8 to 10 bytes a pixel.
+
+    Attributes
+    ----------
+    index, timestamp
+        Of the frame.
+    projection
+        Rays of the pixels, and where points land.
+    z
+        (H, W) uint16, z in counts of `unit` m, 0 where there is none.
+    normals
+        (H, W, 3) int8, 127 times the unit normals away from the camera.
+    strength
+        (H, W) uint8 code of the weight, see `weights`; 0 where nothing is to be believed.
+    light
+        (H, W) float16, root of the albedo in the recording's counts times m^2; or (H, W, 3) uint8
+        RGB; None where neither is known.
+    sigma_m
+        Median standard deviation of z.
+    """
+
+    index: int
+    timestamp: float
+    projection: Projection
+    z: NDArray[np.uint16]
+    unit: float
+    normals: NDArray[np.int8]
+    strength: NDArray[np.uint8]
+    light: NDArray[np.float16] | NDArray[np.uint8] | None
+    sigma_m: float
+
+    @classmethod
+    def of(
+        cls,
+        frame: RangeFrame,
+        surface: SurfaceMap | None = None,
+        options: SurfaceOptions | None = None,
+    ) -> RangeView:
+        """Keep what of `frame` is valid; `surface` is the same image before filters, if there is.
+
+        A pixel's weight is the squared cosine of the incidence over the variance of its depth. It
+        is 0 next to jumps in depth, where light of both sides mixes. Its depth is drawn towards
+        the plane fitted around it, the more the noisier it is.
+        """
+        options = options or SurfaceOptions()
+        if surface is None:
+            surface = surface_map(frame, options)
+        shape = surface.z.shape
+        valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
+        z = np.where(valid, _smoothed(surface), np.float32(0))
+        rays = surface.rays
+        lengths = np.sqrt(surface.projection.lengths2)
+        normals = surface.normals
+        fitted = (normals != 0).any(-1)
+        cosine = (normals[..., 0] * rays[..., 0] + normals[..., 1] * rays[..., 1]) + normals[..., 2]
+        cosine = np.where(fitted, cosine / lengths, np.float32(1))
+        straight = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) / lengths[..., None]
+        normals = np.where(fitted[..., None], normals, straight)
+        good = (z > 0) & (surface.sigma > 0) & (cosine > _LEAST_COSINE)
+        good &= ~_near_jumps(surface, options)
+        weight = np.square(
+            np.divide(cosine, surface.sigma, out=np.zeros_like(z), where=good), dtype=np.float32
+        )
+        weight[~fitted] *= np.float32(_UNFITTED)
+        farthest = float(z.max(initial=0.0))
+        unit = max(farthest, 1e-3) / 65535
+        return cls(
+            frame.index,
+            frame.timestamp,
+            surface.projection,
+            np.round(z / unit).astype(np.uint16),
+            unit,
+            np.round(127 * np.nan_to_num(normals)).astype(np.int8),
+            _encoded(weight),
+            _light(frame, shape),
+            float(np.median(surface.sigma[good])) if good.any() else 0.0,
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the view's own images take."""
+        light = 0 if self.light is None else self.light.nbytes
+        return self.z.nbytes + self.normals.nbytes + self.strength.nbytes + light
+
+    @property
+    def depth(self) -> float:
+        """Median z in m; 0 where nothing is valid."""
+        known = self.z[self.z > 0]
+        return float(np.median(known)) * self.unit if len(known) else 0.0
+
+    @property
+    def pitch(self) -> float:
+        """Typical difference of x/z between neighbouring pixels."""
+        return float(np.nanmedian(np.abs(np.diff(self.projection.rays[..., 0], axis=1))))
+
+    @property
+    def channels(self) -> int:
+        """3 for colour, 1 for albedo, else 0."""
+        if self.light is None:
+            return 0
+        return 3 if self.light.ndim == 3 else 1
+
+    def pixels(self) -> Float32:
+        """(H, W, 5) plane n . p = h of each pixel as n, h, and its weight, 0 where unknown."""
+        out = np.zeros((*self.z.shape, 5), np.float32)
+        unpack_view(
+            self.z, self.unit, self.normals, self.strength, _DECODED, self.projection.rays, out
+        )
+        return out
+
+    def light_image(self, channels: int) -> Float32:
+        """(H, W, channels) light as float32: the root of the albedo, or RGB."""
+        out = np.zeros((*self.z.shape, channels), np.float32)
+        if self.light is not None and channels:
+            out[:] = self.light.reshape(*self.z.shape, -1)
+        return out
+
+    def as_cloud(self) -> CloudFrame:
+        """Return the valid pixels as a cloud; its amplitude falls with the square of the range."""
+        valid = (self.z > 0) & np.isfinite(self.projection.rays).all(-1)
+        z = self.z[valid].astype(np.float32) * np.float32(self.unit)
+        rays = self.projection.rays[valid]
+        points = np.concatenate([rays * z[:, None], z[:, None]], 1)
+        color = amplitude = None
+        if self.channels == 3:
+            assert self.light is not None
+            color = self.light[valid].astype(np.uint8)
+        elif self.light is not None:
+            square = np.einsum("ni,ni->n", points, points)
+            amplitude = self.light[valid].astype(np.float32) ** 2 / np.maximum(square, 1e-6)
+        return CloudFrame(self.index, self.timestamp, points, color=color, amplitude=amplitude)
+
+
+def _smoothed(surface: SurfaceMap) -> Float32:
+    """Depth (H, W) in m: the plane's, and of the rest what exceeds the noise (Wiener's gain)."""
+    z, on_plane = surface.z, surface.planes[..., 3]
+    plane = np.divide(1, on_plane, out=z.copy(), where=on_plane > 0)
+    detail = np.square(np.float32(_DETAIL) * z)
+    gain = detail / np.maximum(detail + np.square(surface.sigma), np.float32(1e-12))
+    return np.asarray(plane + gain * (z - plane), np.float32)
+
+
+def _near_jumps(surface: SurfaceMap, options: SurfaceOptions) -> NDArray[np.bool_]:
+    """Pixels next to jumps in depth: by a share of it, and by more than the noise makes."""
+    z, variance = surface.z, np.square(surface.sigma)
+    jump = np.zeros(z.shape, np.uint8)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        step = np.abs(z[a] - z[b])
+        across = (z[a] > 0) & (z[b] > 0) & (step > options.edge_jump * np.minimum(z[a], z[b]))
+        across &= step * step > _JUMP_SIGMAS**2 * (variance[a] + variance[b])
+        jump[a] |= across
+        jump[b] |= across
+    size = 2 * options.edge_margin + 1
+    return cv2.dilate(jump, np.ones((size, size), np.uint8)) > 0
+
+
+def without_camera_errors(
+    views: Sequence[RangeView], errors: Mapping[str, float]
+) -> list[RangeView]:
+    """Views as they would be, did the camera not err like this; see `Refinement.errors`."""
+    if not any(errors.values()):
+        return list(views)
+    stretch = 1 + errors.get("focal", 0.0)
+    straight: dict[int, Projection] = {}  # shared, as it was before
+    out = []
+    for view in views:
+        old = view.projection
+        if id(old) not in straight:
+            frame = old.frame * [stretch, stretch, 1 / stretch, 1 / stretch]
+            straight[id(old)] = Projection(
+                np.asarray(old.rays * np.float32(stretch)), old.lookup, frame
+            )
+        z = view.z * np.float32(view.unit)
+        z = z * np.float32(1 + errors.get("scale", 0.0)) + np.where(
+            z > 0, np.float32(errors.get("offset", 0.0)) / np.sqrt(old.lengths2), 0
+        )
+        z = np.maximum(np.nan_to_num(z), 0)
+        unit = max(float(z.max(initial=0.0)), 1e-3) / 65535
+        counts = np.round(z / unit).astype(np.uint16)
+        out.append(replace(view, z=counts, unit=unit, projection=straight[id(old)]))
+    return out
+
+
+def _encoded(weight: Float32) -> NDArray[np.uint8]:
+    known = weight > 0
+    code = 1 + np.round(_STEPS * (np.log2(np.where(known, weight, 1)) - _LEAST))
+    return np.where(known, np.clip(code, 1, 255), 0).astype(np.uint8)
+
+
+def _light(
+    frame: RangeFrame, shape: tuple[int, ...]
+) -> NDArray[np.float16] | NDArray[np.uint8] | None:
+    if frame.color_image is not None:
+        return np.round(_reduced(frame.color_image.astype(np.float32), shape)).astype(np.uint8)
+    if frame.amplitude_image is None:
+        return None
+    amplitude = frame.amplitude_image
+    if frame.amplitude_kind != "range_compensated":
+        # Light falls off with the square of the range: this is nearly the surface's albedo.
+        amplitude = amplitude * np.square(frame.z * ray_lengths(frame.camera))
+    light = np.sqrt(np.maximum(_reduced(np.nan_to_num(amplitude), shape), 0))
+    return np.minimum(light, 65000).astype(np.float16)
+
+
+def _reduced(image: Float32, shape: tuple[int, ...]) -> Float32:
+    """Means over the blocks of pixels that make the (H, W) of a reduced image."""
+    step = image.shape[1] // shape[1]
+    if step == 1:
+        return image
+    whole = np.ascontiguousarray(image[: step * shape[0], : step * shape[1]])
+    means = cv2.resize(whole, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    return np.asarray(means, np.float32)

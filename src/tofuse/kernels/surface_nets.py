@@ -1,0 +1,268 @@
+"""The zero surface of signed distances in blocks, by surface nets (Gibson 1998).
+
+Each cell of eight neighbouring voxels that the surface passes has one vertex, the mean of where it
+crosses the cell's edges; the four cells around a crossed edge make two triangles. Blocks are those
+of `tofuse.kernels.tsdf`; cells reach into the next blocks, so there are no seams.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+from tofuse.kernels.tsdf import EDGE, VOXELS, block_of
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+UInt16 = NDArray[np.uint16]
+
+_SIDE = EDGE + 1
+
+
+@kernel
+def _place(i: int, j: int, k: int) -> tuple[int, int]:
+    """Neighbour and voxel of (i, j, k), each from -1 to EDGE, seen from a block."""
+    n = 9 * ((i >> 3) + 1) + 3 * ((j >> 3) + 1) + (k >> 3) + 1
+    return n, ((i & 7) << 6) | ((j & 7) << 3) | (k & 7)
+
+
+@kernel
+def _gather(
+    b: int, neighbours: Int32, distance: Float32, weight: Float32, least: float, out: Float32
+) -> bool:
+    """Distances (9, 9, 9) of a block and the next voxels, NaN where unknown; whether 0 is among."""
+    below = False
+    above = False
+    for i in range(_SIDE):
+        for j in range(_SIDE):
+            for k in range(_SIDE):
+                n, v = _place(i, j, k)
+                row = neighbours[b, n]
+                d = np.float32(np.nan)
+                if row >= 0 and weight[row, v] > least:
+                    d = distance[row, v]
+                    below |= d < 0
+                    above |= d >= 0
+                out[i, j, k] = d
+    return below and above
+
+
+@kernel
+def mark_cells(
+    neighbours: Int32,
+    distance: Float32,
+    weight: Float32,
+    seen: UInt16,
+    least: float,
+    views: int,
+    cells: Int32,
+    counts: Int64,
+    start: int,
+    stop: int,
+) -> None:
+    """Number the cells of blocks start..stop that hold a vertex.
+
+    A cell counts if all its corners have more than the `least` weight, their distances differ in
+    sign, and one of them was seen by at least so many `views`. `cells` (B, VOXELS) gets the number
+    within the block or -1, `counts` (B,) how many there are.
+    """
+    d = np.empty((_SIDE, _SIDE, _SIDE), np.float32)
+    for b in range(start, stop):
+        cells[b] = -1
+        counts[b] = 0
+        if not _gather(b, neighbours, distance, weight, least, d):
+            continue
+        number = 0
+        for v in range(VOXELS):
+            i = v >> 6
+            j = (v >> 3) & 7
+            k = v & 7
+            below = 0
+            above = 0
+            most = 0
+            for q in range(8):
+                x = d[i + (q >> 2), j + ((q >> 1) & 1), k + (q & 1)]
+                if x < 0:
+                    below += 1
+                elif x >= 0:
+                    above += 1
+                else:
+                    break
+            if below == 0 or above == 0 or below + above < 8:
+                continue
+            for q in range(8):
+                n, w = _place(i + (q >> 2), j + ((q >> 1) & 1), k + (q & 1))
+                most = max(most, seen[neighbours[b, n], w])
+            if most < views:
+                continue
+            cells[b, v] = number
+            number += 1
+        counts[b] = number
+
+
+@kernel
+def make_vertices(
+    keys: Int64,
+    voxel_m: float,
+    neighbours: Int32,
+    distance: Float32,
+    weight: Float32,
+    seen: UInt16,
+    color: Float32,
+    cells: Int32,
+    starts: Int64,
+    points: Float64,
+    normals: Float32,
+    tints: Float32,
+    sigmas: Float32,
+    views: Int32,
+    start: int,
+    stop: int,
+) -> None:
+    """Make the vertices of the marked cells of blocks start..stop, from row starts[b] on.
+
+    `points` are relative to the world's origin, `normals` the normalised gradient, `tints` the mean
+    light where seen, `sigmas` one over the root of the corners' mean weight, `views` the largest
+    count among the corners.
+    """
+    d = np.empty((2, 2, 2))
+    channels = color.shape[2]
+    tint = np.zeros(channels)
+    at = np.zeros(3)
+    g = np.zeros(3)
+    c = np.zeros(3, np.int64)
+    for b in range(start, stop):
+        bi, bj, bk = block_of(keys[b])
+        row = starts[b]
+        for v in range(VOXELS):
+            if cells[b, v] < 0:
+                continue
+            i = v >> 6
+            j = (v >> 3) & 7
+            k = v & 7
+            tint[:] = 0
+            amount = 0.0
+            total = 0.0
+            most = 0
+            for q in range(8):
+                n, w = _place(i + (q >> 2), j + ((q >> 1) & 1), k + (q & 1))
+                m = neighbours[b, n]
+                d[q >> 2, (q >> 1) & 1, q & 1] = distance[m, w]
+                total += weight[m, w]
+                most = max(most, seen[m, w])
+                amount += seen[m, w]
+                for s in range(channels):
+                    tint[s] += seen[m, w] * color[m, w, s]
+            at[:] = 0
+            g[:] = 0
+            crossings = 0
+            for axis in range(3):
+                for p in range(4):
+                    c[axis] = 0
+                    c[(axis + 1) % 3] = p >> 1
+                    c[(axis + 2) % 3] = p & 1
+                    d0 = d[c[0], c[1], c[2]]
+                    c[axis] = 1
+                    d1 = d[c[0], c[1], c[2]]
+                    g[axis] += d1 - d0
+                    if (d0 < 0) != (d1 < 0):
+                        crossings += 1
+                        at[axis] += d0 / (d0 - d1)
+                        at[(axis + 1) % 3] += p >> 1
+                        at[(axis + 2) % 3] += p & 1
+            points[row, 0] = (bi * EDGE + i + at[0] / crossings) * voxel_m
+            points[row, 1] = (bj * EDGE + j + at[1] / crossings) * voxel_m
+            points[row, 2] = (bk * EDGE + k + at[2] / crossings) * voxel_m
+            length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+            for axis in range(3):
+                # A gradient of 0 is no direction; any unit vector will do.
+                normals[row, axis] = g[axis] / length if length > 0 else np.float64(axis == 2)
+            for s in range(channels):
+                tints[row, s] = tint[s] / amount
+            sigmas[row] = 1 / np.sqrt(total / 8)
+            views[row] = most
+            row += 1
+
+
+@kernel
+def _cell(b: int, i: int, j: int, k: int, neighbours: Int32, cells: Int32, starts: Int64) -> int:
+    n, v = _place(i, j, k)
+    row = neighbours[b, n]
+    if row < 0 or cells[row, v] < 0:
+        return -1
+    return starts[row] + cells[row, v]
+
+
+@kernel
+def make_faces(
+    neighbours: Int32,
+    distance: Float32,
+    cells: Int32,
+    starts: Int64,
+    points: Float64,
+    firsts: Int64,
+    faces: Int32,
+    counts: Int64,
+    fill: bool,
+    start: int,
+    stop: int,
+) -> None:
+    """Make the triangles around the crossed edges that begin in blocks start..stop.
+
+    They turn counter-clockwise seen from where distances are positive. Without `fill` only
+    `counts` (B,) is written, with it `faces` from row firsts[b] on. Of a quad's diagonals the
+    shorter one is taken.
+    """
+    p = np.zeros(3, np.int64)
+    quad = np.zeros(4, np.int64)
+    for b in range(start, stop):
+        number = 0
+        for v in range(VOXELS):
+            i = v >> 6
+            j = (v >> 3) & 7
+            k = v & 7
+            if cells[b, v] < 0:
+                continue
+            d0 = distance[b, v]
+            for axis in range(3):
+                p[0] = i
+                p[1] = j
+                p[2] = k
+                p[axis] += 1
+                n, w = _place(p[0], p[1], p[2])
+                if (d0 < 0) == (distance[neighbours[b, n], w] < 0):
+                    continue
+                p[axis] -= 1
+                whole = True
+                for q in range(4):
+                    # (0, 0), (-1, 0), (-1, -1), (0, -1) along the two other axes.
+                    a = (axis + 1) % 3
+                    e = (axis + 2) % 3
+                    da = 1 if q == 1 or q == 2 else 0
+                    de = 1 if q >= 2 else 0
+                    p[a] -= da
+                    p[e] -= de
+                    quad[q] = _cell(b, p[0], p[1], p[2], neighbours, cells, starts)
+                    p[a] += da
+                    p[e] += de
+                    whole &= quad[q] >= 0
+                if not whole:
+                    continue
+                if fill:
+                    if d0 >= 0:
+                        quad[1], quad[3] = quad[3], quad[1]
+                    first = 0.0
+                    second = 0.0
+                    for s in range(3):
+                        first += (points[quad[0], s] - points[quad[2], s]) ** 2
+                        second += (points[quad[1], s] - points[quad[3], s]) ** 2
+                    o = 0 if first <= second else 1
+                    row = firsts[b] + number
+                    for s in range(3):
+                        faces[row, s] = quad[(o + s) % 4]
+                        faces[row + 1, s] = quad[(o + (s + 2) % 4) % 4]
+                number += 2
+        counts[b] = number

@@ -1,0 +1,417 @@
+"""Signed distances in sparse blocks of voxels (Curless and Levoy 1996; Nießner et al. 2013).
+
+Space is cut into blocks of 8 x 8 x 8 voxels, of which only those near surfaces are kept. A block is
+known by a 63-bit key; tables of keys are open-addressed with linear probing. Distances are positive
+in front of a surface and cut at `reach`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+from tofuse.kernels.projection import landing
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+UInt16 = NDArray[np.uint16]
+
+EDGE = 8  # voxels along the edge of a block
+VOXELS = EDGE**3
+EMPTY = -1  # of a table of keys
+_HALF = 1 << 20
+_MASK = (1 << 21) - 1
+# How many cells of the grid of rays are looked through before a block is taken voxel by voxel.
+_MOST_CELLS = 600
+
+
+@kernel
+def block_key(i: int, j: int, k: int) -> int:
+    """Key of the block (i, j, k), each from -2^20 to 2^20 - 1."""
+    return ((i + _HALF) << 42) | ((j + _HALF) << 21) | (k + _HALF)
+
+
+@kernel
+def block_of(key: int) -> tuple[int, int, int]:
+    """Block (i, j, k) of a key."""
+    return (key >> 42) - _HALF, ((key >> 21) & _MASK) - _HALF, (key & _MASK) - _HALF
+
+
+@kernel
+def slot_of(table: Int64, key: int) -> int:
+    """Where `key` is in the table (a power of two long), or the empty place where it belongs."""
+    # Fibonacci hashing: the upper bits of the product depend on all bits of the key.
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    mask = len(table) - 1
+    slot = np.int64(mixed >> np.uint64(32)) & mask
+    while table[slot] != EMPTY and table[slot] != key:
+        slot = (slot + 1) & mask
+    return int(slot)
+
+
+@kernel
+def _grown(table: Int64) -> Int64:
+    larger = np.full(2 * len(table), EMPTY, np.int64)
+    for key in table:
+        if key != EMPTY:
+            larger[slot_of(larger, key)] = key
+    return larger
+
+
+@kernel
+def touch_blocks(
+    pixels: Float32,
+    rays: Float32,
+    T_world_camera: Float64,
+    block_m: float,
+    reach: float,
+    table: Int64,
+    count: int,
+) -> tuple[Int64, int]:
+    """Enter the blocks within `reach` of the surface that a view shows.
+
+    `pixels` are those of `unpack_view`. Returns the table, a larger one if it had to grow, and how
+    many keys it holds now.
+    """
+    rows, columns = pixels.shape[:2]
+    steps = max(2, int(np.ceil(2 * reach / (0.34 * block_m))))
+    last = np.full(steps + 1, EMPTY, np.int64)
+    R = T_world_camera
+    for r in range(rows):
+        for c in range(columns):
+            if not pixels[r, c, 4] > 0:
+                continue
+            n0 = np.float64(pixels[r, c, 0])
+            n1 = np.float64(pixels[r, c, 1])
+            n2 = np.float64(pixels[r, c, 2])
+            x = np.float64(rays[r, c, 0])
+            y = np.float64(rays[r, c, 1])
+            z = pixels[r, c, 3] / (n0 * x + n1 * y + n2)
+            for s in range(steps + 1):
+                t = reach * (2.0 * s / steps - 1.0)
+                p0 = z * x + t * n0
+                p1 = z * y + t * n1
+                p2 = z + t * n2
+                i = int(np.floor((R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2 + R[0, 3]) / block_m))
+                j = int(np.floor((R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2 + R[1, 3]) / block_m))
+                k = int(np.floor((R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2 + R[2, 3]) / block_m))
+                if max(abs(i), abs(j), abs(k)) >= _HALF - 1:
+                    continue
+                key = block_key(i, j, k)
+                if key == last[s]:
+                    continue
+                last[s] = key
+                slot = slot_of(table, key)
+                if table[slot] == EMPTY:
+                    table[slot] = key
+                    count += 1
+                    if 2 * count > len(table):
+                        table = _grown(table)
+    return table, count
+
+
+@kernel
+def neighbours_of(keys: Int64, out: Int32) -> None:
+    """Rows of the 27 blocks around each block, itself in the middle; -1 where there is none.
+
+    `keys` (B,) are distinct. Column 9 a + 3 b + c of `out` (B, 27) is the block at the offset
+    (a - 1, b - 1, c - 1).
+    """
+    size = 16
+    while size < 2 * len(keys):
+        size *= 2
+    table = np.full(size, EMPTY, np.int64)
+    rows = np.empty(size, np.int32)
+    for b in range(len(keys)):
+        slot = slot_of(table, keys[b])
+        table[slot] = keys[b]
+        rows[slot] = b
+    for b in range(len(keys)):
+        i, j, k = block_of(keys[b])
+        for n in range(27):
+            key = block_key(i + n // 9 - 1, j + n // 3 % 3 - 1, k + n % 3 - 1)
+            slot = slot_of(table, key)
+            out[b, n] = rows[slot] if table[slot] == key else -1
+
+
+@kernel
+def unpack_view(
+    z: UInt16,
+    unit: float,
+    normals: NDArray[np.int8],
+    strength: NDArray[np.uint8],
+    weights: Float32,
+    rays: Float32,
+    pixels: Float32,
+) -> None:
+    """Fill `pixels` (H, W, 5): the plane n . p = h of each pixel as n, h, and its weight.
+
+    `z` counts in `unit` m; `normals` are 127 times unit vectors away from the camera, and
+    `weights` (256,) decodes `strength`, of which 0 is weight 0.
+    """
+    rows, columns = z.shape
+    for r in range(rows):
+        for c in range(columns):
+            w = weights[strength[r, c]]
+            pixels[r, c, 4] = 0
+            if z[r, c] == 0 or not w > 0:
+                continue
+            n0 = normals[r, c, 0] / 127.0
+            n1 = normals[r, c, 1] / 127.0
+            n2 = normals[r, c, 2] / 127.0
+            along = n0 * rays[r, c, 0] + n1 * rays[r, c, 1] + n2
+            if not along > 0:
+                continue
+            pixels[r, c, 0] = n0
+            pixels[r, c, 1] = n1
+            pixels[r, c, 2] = n2
+            pixels[r, c, 3] = z[r, c] * unit * along
+            pixels[r, c, 4] = w
+
+
+@kernel
+def ray_cells(
+    pixels: Float32, rays: Float32, lookup_frame: Float64, reach: float, cells: Float32
+) -> None:
+    """Bounds of what a view shows, for cells of a grid over ray coordinates.
+
+    `cells` (A, B, 3) gets the z before which all in the cell is free, the z behind which all is
+    hidden, and the least weight: 0 where a pixel shows nothing, or the cell has no pixel.
+    """
+    cells[..., 0] = np.inf
+    cells[..., 1] = -np.inf
+    cells[..., 2] = np.inf
+    for r in range(pixels.shape[0]):
+        for c in range(pixels.shape[1]):
+            x = rays[r, c, 0]
+            y = rays[r, c, 1]
+            fu = (x - lookup_frame[0]) * lookup_frame[2]
+            fv = (y - lookup_frame[1]) * lookup_frame[3]
+            if not (fu >= 0 and fv >= 0 and fu < cells.shape[1] and fv < cells.shape[0]):
+                continue
+            i = int(fu)
+            j = int(fv)
+            w = pixels[r, c, 4]
+            cells[j, i, 2] = min(cells[j, i, 2], w)
+            if w > 0:
+                along = pixels[r, c, 0] * x + pixels[r, c, 1] * y + pixels[r, c, 2]
+                z = pixels[r, c, 3] / along
+                cells[j, i, 0] = min(cells[j, i, 0], z - reach / along)
+                cells[j, i, 1] = max(cells[j, i, 1], z + reach / along)
+    for j in range(cells.shape[0]):
+        for i in range(cells.shape[1]):
+            if cells[j, i, 2] == np.inf:
+                cells[j, i, 2] = 0
+
+
+@kernel
+def _bounds(
+    x: float, y: float, z: float, radius: float, cells: Float32, lookup_frame: Float64
+) -> tuple[float, float, float]:
+    """Free before, hidden behind, least weight for a ball around (x, y, z) in the camera's frame.
+
+    Hidden behind minus infinity: the view shows nothing of it.
+    """
+    if z - radius < 0.2 * z:
+        return -np.inf, np.inf, 0.0
+    # Ray coordinates of the ball's box, at its near and far end.
+    near = 1 / (z - radius)
+    far = 1 / (z + radius)
+    a = min((x - radius) * near, (x - radius) * far)
+    b = max((x + radius) * near, (x + radius) * far)
+    fu = (a - lookup_frame[0]) * lookup_frame[2] - 1
+    gu = (b - lookup_frame[0]) * lookup_frame[2] + 1
+    a = min((y - radius) * near, (y - radius) * far)
+    b = max((y + radius) * near, (y + radius) * far)
+    fv = (a - lookup_frame[1]) * lookup_frame[3] - 1
+    gv = (b - lookup_frame[1]) * lookup_frame[3] + 1
+    if gu < 0 or gv < 0 or fu >= cells.shape[1] or fv >= cells.shape[0]:
+        return 0.0, -np.inf, 0.0
+    least = np.inf
+    if fu < 0 or fv < 0 or gu >= cells.shape[1] or gv >= cells.shape[0]:
+        least = 0.0
+    i0 = int(max(fu, 0))
+    i1 = int(min(gu, cells.shape[1] - 1))
+    j0 = int(max(fv, 0))
+    j1 = int(min(gv, cells.shape[0] - 1))
+    if (i1 - i0 + 1) * (j1 - j0 + 1) > _MOST_CELLS:
+        return -np.inf, np.inf, 0.0
+    low = np.inf
+    high = -np.inf
+    for j in range(j0, j1 + 1):
+        for i in range(i0, i1 + 1):
+            low = min(low, cells[j, i, 0])
+            high = max(high, cells[j, i, 1])
+            least = min(least, cells[j, i, 2])
+    return low, high, least
+
+
+@kernel
+def _linear(
+    x: float, y: float, z: float, radius: float, lookup: Float32, lookup_frame: Float64
+) -> tuple[float, float, float, float, float, float, bool]:
+    """Where points of a small ball around (x, y, z) land, as a linear function of x/z and y/z.
+
+    u = u0 + ux x/z + uy y/z, v likewise: (u0, v0, ux, uy, vx, vy), and whether that will do: not
+    for balls that a bent lens shows bent, nor at the border.
+    """
+    if z - radius < 0.5 * z or radius / z * max(lookup_frame[2], lookup_frame[3]) > 2:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
+    u, v, i, j = landing(x / z, y / z, lookup, lookup_frame)
+    if i < 0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
+    ux = np.float64(lookup[j, i + 1, 0] - lookup[j, i, 0]) * lookup_frame[2]
+    vx = np.float64(lookup[j, i + 1, 1] - lookup[j, i, 1]) * lookup_frame[2]
+    uy = np.float64(lookup[j + 1, i, 0] - lookup[j, i, 0]) * lookup_frame[3]
+    vy = np.float64(lookup[j + 1, i, 1] - lookup[j, i, 1]) * lookup_frame[3]
+    if max(abs(ux), abs(vx), abs(uy), abs(vy)) > 1e5:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False  # a node that the camera does not see
+    return u - (ux * x + uy * y) / z, v - (vx * x + vy * y) / z, ux, uy, vx, vy, True
+
+
+@kernel
+def integrate(
+    keys: Int64,
+    voxel_m: float,
+    T_camera_world: Float64,
+    pixels: Float32,
+    light: Float32,
+    lookup: Float32,
+    lookup_frame: Float64,
+    cells: Float32,
+    reach: float,
+    distance: Float32,
+    weight: Float32,
+    seen: UInt16,
+    color: Float32,
+    free: Float32,
+    start: int,
+    stop: int,
+) -> None:
+    """Add a view to blocks start..stop.
+
+    Voxel (i, j, k) of a block lies at its corner plus (i, j, k) `voxel_m`. Its distance is that to
+    the plane of the pixel that it lands on, cut at `reach`; behind `reach` nothing is known.
+
+    Parameters
+    ----------
+    pixels, cells, light
+        Of `unpack_view` and `ray_cells`; light (H, W, C), C may be 0.
+    distance, weight
+        (B, VOXELS) mean distance in m, and the sum of the weights.
+    seen
+        (B, VOXELS) how many views saw a surface within `reach`.
+    color
+        (B, VOXELS, C) mean light of those views.
+    free
+        (B,) weight of the views that saw through the whole block, not yet in `distance`.
+    """
+    T = T_camera_world
+    rows, columns = pixels.shape[:2]
+    channels = light.shape[2]
+    middle = 0.5 * (EDGE - 1) * voxel_m
+    radius = np.sqrt(3.0) * middle
+    # A block is cut in eight where it can't be told as a whole.
+    small = np.sqrt(3.0) * 1.5 * voxel_m
+    for b in range(start, stop):
+        bi, bj, bk = block_of(keys[b])
+        ox = bi * EDGE * voxel_m
+        oy = bj * EDGE * voxel_m
+        oz = bk * EDGE * voxel_m
+        z = T[2, 0] * (ox + middle) + T[2, 1] * (oy + middle) + T[2, 2] * (oz + middle) + T[2, 3]
+        if z + radius <= 1e-3:
+            continue
+        x = T[0, 0] * (ox + middle) + T[0, 1] * (oy + middle) + T[0, 2] * (oz + middle) + T[0, 3]
+        y = T[1, 0] * (ox + middle) + T[1, 1] * (oy + middle) + T[1, 2] * (oz + middle) + T[1, 3]
+        low, high, least = _bounds(x, y, z, radius, cells, lookup_frame)
+        if z - radius > high:
+            continue
+        if least > 0 and z + radius < low:
+            free[b] += least
+            continue
+        for part in range(8):
+            i0 = 4 * (part >> 2)
+            j0 = 4 * ((part >> 1) & 1)
+            k0 = 4 * (part & 1)
+            px = ox + (i0 + 1.5) * voxel_m
+            py = oy + (j0 + 1.5) * voxel_m
+            pz = oz + (k0 + 1.5) * voxel_m
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if z + small <= 1e-3:
+                continue
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            low, high, least = _bounds(x, y, z, small, cells, lookup_frame)
+            if z - small > high:
+                continue
+            all_free = least > 0 and z + small < low
+            uc, wc, ux, uy, wx, wy, local = _linear(x, y, z, small, lookup, lookup_frame)
+            for row in range(16):
+                i = i0 + (row >> 2)
+                j = j0 + (row & 3)
+                px = ox + i * voxel_m
+                py = oy + j * voxel_m
+                pz = oz + k0 * voxel_m
+                x0 = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+                y0 = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+                z0 = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+                first = (i << 6) | (j << 3) | k0
+                for k in range(4):
+                    v = first + k
+                    z = z0 + k * T[2, 2] * voxel_m
+                    if all_free:
+                        total = weight[b, v] + least
+                        distance[b, v] += (reach - distance[b, v]) * least / total
+                        weight[b, v] = total
+                        continue
+                    if z < 1e-3 or z > high:
+                        continue
+                    x = x0 + k * T[0, 2] * voxel_m
+                    y = y0 + k * T[1, 2] * voxel_m
+                    x /= z
+                    y /= z
+                    if local:
+                        u = uc + ux * x + uy * y
+                        w = wc + wx * x + wy * y
+                    else:
+                        u, w, node, _ = landing(x, y, lookup, lookup_frame)
+                        if node < 0:
+                            continue
+                    if not (u > -0.5 and w > -0.5):
+                        continue
+                    c = int(u + 0.5)
+                    r = int(w + 0.5)
+                    if r >= rows or c >= columns or not pixels[r, c, 4] > 0:
+                        continue
+                    d = pixels[r, c, 3] - z * (
+                        pixels[r, c, 0] * x + pixels[r, c, 1] * y + pixels[r, c, 2]
+                    )
+                    if d < -reach:
+                        continue
+                    if d < reach:
+                        if seen[b, v] < 65535:
+                            seen[b, v] += 1
+                        for q in range(channels):
+                            color[b, v, q] += (light[r, c, q] - color[b, v, q]) / seen[b, v]
+                    else:
+                        d = reach
+                    total = weight[b, v] + pixels[r, c, 4]
+                    distance[b, v] += (d - distance[b, v]) * pixels[r, c, 4] / total
+                    weight[b, v] = total
+
+
+@kernel
+def settle_free(
+    distance: Float32, weight: Float32, free: Float32, reach: float, start: int, stop: int
+) -> None:
+    """Put the weight of views that saw through whole blocks into their voxels."""
+    for b in range(start, stop):
+        if free[b] > 0:
+            for v in range(VOXELS):
+                total = weight[b, v] + free[b]
+                distance[b, v] += (reach - distance[b, v]) * free[b] / total
+                weight[b, v] = total
+            free[b] = 0

@@ -1,0 +1,93 @@
+"""glTF binary: read back by a parser that shares nothing with the writer."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.files.glb import write_glb
+
+SIZES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def parse(path):
+    """Header, chunks and accessors by the words of the specification."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    at, chunks = 12, []
+    while at < length:
+        size, kind = struct.unpack_from("<I4s", data, at)
+        assert size % 4 == 0
+        chunks.append((kind, data[at + 8 : at + 8 + size]))
+        at += 8 + size
+    assert at == length
+    assert [kind for kind, _ in chunks] in ([b"JSON"], [b"JSON", b"BIN\0"])
+    document = json.loads(chunks[0][1])
+    arrays = []
+    for accessor in document.get("accessors", []):
+        view = document["bufferViews"][accessor["bufferView"]]
+        dtype = np.dtype(SIZES[accessor["componentType"]])
+        width = WIDTHS[accessor["type"]]
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
+        assert view["byteOffset"] + view["byteLength"] <= document["buffers"][0]["byteLength"]
+        body = chunks[1][1]
+        values = np.frombuffer(body, dtype, accessor["count"] * width, view["byteOffset"])
+        arrays.append(values.reshape(-1, width))
+    return document, arrays
+
+
+def test_a_mesh_comes_back(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(7, 3)).astype(np.float32)
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    color = np.array([[0, 127, 255]] * 7, np.uint8)
+    faces = np.array([[0, 1, 2], [2, 3, 6], [4, 5, 0]])
+    path = tmp_path / "m.glb"
+    write_glb(path, points, faces, normals=normals, color=color)
+    document, arrays = parse(path)
+    assert document["asset"]["version"] == "2.0"
+    node = document["nodes"][document["scenes"][document["scene"]]["nodes"][0]]
+    primitive = document["meshes"][node["mesh"]]["primitives"][0]
+    assert primitive["mode"] == 4
+    where = primitive["attributes"]
+    np.testing.assert_array_equal(arrays[where["POSITION"]], points)
+    np.testing.assert_allclose(arrays[where["NORMAL"]], normals, atol=1e-7)
+    np.testing.assert_array_equal(arrays[primitive["indices"]].reshape(-1, 3), faces)
+    accessor = document["accessors"][where["POSITION"]]
+    np.testing.assert_array_equal(np.float32(accessor["min"]), points.min(0))
+    np.testing.assert_array_equal(np.float32(accessor["max"]), points.max(0))
+    # The standard's colours are linear: half of the way on a screen is a fifth of the light.
+    light = arrays[where["COLOR_0"]][0] / 65535
+    np.testing.assert_allclose(light, [0, 0.2122, 1, 1], atol=1e-3)
+    assert document["accessors"][where["COLOR_0"]]["normalized"] is True
+    assert primitive["material"] == 0
+
+
+def test_a_mesh_without_faces_is_an_empty_scene(tmp_path) -> None:
+    path = tmp_path / "m.glb"
+    write_glb(path, np.zeros((0, 3)), np.zeros((0, 3), int))
+    document, arrays = parse(path)
+    assert arrays == []
+    # Empty lists are not allowed.
+    assert all(value != [] for value in document.values())
+    assert document["scenes"] == [{}]
+
+
+def test_what_does_not_fit_is_refused(tmp_path) -> None:
+    points, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
+    for problem in (
+        {"points": points, "faces": faces + 1},
+        {"points": points, "faces": faces[0]},
+        {"points": points[:, :2], "faces": faces},
+        {"points": points, "faces": faces, "normals": np.zeros((2, 3))},
+    ):
+        with pytest.raises(InputError, match=r"m\.glb"):
+            write_glb(tmp_path / "m.glb", **problem)
+    assert not (tmp_path / "m.glb").exists()

@@ -1,0 +1,445 @@
+"""The surface of range images: where it is, that it closes, what it leaves out, and its bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.fusion.model import ModelBuilder
+from tofuse.fusion.options import Fusion
+from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
+from tofuse.fusion.upright import upright
+from tofuse.fusion.views import RangeView, without_camera_errors
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import BrownConrady, Pinhole, ray_lengths
+from tofuse.kernels.threads import threads
+from tofuse.kernels.tsdf import block_of
+from tofuse.posegraph.refinement import without_errors
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+
+EYE = np.eye(4)
+CAMERA = BrownConrady(88, 72, 90.0, 90.0, 43.0, 36.0, -0.2, 0.05)
+
+
+def look(position, target, camera=CAMERA):
+    """Pose (4, 4) of a camera at `position` that looks at `target`, image rows along y."""
+    z = np.asarray(target, float) - position
+    z /= np.linalg.norm(z)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    T[:3, 3] = position
+    return T
+
+
+def sphere_range(T, centre, radius, camera=CAMERA):
+    """(H, W) range of rays to a sphere, infinite where they miss it."""
+    rays = camera.rays().astype(float)
+    d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T[:3, :3].T
+    o = T[:3, 3] - centre
+    b = d @ o
+    under = b * b - (o @ o - radius**2)
+    t = -b - np.sqrt(np.maximum(under, 0))
+    return np.where((under > 0) & (t > 0), t, np.inf)
+
+
+def plane_range(T, normal, height, camera=CAMERA):
+    """(H, W) range of rays to the plane normal . p = height."""
+    rays = camera.rays().astype(float)
+    d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T[:3, :3].T
+    with np.errstate(divide="ignore"):
+        t = (height - T[:3, 3] @ normal) / (d @ normal)
+    return np.where(t > 0, t, np.inf)
+
+
+def frame_of(ranges, index=0, sigma=0.005, noise=None, camera=CAMERA, **images):
+    depth = np.where(np.isfinite(ranges), ranges, 0).astype(np.float32)
+    if noise is not None:
+        depth = np.where(depth > 0, depth + noise.normal(0, sigma, depth.shape), 0)
+    images = {
+        "sigma_image": np.full(depth.shape, sigma, np.float32),
+        "amplitude_image": (1000 / np.maximum(depth, 0.1) ** 2).astype(np.float32),
+    } | images
+    return RangeFrame(index, float(index), camera, depth.astype(np.float32), "range", **images)
+
+
+def around_a_ball(count=14, noise=None):
+    """Views (frames, poses) of a ball of radius 0.3 at the origin, from all around."""
+    frames, poses = [], []
+    for k in range(count):
+        # A spiral from pole to pole.
+        y = 1 - 2 * (k + 0.5) / count
+        a = 2.4 * k
+        position = 1.1 * np.array(
+            [np.sqrt(1 - y * y) * np.cos(a), y, np.sqrt(1 - y * y) * np.sin(a)]
+        )
+        T = look(position, np.zeros(3))
+        frames.append(frame_of(sphere_range(T, np.zeros(3), 0.3), k, noise=noise))
+        poses.append(T)
+    return frames, np.array(poses)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    frames, poses = around_a_ball(noise=np.random.default_rng(1))
+    views = [RangeView.of(f) for f in frames]
+    return views, poses, fuse_surface(views, poses, Fusion(voxel_m=0.012))
+
+
+def edges_of(faces):
+    """Directed edges (3 M, 2) of triangles."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def test_the_zero_of_exact_distances_is_closed_across_blocks() -> None:
+    frames, poses = around_a_ball()
+    volume = Volume.around([RangeView.of(f) for f in frames], poses, 0.012, Fusion())
+    r = np.linalg.norm(voxels_of(volume), axis=-1)
+    volume.distance[:] = r - 0.3
+    volume.weight[:] = 4
+    volume.seen[:] = 1
+    mesh = volume.surface()
+    edges = edges_of(mesh.faces)
+    there, count = np.unique(edges, axis=0, return_counts=True)
+    assert (count == 1).all()  # a directed edge is of one face: all turn the same way
+    np.testing.assert_array_equal(there, np.unique(edges[:, ::-1], axis=0))  # no border
+    # Euler: V - E + F = 2 for a ball.
+    assert len(mesh) - len(edges) // 2 + len(mesh.faces) == 2
+    assert len(mesh) > 5000
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.3, atol=2e-4)
+    np.testing.assert_allclose(mesh.normals, mesh.vertices / 0.3, atol=0.02)
+    np.testing.assert_allclose(mesh.sigma, 0.5)
+
+
+def test_noise_never_opens_the_surface(ball) -> None:
+    edges = edges_of(ball[2].faces)
+    there, count = np.unique(edges, axis=0, return_counts=True)
+    back, count_back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
+    np.testing.assert_array_equal(there, back)
+    np.testing.assert_array_equal(count, count_back)
+    assert (count > 1).mean() < 0.001  # where it touches itself
+
+
+def test_a_noisy_ball_has_its_radius_and_normals_outwards(ball) -> None:
+    _, _, mesh = ball
+    p = mesh.vertices.astype(float)
+    r = np.linalg.norm(p, axis=1)
+    assert np.abs(r - 0.3).mean() < 0.002  # noise of 5 mm in each image
+    assert np.percentile(np.abs(r - 0.3), 99) < 0.006
+    outwards = p / r[:, None]
+    assert ((mesh.normals * outwards).sum(1) > np.cos(np.radians(25))).mean() > 0.98
+    a, b, c = (p[mesh.faces[:, k]] for k in range(3))
+    face_normals = np.cross(b - a, c - a)
+    assert ((face_normals * a).sum(1) > 0).mean() > 0.999
+    area = np.linalg.norm(face_normals, axis=1).sum() / 2
+    assert area == pytest.approx(4 * np.pi * 0.09, rel=0.03)
+    assert mesh.views.max() > 2
+    assert 0.0005 < np.median(mesh.sigma) < 0.005
+
+
+def test_threads_change_no_byte(ball) -> None:
+    views, poses, mesh = ball
+    for count in (1, 3):
+        with threads(count):
+            again = fuse_surface(views, poses, Fusion(voxel_m=0.012))
+        for name in ("vertices", "faces", "normals", "color", "sigma", "views"):
+            assert getattr(again, name).tobytes() == getattr(mesh, name).tobytes(), name
+
+
+def voxels_of(volume):
+    """(B, 512, 3) where the voxels are, in m."""
+    ijk = np.array([block_of(int(key)) for key in volume.keys])
+    v = np.arange(512)
+    inside = np.stack([v >> 6, (v >> 3) & 7, v & 7], -1)
+    return (8 * ijk[:, None] + inside[None]) * volume.voxel_m
+
+
+def slow_distances(volume, views, poses):
+    """Sums over all views for every voxel, by the camera's own projection."""
+    world = voxels_of(volume)
+    top, weight, seen = (np.zeros(world.shape[:2]) for _ in range(3))
+    margin = np.full(world.shape[:2], np.inf)
+    for view, T in zip(views, poses, strict=True):
+        p = se3.transform(se3.inverse(T), world.reshape(-1, 3)).reshape(world.shape)
+        uv = CAMERA.project(p)
+        good = (p[..., 2] > 1e-3) & np.isfinite(uv).all(-1)
+        u = np.where(good, uv[..., 0], 0)
+        w = np.where(good, uv[..., 1], 0)
+        # Voxels that land between two pixels may go to either.
+        for x in (u, w):
+            margin = np.minimum(margin, np.where(good, 0.5 - np.abs(x - np.round(x)), np.inf))
+        c, r = np.round(u).astype(int), np.round(w).astype(int)
+        good &= (c >= 0) & (r >= 0) & (c < 88) & (r < 72)
+        pixel = view.pixels().astype(float)[np.where(good, r, 0), np.where(good, c, 0)]
+        d = pixel[..., 3] - (pixel[..., :3] * p).sum(-1)
+        good &= (pixel[..., 4] > 0) & (d >= -volume.reach_m)
+        wt = np.where(good, pixel[..., 4], 0)
+        top += wt * np.minimum(d, volume.reach_m)
+        weight += wt
+        seen += good & (d < volume.reach_m)
+    return np.divide(top, weight, out=np.zeros_like(top), where=weight > 0), weight, seen, margin
+
+
+def test_distances_are_those_of_a_slow_sum_over_all_views() -> None:
+    # A ball before a wall, gone after two views: it is seen through, hides, and makes jumps.
+    rng = np.random.default_rng(2)
+    poses = np.array([look([x, 0.1 * x, 0], [0.2 * x, 0, 2]) for x in np.linspace(-1.2, 1.2, 5)])
+    views = []
+    for k, T in enumerate(poses):
+        wall = plane_range(T, np.array([0, 0, 1.0]), 2.0)
+        ball = sphere_range(T, np.array([0, 0, 1.2]), 0.3 if k < 2 else 0.0)
+        views.append(RangeView.of(frame_of(np.minimum(wall, ball), noise=rng)))
+    volume = Volume.around(views, poses, 0.01, Fusion())
+    for view, T in zip(views, poses, strict=True):
+        volume.add(view, T)
+    assert (volume.free > 0).sum() > 10
+    volume.surface()  # settles what was seen through
+    distance, weight, seen, margin = slow_distances(volume, views, poses)
+    near = (seen > 0) & (margin > 0.05)
+    assert near.sum() > 10_000
+    assert (volume.seen[near] != seen[near]).mean() < 1e-3  # at the cut, by rounding
+    # Blocks that were seen through count the least weight of what lies behind them.
+    assert (volume.weight[near] <= weight[near] * (1 + 1e-5)).all()
+    exact = near & np.isclose(volume.weight, weight, rtol=1e-4) & (volume.seen == seen)
+    assert exact.sum() > 0.6 * near.sum()
+    np.testing.assert_allclose(volume.distance[exact], distance[exact], atol=2e-5)
+    # That changes few distances.
+    assert np.abs(volume.distance - distance)[near].mean() < 0.01 * volume.reach_m
+
+
+def test_blocks_lie_near_surfaces_only_and_don_t_grow_with_views(ball) -> None:
+    views, poses, _ = ball
+    once = Volume.around(views, poses, 0.012, Fusion())
+    twice = Volume.around([*views, *views], np.concatenate([poses, poses]), 0.012, Fusion())
+    np.testing.assert_array_equal(once.keys, twice.keys)
+    assert (np.diff(once.keys) > 0).all()
+    corners = np.array([[(k >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)] for k in once.keys])
+    centre = (corners + 0.5) * 8 * 0.012
+    off = np.abs(np.linalg.norm(centre, axis=1) - 0.3)
+    assert off.max() < once.reach_m + 0.02 + np.sqrt(3) * 4 * 0.012
+
+
+def test_too_many_voxels_are_made_larger() -> None:
+    frames, poses = around_a_ball(4)
+    views = [RangeView.of(f) for f in frames]
+    fine = Volume.around(views, poses, 0.003, Fusion())
+    small = Volume.around(views, poses, 0.003, Fusion(memory_mb=3))
+    assert fine.voxel_m == 0.003
+    assert small.voxel_m > 0.004
+    assert small.distance.nbytes * 14 / 4 <= 3e6
+
+
+def test_free_space_carves_away_what_one_view_made_up() -> None:
+    wall = [plane_range(look([x, 0, 0], [x, 0, 2]), np.array([0, 0, 1.0]), 2.0) for x in (0, 0.1)]
+    poses = np.array([look([x, 0, 0], [x, 0, 2]) for x in (0, 0.1)] * 4)
+    frames = [frame_of(wall[k % 2], k) for k in range(8)]
+    ghost = wall[0].copy()
+    ghost[26:48, 30:56] = 1.4  # large enough to be no island
+    views = [RangeView.of(f) for f in frames]
+    options = Fusion(voxel_m=0.02, island=10)
+    alone = fuse_surface([RangeView.of(frame_of(ghost, 0))], poses[:1], options)
+    assert (np.abs(alone.vertices[:, 2] - 1.4) < 0.05).sum() > 50
+    views[0] = RangeView.of(frame_of(ghost, 0))
+    mesh = fuse_surface(views, poses, options)
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.02
+    assert len(mesh) > 1000
+
+
+def test_pixels_next_to_a_jump_make_no_surface() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[:, 40:] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, 40:]
+    ranges[:, 40] = 1.5  # mixes both
+    view = RangeView.of(frame_of(ranges))
+    assert (view.strength[10:60, 38:43] == 0).all()
+    assert (view.strength[10:60, 10:36] > 0).all()
+    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03, island=0))
+    z = mesh.vertices[:, 2]
+    assert (np.minimum(np.abs(z - 1), np.abs(z - 2)) < 0.01).all()
+
+
+def test_weights_follow_noise_and_incidence() -> None:
+    straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    slanted = plane_range(EYE, np.array([np.sin(1.0), 0, np.cos(1.0)]), 1.5)
+    quiet, loud = (RangeView.of(frame_of(straight, sigma=s)) for s in (0.005, 0.02))
+    centre = (36, 43)
+    ratio = quiet.pixels()[centre][4] / loud.pixels()[centre][4]
+    assert ratio == pytest.approx(16, rel=0.15)
+    tilted = RangeView.of(frame_of(slanted, sigma=0.005))
+    cut = tilted.pixels()[centre][4] / quiet.pixels()[centre][4]
+    assert cut == pytest.approx(np.cos(1.0) ** 2, rel=0.15)
+    np.testing.assert_allclose(
+        tilted.pixels()[centre][:3], [np.sin(1.0), 0, np.cos(1.0)], atol=0.02
+    )
+
+
+def test_islands_go_and_large_pieces_stay() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[28:40, 28:40] = 1.0 * ray_lengths(CAMERA)[28:40, 28:40]
+    view = RangeView.of(frame_of(ranges))
+    both = fuse_surface([view], EYE[None], Fusion(voxel_m=0.02, island=0))
+    assert (both.vertices[:, 2] < 1.2).any()
+    large = fuse_surface([view], EYE[None], Fusion(voxel_m=0.02, island=200))
+    assert (large.vertices[:, 2] > 1.9).all()
+    assert len(large) > 1000
+    assert large.faces.max() == len(large) - 1
+
+
+def test_colour_is_the_mean_of_what_the_views_saw() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    red = np.zeros((72, 88, 3), np.uint8)
+    red[..., 0] = 200
+    blue = red[..., ::-1].copy()
+    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate((red, blue))]
+    mesh = fuse_surface(views, np.stack([EYE, EYE]), Fusion(voxel_m=0.03))
+    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[100, 0, 100]])
+    assert (mesh.views == 2).all()
+
+
+def test_albedo_is_grey_and_does_not_fall_with_range() -> None:
+    # Two walls of one albedo, at 1 m and 2 m, and a dark patch.
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ranges[:, :40] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, :40]
+    albedo = np.full((72, 88), 4000.0)
+    albedo[50:, 60:] = 500
+    view = RangeView.of(frame_of(ranges, amplitude_image=(albedo / ranges**2).astype(np.float32)))
+    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03))
+    near, far = mesh.vertices[:, 2] < 1.5, mesh.vertices[:, 2] > 1.5
+    assert np.median(mesh.color[near]) == np.median(mesh.color[far])
+    assert mesh.color.min() < 60
+
+
+def test_min_views_leaves_out_what_few_saw() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    side = se3.exp(np.array([0.8, 0, 0, 0, 0, 0]))
+    views = [RangeView.of(frame_of(ranges, k)) for k in range(2)]
+    poses = np.stack([EYE, side])
+    either = fuse_surface(views, poses, Fusion(voxel_m=0.03))
+    both = fuse_surface(views, poses, Fusion(voxel_m=0.03, min_views=2))
+    assert np.ptp(either.vertices[:, 0]) > np.ptp(both.vertices[:, 0]) + 1.0
+    assert (both.views == 2).all()
+
+
+def test_a_voxel_fits_the_sensor() -> None:
+    camera = Pinhole(100, 80, 200.0, 200.0, 50.0, 40.0)
+
+    def views(z):
+        depth = np.full((80, 100), z, np.float32)
+        return [RangeView.of(RangeFrame(0, 0.0, camera, depth))]
+
+    assert fitting_voxel(views(2.0)) == pytest.approx(0.01, rel=0.02)  # 2 m / 200
+    assert fitting_voxel(views(0.02)) == 0.002
+    assert fitting_voxel(views(200.0)) == 0.1
+    assert fitting_voxel([]) > 0
+
+
+def test_large_images_are_kept_at_half_their_size() -> None:
+    camera = Pinhole(640, 480, 580.0, 580.0, 320.0, 240.0)
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[200:, 300:] = 0
+    color = np.zeros((480, 640, 3), np.uint8)
+    color[:, :320] = 90
+    view = RangeView.of(RangeFrame(0, 0.0, camera, depth, color_image=color))
+    assert view.z.shape == (240, 320)
+    assert view.nbytes <= 10 * 240 * 320
+    assert view.light[100, 100].tolist() == [90, 90, 90]
+    assert (view.z[100:, 150:] == 0).all()
+    mesh = fuse_surface([view], EYE[None])
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002
+
+
+def test_views_that_show_nothing_make_an_empty_mesh() -> None:
+    empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
+    mesh = fuse_surface([empty], EYE[None])
+    assert (len(mesh), len(mesh.faces)) == (0, 0)
+    assert mesh.cloud().points.shape == (0, 3)
+
+
+def test_a_builder_keeps_so_much_memory_evenly() -> None:
+    frame = frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0))
+    size = RangeView.of(frame).nbytes
+    builder = ModelBuilder(Fusion(memory_mb=1))
+    for k in range(200):
+        builder.add(replace(frame, index=k), None, 1000)
+    most = 1_000_000 // size
+    assert most / 2 <= builder.views <= most
+    advanced = []
+    model = builder.fuse(dict.fromkeys(range(200), EYE), lambda: advanced.append(1))
+    assert len(advanced) == builder.views
+    steps = np.diff([view.index for view in builder._ranges])
+    assert (steps == steps[0]).all()
+    assert model.mesh.views.max() == builder.views
+
+
+def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
+    rng = np.random.default_rng(5)
+    frame = frame_of(rng.uniform(1, 3, (72, 88)))
+    errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
+    view = RangeView.of(frame)
+    found = without_camera_errors([view, view], errors)
+    expected = without_errors(view.as_cloud().points, errors)
+    np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
+    assert found[0].projection is found[1].projection
+    # Points still land on the pixels that measured them.
+    p = found[0].projection
+    x, y = p.rays[20, 30]
+    node = (x - p.frame[0]) * p.frame[2], (y - p.frame[1]) * p.frame[3]
+    i, j = (int(n) for n in node)
+    a, b = node[0] - i, node[1] - j
+    corners = p.lookup[j : j + 2, i : i + 2].astype(float)
+    landed = np.einsum("j,i,jik->k", [1 - b, b], [1 - a, a], corners)
+    np.testing.assert_allclose(landed, [30, 20], atol=0.1)
+    builder = ModelBuilder(Fusion())
+    builder.add(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)), None, 1000)
+    z = builder.fuse({0: EYE}, errors={"scale": 0.05}).mesh.vertices[:, 2]
+    np.testing.assert_allclose(z, 2.1, atol=0.003)
+
+
+def test_clouds_have_no_surface_and_hopeless_images_still_a_cloud() -> None:
+    rng = np.random.default_rng(4)
+    builder = ModelBuilder(Fusion())
+    builder.add(CloudFrame.of(rng.normal(size=(500, 3))), None, 1000)
+    model = builder.fuse({0: EYE})
+    assert model.mesh is None
+    assert len(model.cloud) > 400
+    # A single valid pixel makes no surface.
+    ranges = np.full((72, 88), np.inf)
+    ranges[36, 43] = 1.0
+    builder = ModelBuilder(Fusion())
+    builder.add(frame_of(ranges), None, 1000)
+    model = builder.fuse({0: EYE})
+    assert len(model.mesh) == 0
+    assert len(model.cloud) == 1
+
+
+def test_simplifying_keeps_the_shape_with_fewer_faces(ball) -> None:
+    _, _, mesh = ball
+    small = mesh.simplified(0.036)
+    assert len(small.faces) < len(mesh.faces) / 5
+    r = np.linalg.norm(small.vertices, axis=1)
+    assert np.abs(r - 0.3).mean() < 0.004
+    a, b, c = (small.vertices[small.faces[:, k]] for k in range(3))
+    assert (np.einsum("ni,ni->n", np.cross(b - a, c - a), a) > 0).mean() > 0.99
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_up_is_the_floor_s_normal_or_the_cameras(tilt) -> None:
+    # The camera looks down by `tilt`, at a floor 1 m below and a wall 3 m ahead.
+    T = se3.exp(np.array([0, 0, 0, -tilt, 0, 0]))
+    floor = plane_range(T, np.array([0, 1.0, 0]), 1.0)
+    wall = plane_range(T, np.array([0, 0, 1.0]), 3.0)
+    view = RangeView.of(frame_of(np.minimum(floor, wall)))
+    # In the world, which is the first camera.
+    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03))
+    R = upright(mesh, EYE[None])
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    down = T[:3, :3].T @ [0, 1.0, 0]
+    if (np.minimum(floor, wall) == floor).mean() > 0.15:
+        np.testing.assert_allclose(R @ down, [0, -1, 0], atol=0.03)
+    wall_only = fuse_surface([RangeView.of(frame_of(wall))], EYE[None], Fusion(voxel_m=0.03))
+    np.testing.assert_allclose(upright(wall_only, EYE[None]), np.diag([1, -1, -1]), atol=1e-12)
