@@ -30,7 +30,7 @@ from tofuse.results.verdict import REASONS
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate
 
-SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply")
+SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "run.json"}
 
 
@@ -293,6 +293,9 @@ def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
     assert data["verdict"] == "good"
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
     assert len(read_ply(tmp_path / "out/cloud.ply")) > 1000
+    mesh = read_ply(tmp_path / "out/mesh.ply")
+    assert mesh.faces is not None
+    assert len(mesh.faces) > 1000
 
 
 def test_selection(room_recording, tmp_path) -> None:

@@ -31,8 +31,7 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 _CHUNKS = 16
-# A view says nothing of a surface within a voxel of what it can't place: the distances it gives
-# would be cut off on one side more than on the other.
+# Nearer cuts would take off more of the noise on one side of a surface than on the other.
 _REACH_SIGMAS = 3.0
 _LARGEST_REACH = 8.0  # voxels: the noise of a bad sensor is no reason to fill space
 # How much larger voxels get when there are too many.
@@ -149,7 +148,10 @@ class Volume:
         )
 
     def surface(self, min_views: int = 1) -> Mesh:
-        """Return where the distances change sign, between voxels that views saw."""
+        """Return where the distances change sign, between voxels that views saw.
+
+        What is not known to the edge of a voxel is left out: there noise makes the surface.
+        """
         blocks = len(self.keys)
         run_chunks(
             lambda a, b: settle_free(self.distance, self.weight, self.free, self.reach_m, a, b),
@@ -166,7 +168,7 @@ class Volume:
                 self.distance,
                 self.weight,
                 self.seen,
-                0.0,
+                1 / self.voxel_m**2,
                 min_views,
                 cells,
                 counts,

@@ -85,7 +85,8 @@ class RangeView:
             surface = surface_map(frame, options)
         shape = surface.z.shape
         valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
-        z = np.where(valid, _smoothed(surface), np.float32(0))
+        smoothed, variance = _smoothed(surface)
+        z = np.where(valid, smoothed, np.float32(0))
         rays = surface.rays
         lengths = np.sqrt(surface.projection.lengths2)
         normals = surface.normals
@@ -96,9 +97,7 @@ class RangeView:
         normals = np.where(fitted[..., None], normals, straight)
         good = (z > 0) & (surface.sigma > 0) & (cosine > _LEAST_COSINE)
         good &= ~_near_jumps(surface, options)
-        weight = np.square(
-            np.divide(cosine, surface.sigma, out=np.zeros_like(z), where=good), dtype=np.float32
-        )
+        weight = np.divide(cosine * cosine, variance, out=np.zeros_like(z), where=good)
         weight[~fitted] *= np.float32(_UNFITTED)
         farthest = float(z.max(initial=0.0))
         unit = max(farthest, 1e-3) / 65535
@@ -169,13 +168,24 @@ class RangeView:
         return CloudFrame(self.index, self.timestamp, points, color=color, amplitude=amplitude)
 
 
-def _smoothed(surface: SurfaceMap) -> Float32:
-    """Depth (H, W) in m: the plane's, and of the rest what exceeds the noise (Wiener's gain)."""
+def _smoothed(surface: SurfaceMap) -> tuple[Float32, Float32]:
+    """Depth (H, W) in m and its variance in m^2.
+
+    It is that of the plane around the pixel, and of the rest what exceeds the noise (Wiener's
+    gain).
+    """
     z, on_plane = surface.z, surface.planes[..., 3]
-    plane = np.divide(1, on_plane, out=z.copy(), where=on_plane > 0)
+    fitted = on_plane > 0
+    plane = np.divide(1, on_plane, out=z.copy(), where=fitted)
+    noise = np.square(surface.sigma)
     detail = np.square(np.float32(_DETAIL) * z)
-    gain = detail / np.maximum(detail + np.square(surface.sigma), np.float32(1e-12))
-    return np.asarray(plane + gain * (z - plane), np.float32)
+    gain = np.where(fitted, detail / np.maximum(detail + noise, np.float32(1e-12)), np.float32(1))
+    # d z = z^2 d(1/z)
+    of_plane = np.where(fitted, surface.plane_variance * np.square(plane * plane), np.float32(0))
+    variance = np.square(gain) * noise + np.square(1 - gain) * of_plane
+    # What is left of the relief is not known either.
+    variance += np.square(1 - gain) * np.minimum(detail, noise)
+    return np.asarray(plane + gain * (z - plane), np.float32), np.asarray(variance, np.float32)
 
 
 def _near_jumps(surface: SurfaceMap, options: SurfaceOptions) -> NDArray[np.bool_]:

@@ -1,0 +1,205 @@
+"""How near a model is to a reference: accuracy, completeness, F-score (Knapitsch et al. 2017)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError
+from tofuse.kernels.kdtree import KdTree
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_SAMPLED = 400_000  # points of a mesh
+_TRIED = 4  # samples of a mesh near a point whose triangles are tried
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A cloud, or with `faces` a mesh: what models are compared as.
+
+    Attributes
+    ----------
+    points
+        (N, 3) in m.
+    faces
+        (M, 3) rows of points, or None.
+    """
+
+    points: Float64
+    faces: NDArray[np.integer] | None = None
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, float)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise InputError(
+                f"has shape {points.shape}, or numbers that are not finite",
+                where="points of a model",
+                remedy="give (N, 3) finite numbers in metres",
+            )
+        object.__setattr__(self, "points", points)
+
+    @property
+    def area(self) -> float:
+        """Of all faces, m^2; 0 of a cloud."""
+        if self.faces is None:
+            return 0.0
+        return float(_areas(self.points[self.faces]).sum())
+
+    def samples(self, count: int, seed: int = 0) -> tuple[Float64, Int64]:
+        """Return points spread evenly over the faces, and the face of each; a cloud's own, and -1.
+
+        Of a cloud with more than `count` points some are taken, at random.
+        """
+        if self.faces is None or len(self.faces) == 0:
+            points = self.points
+            if len(points) > count:
+                rng = np.random.default_rng([seed, len(points)])
+                points = points[np.sort(rng.permutation(len(points))[:count])]
+            return points, np.full(len(points), -1)
+        corners = self.points[self.faces]
+        share = np.cumsum(_areas(corners))
+        if not share[-1] > 0:
+            return self.points, np.full(len(self.points), -1)
+        rng = np.random.default_rng([seed, len(corners)])
+        # One in each of as many equal parts of the area: even, not just random.
+        at = (np.arange(count) + rng.random(count)) / count * share[-1]
+        face = np.minimum(np.searchsorted(share, at, side="right"), len(corners) - 1)
+        u, v = rng.random((2, count, 1))
+        flip = u + v > 1
+        u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+        a, b, c = (corners[face, k] for k in range(3))
+        return a + u * (b - a) + v * (c - a), face
+
+
+@dataclass(frozen=True)
+class SurfaceErrors:
+    """Distances in m between a model and a reference.
+
+    Attributes
+    ----------
+    accuracy_m, accuracy_median_m, accuracy_p95_m
+        Mean, median and 95th percentile of the distance from the model to the reference; from its
+        points, or evenly over its faces.
+    completeness_m
+        Mean distance from the reference to the model.
+    precision, recall, fscore
+        Share of the model within `threshold_m` of the reference, of the reference within
+        `threshold_m` of the model (its completeness), and their harmonic mean.
+    outliers
+        Share of the model farther than `outlier_m` from the reference.
+    threshold_m, outlier_m
+        As given.
+    """
+
+    accuracy_m: float
+    accuracy_median_m: float
+    accuracy_p95_m: float
+    completeness_m: float
+    precision: float
+    recall: float
+    fscore: float
+    outliers: float
+    threshold_m: float
+    outlier_m: float
+
+
+def compare_surfaces(
+    model: Shape,
+    reference: Shape,
+    *,
+    threshold_m: float = 0.01,
+    outlier_m: float = 0.05,
+    seen: ArrayLike | None = None,
+    samples: int = _SAMPLED,
+) -> SurfaceErrors:
+    """Compare a model with a reference in the same frame.
+
+    Parameters
+    ----------
+    model, reference
+        Meshes or clouds. Distances to a mesh are those to its triangles.
+    threshold_m, outlier_m
+        What counts as near, and as far off.
+    seen
+        (K, 3) points of the reference that could be seen: only they have to be in the model. All
+        of the reference unless given.
+    samples
+        How many points stand for a mesh.
+
+    Raises
+    ------
+    InputError
+        If one of them is empty.
+    """
+    for name, shape in (("model", model), ("reference", reference)):
+        if len(shape.points) == 0:
+            raise InputError("is empty", where=name, remedy="give a model with points")
+    points, _ = model.samples(samples, seed=1)
+    off = distances(points, reference, samples)
+    wanted = reference.samples(samples, seed=2)[0] if seen is None else np.asarray(seen, float)
+    missing = distances(wanted, model, samples)
+    precision = float((off <= threshold_m).mean())
+    recall = float((missing <= threshold_m).mean())
+    both = precision + recall
+    return SurfaceErrors(
+        float(off.mean()),
+        float(np.median(off)),
+        float(np.percentile(off, 95)),
+        float(missing.mean()),
+        precision,
+        recall,
+        2 * precision * recall / both if both else 0.0,
+        float((off > outlier_m).mean()),
+        threshold_m,
+        outlier_m,
+    )
+
+
+def distances(points: ArrayLike, shape: Shape, samples: int = _SAMPLED) -> Float64:
+    """Distance (K,) in m from points (K, 3) to a cloud's points or a mesh's triangles.
+
+    A mesh is sampled; the distance is that to the nearest of the triangles of the 4 nearest
+    samples, which may be too large where samples are sparse, but is never too small.
+    """
+    points = np.asarray(points, float)
+    found, face = shape.samples(samples)
+    tree = KdTree(found)
+    if shape.faces is None or (len(face) and face[0] < 0):
+        return np.sqrt(tree.nearest(points)[1])
+    corners = shape.points[shape.faces]
+    near, _ = tree.neighbours(points, min(_TRIED, len(found)))
+    best = np.full(len(points), np.inf)
+    for column in near.T:
+        best = np.minimum(best, _to_triangles(points, corners[face[column]]))
+    return best
+
+
+def _to_triangles(p: Float64, corners: Float64) -> Float64:
+    """Distance (K,) of each point (K, 3) to its triangle (K, 3, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    best = np.full(len(p), np.inf)
+    inside = length > 0
+    for start, end in ((a, b), (b, c), (c, a)):
+        side = end - start
+        along = _dot(p - start, side) / np.maximum(_dot(side, side), 1e-300)
+        foot = start + np.clip(along, 0, 1)[:, None] * side
+        best = np.minimum(best, np.linalg.norm(p - foot, axis=1))
+        inside &= _dot(np.cross(side, p - start), normal) >= 0
+    above = np.abs(_dot(p - a, normal)) / np.maximum(length, 1e-300)
+    return np.where(inside, above, best)
+
+
+def _dot(a: Float64, b: Float64) -> Float64:
+    return np.einsum("ki,ki->k", a, b)
+
+
+def _areas(corners: Float64) -> Float64:
+    """Areas (M,) of triangles (M, 3, 3)."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.linalg.norm(normal, axis=1) / 2

@@ -1,0 +1,84 @@
+"""Accuracy and completeness of surfaces, against distances worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.evaluation.surface import Shape, compare_surfaces, distances
+
+SQUARE = Shape(
+    np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float), np.array([[0, 1, 2], [0, 2, 3]])
+)
+
+
+def shifted(shape, by):
+    return Shape(shape.points + by, shape.faces)
+
+
+def slow_distance(p, a, b, c):
+    """To a triangle, by a fine grid of its points."""
+    n = 150
+    u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
+    keep = u + v <= 1
+    u, v = u[keep][:, None], v[keep][:, None]
+    return np.linalg.norm(a + u * (b - a) + v * (c - a) - p, axis=1).min()
+
+
+def test_distances_to_triangles_are_those_of_a_slow_search() -> None:
+    rng = np.random.default_rng(0)
+    mesh = Shape(rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3))
+    points = rng.normal(size=(40, 3))
+    found = distances(points, mesh, 50_000)
+    expected = [min(slow_distance(p, *mesh.points[face]) for face in mesh.faces) for p in points]
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    np.testing.assert_allclose(distances(points, Shape(points[:7]))[:7], 0, atol=1e-12)
+
+
+def test_a_shifted_square_is_as_far_off_as_it_was_shifted() -> None:
+    found = compare_surfaces(shifted(SQUARE, [0, 0, 0.004]), SQUARE, samples=20_000)
+    for value in (found.accuracy_m, found.accuracy_median_m, found.completeness_m):
+        assert value == pytest.approx(0.004, rel=1e-3)
+    assert (found.precision, found.recall, found.fscore, found.outliers) == (1, 1, 1, 0)
+    far = compare_surfaces(shifted(SQUARE, [0, 0, 0.06]), SQUARE, samples=20_000)
+    assert (far.precision, far.recall, far.fscore, far.outliers) == (0, 0, 0, 1)
+
+
+def test_a_missing_half_is_incomplete_but_accurate() -> None:
+    half = Shape(SQUARE.points * [0.5, 1, 1], SQUARE.faces)
+    found = compare_surfaces(half, SQUARE, samples=20_000)
+    assert found.accuracy_m == pytest.approx(0, abs=1e-5)
+    assert found.precision == 1
+    assert found.recall == pytest.approx(0.51, abs=0.01)  # the half and 1 cm
+    assert found.fscore == pytest.approx(2 * 0.51 / 1.51, abs=0.01)
+    seen = np.array([[0.1, 0.5, 0], [0.3, 0.2, 0]])
+    assert compare_surfaces(half, SQUARE, seen=seen, samples=20_000).recall == 1
+    back = compare_surfaces(SQUARE, half, samples=20_000)
+    assert back.recall == 1
+    assert back.accuracy_p95_m == pytest.approx(0.45, abs=0.01)
+
+
+def test_samples_lie_evenly_on_the_faces() -> None:
+    points, face = SQUARE.samples(10_000)
+    assert SQUARE.area == pytest.approx(1)
+    assert np.abs(points[:, 2]).max() == 0
+    assert np.bincount(face).tolist() == [5000, 5000]
+    counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], 5, ((0, 1), (0, 1)))
+    assert 300 < counts.min() <= counts.max() < 500
+    same, _ = SQUARE.samples(10_000)
+    np.testing.assert_array_equal(same, points)
+
+
+def test_clouds_are_compared_by_their_points() -> None:
+    cloud = Shape(SQUARE.samples(5000)[0])
+    found = compare_surfaces(cloud, SQUARE, samples=20_000)
+    assert found.accuracy_m == pytest.approx(0, abs=1e-5)
+    assert 0.002 < found.completeness_m < 0.02  # the spacing of 5000 points
+
+
+def test_what_can_t_be_compared_is_refused() -> None:
+    with pytest.raises(InputError, match="model"):
+        compare_surfaces(Shape(np.zeros((0, 3))), SQUARE)
+    with pytest.raises(InputError, match="finite"):
+        Shape(np.full((2, 3), np.nan))
