@@ -147,6 +147,21 @@ def inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def convert(arguments: argparse.Namespace) -> int:
+    """``tofuse convert``."""
+    from tofuse.recordings.convert import convert as convert_recording
+    from tofuse.recordings.open import open_recording
+
+    recording = open_recording(*arguments.inputs, format=arguments.format, camera=arguments.camera)
+    recording = recording.select(arguments.start, arguments.end, arguments.every)
+    done = convert_recording(recording, arguments.out)
+    console = _Output(highlight=False, soft_wrap=True)
+    console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
+    for warning in (*recording.warnings, *done.warnings):
+        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    return 0
+
+
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
     from tofuse.calibration.noise import estimate_noise

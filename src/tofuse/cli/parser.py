@@ -43,6 +43,7 @@ def make_parser() -> Parser:
     _demo(commands)
     _simulate(commands)
     _inspect(commands)
+    _convert(commands)
     _noise(commands)
     _evaluate(commands)
     _optimize(commands)
@@ -166,6 +167,17 @@ def _inspect(commands: Any) -> None:
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
     p.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _convert(commands: Any) -> None:
+    p = _command(commands, "convert", "write any recording as a native folder")
+    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder for it")
+    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
+    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
+    p.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
+    p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
 
 
 def _noise(commands: Any) -> None:

@@ -85,8 +85,9 @@ class CloudBuilder:
         rows[:, 3:6] = towards / distance
         rows[:, 6] = 1
         if frame.color is not None:
+            # Black means that the colour camera didn't see the point.
             rows[:, 7:10] = frame.color
-            rows[:, 10] = 1
+            rows[:, 10] = frame.color.any(1)
         elif frame.amplitude is not None:
             # Light falls off with the square of the range: this is nearly the surface's albedo.
             rows[:, 11] = _raw_amplitude(frame) * distance[:, 0] ** 2

@@ -31,6 +31,9 @@ _KEYS = (
     "ambiguity_m",
     "confidence_max",
     "amplitude_kind",
+    "sigma_unit_m",
+    "sensor",
+    "color_registered",
     "color",
 )
 
@@ -60,8 +63,10 @@ class CameraFile:
         Metres per count.
     depth_kind
         "z" or "range".
-    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor
         As in the format, None where not given.
+    color_registered
+        Whether a colour image without a camera of its own shows what depth shows.
     color
         None where colour is registered to depth.
     unknown
@@ -76,6 +81,9 @@ class CameraFile:
     ambiguity_m: float | None = None
     confidence_max: float | None = None
     amplitude_kind: AmplitudeKind | None = None
+    sigma_unit_m: float | None = None
+    sensor: str | None = None
+    color_registered: bool = True
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
 
@@ -148,6 +156,9 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         get.positive("ambiguity_m"),
         get.positive("confidence_max"),
         get.choice("amplitude_kind", AMPLITUDE_KINDS),  # type: ignore[arg-type]
+        get.positive("sigma_unit_m"),
+        get.text("sensor"),
+        get.flag("color_registered", default=True),
         color,
         tuple(key for key in data if key not in _KEYS),
     )
@@ -267,6 +278,18 @@ class _Fields:
         if value is None or value != int(value) or not 2 <= value <= 16384:
             raise self.error(field, f"is {value}", "give a whole number of pixels, 2 to 16384")
         return int(value)
+
+    def text(self, field: str) -> str | None:
+        value = self.data.get(field)
+        if value is not None and (not isinstance(value, str) or not value.isprintable()):
+            raise self.error(field, f"is {value!r:.60}", "write a name on one line")
+        return value if value is None else value[:200]
+
+    def flag(self, field: str, *, default: bool) -> bool:
+        value = self.data.get(field, default)
+        if not isinstance(value, bool):
+            raise self.error(field, f"is {value!r:.60}", "write true or false")
+        return value
 
     def choice(self, field: str, choices: tuple[str, ...], *, needed: bool = False) -> str | None:
         value = self.data.get(field)

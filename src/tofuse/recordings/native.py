@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,15 @@ from tofuse.files.ply import write_ply
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import exact, read_columns, read_numbers, write_columns
 from tofuse.files.trajectory import write_tum
-from tofuse.geometry.cameras import Camera, RayTable, range_from_z, z_from_range
+from tofuse.geometry.cameras import Camera, Pinhole, RayTable, range_from_z, z_from_range
 from tofuse.recordings.camera_file import (
     SCHEMA,
     CameraFile,
     camera_fields,
+    checked_lens,
     load_camera,
     read_camera_file,
+    read_rays,
 )
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import (
@@ -42,7 +45,9 @@ Float64 = NDArray[np.float64]
 
 INVALID_DEPTH = 65535
 MAX_CORRECTION_BYTES = 1 << 30
+MAX_COUNTS = 65535
 _IMAGES = (".png", ".jpg", ".jpeg")
+_LENS = ("fx", "fy", "cx", "cy")
 
 
 class NativeSource(FileSource):
@@ -83,9 +88,18 @@ class NativeSource(FileSource):
         self.amplitude = self._channel("amplitude", ".png")
         self.confidence = self._channel("confidence", ".png")
         self.color = self._channel("color", *_IMAGES)
+        self.sigma = self._channel("sigma", ".png")
+        self.rays = self._channel("rays", ".npy")
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
+        self.cameras = self._frame_lenses()
+        if self.sigma and self.description.sigma_unit_m is None:
+            raise InputError(
+                "is missing, and there is sigma/",
+                where=f"{self.folder / 'camera.json'}: sigma_unit_m",
+                remedy="give the metres of one count of sigma",
+            )
         if is_file(folder / "groundtruth.txt"):
             self.reference = tum_poses(self, folder / "groundtruth.txt")
         if is_file(folder / "odometry.txt"):
@@ -99,13 +113,14 @@ class NativeSource(FileSource):
         if self.camera is None:
             return ply_frame(self.files[index], index, timestamp)
         size = (self.camera.width, self.camera.height)
+        camera = self._camera_of(index, self.camera)
         counts = read_image(self.files[index], size=size, dtype="uint16")
         depth = depth_from_counts(counts, self.description.depth_unit_m)
         kind = self.description.depth_kind
         if self.correction is not None:
-            depth = corrected_depth(self.correction, self.camera, depth, kind)
-        frame = RangeFrame(index, timestamp, self.camera, depth, kind)
-        amplitude = confidence = color = None
+            depth = corrected_depth(self.correction, camera, depth, kind)
+        frame = RangeFrame(index, timestamp, camera, depth, kind)
+        amplitude = confidence = color = sigma = None
         if self.amplitude:
             amplitude = read_image(self.amplitude[index], size=size, dtype="uint16")
             amplitude = amplitude.astype(np.float32)
@@ -114,18 +129,61 @@ class NativeSource(FileSource):
             confidence = confidence.astype(np.uint8, copy=False)
         if self.color:
             color = self._registered(frame, self.color[index])
+        if self.sigma:
+            counts = read_image(self.sigma[index], size=size, dtype="uint16")
+            sigma = counts.astype(np.float32) * np.float32(self.description.sigma_unit_m or 0)
         return RangeFrame(
             index,
             timestamp,
-            self.camera,
+            camera,
             frame.depth,
             kind,
             amplitude,
             confidence,
             color,
+            sigma,
+            color_registered=self.description.color_registered,
             amplitude_kind=self.description.amplitude_kind or "raw",
             ambiguity_m=self.description.ambiguity_m,
         )
+
+    def _camera_of(self, index: int, camera: Camera) -> Camera:
+        """Return the camera of one frame, where each has its own."""
+        if self.cameras:
+            own = self.cameras[index]
+            if isinstance(own, InputError):
+                raise own
+            return own
+        if not self.rays:
+            return camera
+        table = read_rays(self.rays[index])
+        if (table.width, table.height) != (camera.width, camera.height):
+            raise InputError(
+                f"is {table.width} x {table.height}, the images {camera.width} x {camera.height}",
+                where=self.rays[index],
+                remedy="use the table of this frame",
+            )
+        return table
+
+    def _frame_lenses(self) -> list[Pinhole | InputError]:
+        """Lens of each frame, where frames.csv tells fx, fy, cx and cy."""
+        columns, camera = self.frame_columns, self.camera
+        if columns is None or not isinstance(camera, Pinhole) or not set(_LENS) <= set(columns):
+            return []
+        cameras: list[Pinhole | InputError] = []
+        known: dict[tuple[float, ...], Pinhole] = {}
+        for k, row in enumerate(zip(*(columns[name] for name in _LENS), strict=True)):
+            try:
+                values = {f.name: getattr(camera, f.name) for f in fields(camera)[2:]}
+                values |= {name: float(v) for name, v in zip(_LENS, row, strict=True)}
+                where = f"{self.folder / 'frames.csv'}, row {k + 1}"
+                size = (camera.width, camera.height)
+                if row not in known:
+                    known[row] = checked_lens(type(camera), size, values, where)
+                cameras.append(known[row])
+            except InputError as error:
+                cameras.append(error)
+        return cameras
 
     def _read_camera(self, given: Path | None) -> tuple[CameraFile, Camera | None]:
         path = self.folder / "camera.json"
@@ -196,7 +254,7 @@ class NativeSource(FileSource):
         """Refuse a camera.json of other images, as far as the first readable header tells."""
         if self.camera is None:
             return
-        for channel in (self.files, self.amplitude, self.confidence):
+        for channel in (self.files, self.amplitude, self.confidence, self.sigma):
             self._check_size(channel, (self.camera.width, self.camera.height), "")
         color = self.description.color
         if color is None:
@@ -239,15 +297,24 @@ class NativeSource(FileSource):
             self.warnings.append(
                 f"{self.folder / 'camera.json'}: means nothing here: {', '.join(about.unknown)}"
             )
-        for name in ("frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
+        for name in ("sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
             if getattr(about, name) is not None:
                 self.metadata[name] = getattr(about, name)
         if self.camera is not None:
             self.metadata["depth_unit_m"] = about.depth_unit_m
             self.metadata["depth_kind"] = about.depth_kind
             self.metadata["corrected"] = self.correction is not None
+            if self.sigma:
+                self.metadata["sigma_unit_m"] = about.sigma_unit_m
         if is_folder(self.folder / "truth"):
             self.metadata["truth"] = str(self.folder / "truth")
+
+
+def same_distortion(a: Pinhole, b: Pinhole) -> bool:
+    """Whether two lenses differ in nothing but focal lengths and principal point."""
+    return type(a) is type(b) and all(
+        getattr(a, f.name) == getattr(b, f.name) for f in fields(a) if f.name not in _LENS
+    )
 
 
 def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
@@ -299,8 +366,15 @@ class RecordingWriter:
         Metres per count.
     depth_kind
         What is stored, "z" or "range"; frames are converted.
-    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sensor
         As in the format; None: not written.
+    sigma_unit_m
+        Metres per count of sigma; None: frames' sigma is not written.
+    color_registered
+        Whether the frames' colour is what depth shows.
+    own_cameras
+        Whether to write each frame's camera: its lens where it is one of the kind of `camera` with
+        the same distortion, else its rays.
 
     Attributes
     ----------
@@ -325,13 +399,19 @@ class RecordingWriter:
         ambiguity_m: float | None = None,
         confidence_max: float | None = None,
         amplitude_kind: str | None = None,
+        sensor: str | None = None,
+        sigma_unit_m: float | None = None,
+        color_registered: bool = True,
+        own_cameras: bool = False,
     ) -> None:
         self.folder = make_folder(folder)
         if any(self.folder.iterdir()):
             raise OutputError("isn't empty", where=self.folder, remedy="choose a new folder")
         self.camera = camera
         self.depth_unit_m, self.depth_kind = depth_unit_m, depth_kind
+        self.sigma_unit_m, self.own_cameras = sigma_unit_m, own_cameras
         self.out_of_range = 0
+        self._lenses: list[tuple[float, ...]] = []
         self._channels: frozenset[str] | None = None
         self._times: list[float] = []
         self._about: dict[str, Any] = {"schema": SCHEMA}
@@ -343,6 +423,9 @@ class RecordingWriter:
             "ambiguity_m": ambiguity_m,
             "confidence_max": confidence_max,
             "amplitude_kind": amplitude_kind,
+            "sensor": sensor,
+            "sigma_unit_m": sigma_unit_m,
+            "color_registered": None if color_registered else False,
         }
         self._about |= {key: value for key, value in optional.items() if value is not None}
 
@@ -390,6 +473,7 @@ class RecordingWriter:
             "amplitude": frame.amplitude_image,
             "confidence": frame.confidence_image,
             "color": frame.color_image,
+            "sigma": None if self.sigma_unit_m is None else frame.sigma_image,
         }
         self._check_channels(frame, *(name for name, image in images.items() if image is not None))
         depth = frame.z if self.depth_kind == "z" else frame.radial_range
@@ -401,6 +485,24 @@ class RecordingWriter:
             write_png(self._name("confidence", ".png"), confidence)
         if frame.color_image is not None:
             write_png(self._name("color", ".png"), frame.color_image)
+        if self.sigma_unit_m is not None and frame.sigma_image is not None:
+            counts = np.rint(frame.sigma_image.astype(float) / self.sigma_unit_m)
+            write_png(self._name("sigma", ".png"), np.clip(counts, 0, MAX_COUNTS).astype(np.uint16))
+        if self.own_cameras:
+            self._write_camera(frame.camera, camera)
+
+    def _write_camera(self, own: Camera, common: Camera) -> None:
+        if isinstance(common, Pinhole):
+            if not isinstance(own, Pinhole) or not same_distortion(own, common):
+                raise InputError(
+                    "has another kind of lens than the first",
+                    where=f"frame {len(self)}",
+                    remedy="give a RayTable as the common camera",
+                )
+            self._lenses.append((own.fx, own.fy, own.cx, own.cy))
+            return
+        with replacing(self._name("rays", ".npy")) as beside, beside.open("wb") as file:
+            np.save(file, np.asarray(own.rays(), np.float32))
 
     def _check_channels(self, frame: Frame, *names: str) -> None:
         if self._channels is None:
@@ -462,6 +564,9 @@ class RecordingWriter:
                 correction.save(beside)
         if imu is not None:
             write_columns(self.folder / "imu.csv", imu)
+        if self._lenses:
+            columns = dict(zip(_LENS, np.array(self._lenses).T, strict=True))
+            frames = {**(frames or {}), **columns}
         if frames is not None:
             if any(len(column) != len(self) for column in frames.values()):
                 raise InputError(

@@ -69,6 +69,16 @@ class IfmO3rSource(FileSource):
             "depth_kind": "range",
             "amplitude_kind": "raw",
         }
+        for k, chunks in enumerate(self.frames):
+            if not isinstance(chunks, InputError) and INFO in chunks:
+                try:
+                    info = _info(self.data, chunks[INFO], f"{path}: frame {k}")
+                except InputError:
+                    continue  # that frame's own trouble, told when it is read
+                self.metadata["depth_unit_m"] = info.distance_unit_m
+                if NOISE in chunks:
+                    self.metadata["sigma_unit_m"] = info.distance_unit_m
+                break
         if (np.diff(self.timestamps) < 0).any():
             self.warnings.append("time goes back; frames stay in the order of the file")
 

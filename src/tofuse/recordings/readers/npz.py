@@ -90,6 +90,8 @@ class NpzSource(FileSource):
         self.reference = self._poses(arrays, "reference")
         self.odometry = self._poses(arrays, "odometry")
         self.metadata |= {"depth_kind": self.kind}
+        if depth.dtype.kind != "f":
+            self.metadata["depth_unit_m"] = self.unit
         for name in ("frame_rate_hz", "ambiguity_m", "confidence_max"):
             if name in arrays:
                 self.metadata[name] = self._number(arrays, name)

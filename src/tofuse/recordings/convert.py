@@ -1,0 +1,245 @@
+"""Any recording as a native folder."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, OutputError, UnreadableFrameError
+from tofuse.files.atomic import make_folder, output_error
+from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.recordings.native import (
+    MAX_COUNTS,
+    NativeSource,
+    RecordingWriter,
+    same_distortion,
+)
+from tofuse.recordings.recording import Recording
+from tofuse.sensor.correction import DepthCorrection
+
+Float64 = NDArray[np.float64]
+
+FINEST_UNIT_M = 1e-4
+FINEST_SIGMA_M = 1e-5
+_LOOKED_AT = 24
+_CHANNELS = ("amplitude_image", "confidence_image", "color_image")
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What came of it: frames written, and what a person should know, one line each."""
+
+    folder: Path
+    frames: int
+    warnings: tuple[str, ...]
+
+
+def convert(
+    recording: Recording, folder: str | Path, progress: Callable[[int], None] | None = None
+) -> Conversion:
+    """Write a recording as a native folder.
+
+    Depth keeps its unit where the recording has one, and each frame its own camera where they
+    differ. A correction is written beside uncorrected depth. The folder appears when all is done.
+
+    Parameters
+    ----------
+    recording
+        What to write: the selected frames.
+    folder
+        Must not be there, or be empty.
+    progress
+        Called with the number of each frame that was written.
+
+    Raises
+    ------
+    InputError
+        If no frame can be read.
+    OutputError
+        If the folder isn't empty, or can't be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError("isn't empty", where=folder, remedy="choose a new folder")
+    make_folder(folder.absolute().parent)
+    try:
+        beside = Path(tempfile.mkdtemp(prefix=".tofuse-", dir=folder.absolute().parent))
+    except OSError as error:
+        raise output_error(error, folder) from error
+    try:
+        beside.chmod(0o777 & ~_umask())
+        count, warnings = _write(recording, beside, progress)
+        if folder.exists():
+            folder.rmdir()
+        os.replace(beside, folder)
+    except OSError as error:
+        raise output_error(error, folder) from error
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return Conversion(folder, count, tuple(warnings))
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
+
+
+def _write(
+    recording: Recording, folder: Path, progress: Callable[[int], None] | None
+) -> tuple[int, list[str]]:
+    warnings: list[str] = []
+    recording, correction = _uncorrected(recording)
+    sample = [f for f in recording.sample(_LOOKED_AT) if not isinstance(f, UnreadableFrameError)]
+    if not sample:
+        raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
+    own = not _same_camera(sample)
+    writer = _writer(recording, sample, folder, own)
+    channels = _channels(sample)
+    written: list[int] = []
+    for k, item in enumerate(recording.read_all()):
+        if isinstance(item, UnreadableFrameError):
+            warnings.append(f"skipped: {item}")
+            continue
+        if not own and not _same_camera([sample[0], item]):
+            raise InputError(
+                "has another camera than the frames looked at before",
+                where=f"{recording.path}: frame {item.index}",
+                remedy="convert the parts of the recording one by one",
+            )
+        writer.add(_completed(item, channels))
+        written.append(k)
+        if progress is not None:
+            progress(len(written))
+    if not written:
+        raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
+    _finish(recording, writer, written, correction)
+    if writer.out_of_range:
+        warnings.append(f"{writer.out_of_range} values were too large for 16 bits")
+    if any(isinstance(f, CloudFrame) and f.origin.any() for f in sample):
+        warnings.append("the sensor's position within its clouds is not kept")
+    noise = Path(recording.path) / "noise.json"
+    if noise.is_file():
+        shutil.copyfile(noise, folder / "noise.json")
+    return len(written), warnings
+
+
+def _uncorrected(recording: Recording) -> tuple[Recording, DepthCorrection | None]:
+    """Return a native recording as it was measured, and what is to be subtracted from it."""
+    source = recording.source
+    if not isinstance(source, NativeSource) or source.correction is None:
+        return recording, None
+    correction = source.correction
+    bare = copy.copy(source)
+    bare.correction = None
+    return replace(recording, source=bare), correction
+
+
+def _same_camera(frames: list[Frame]) -> bool:
+    cameras = [f.camera for f in frames if isinstance(f, RangeFrame)]
+    return all(camera == cameras[0] for camera in cameras)
+
+
+def _writer(recording: Recording, sample: list[Frame], folder: Path, own: bool) -> RecordingWriter:
+    about = recording.metadata
+    first = sample[0]
+    facts: dict[str, Any] = {
+        name: about.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor")
+    }
+    if isinstance(first, CloudFrame):
+        return RecordingWriter(folder, None, **facts)
+    images = [f for f in sample if isinstance(f, RangeFrame)]
+    camera = _common_camera([f.camera for f in images])
+    sigmas = [float(f.sigma_image.max()) for f in images if f.sigma_image is not None]
+    sigma_unit = about.get("sigma_unit_m")
+    if sigma_unit is None and sigmas:
+        sigma_unit = max(FINEST_SIGMA_M, _round_up(max(sigmas) / MAX_COUNTS))
+    unit = about.get("depth_unit_m")
+    if unit is None:
+        farthest = max(float(f.depth.max()) for f in images)
+        unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / MAX_COUNTS))
+    if any(f.amplitude_image is not None for f in images):
+        facts["amplitude_kind"] = first.amplitude_kind
+    return RecordingWriter(
+        folder,
+        camera,
+        depth_unit_m=unit,
+        depth_kind=first.depth_kind,
+        ambiguity_m=first.ambiguity_m or about.get("ambiguity_m"),
+        sigma_unit_m=sigma_unit if sigmas else None,
+        color_registered=all(f.color_registered for f in images),
+        own_cameras=own,
+        **facts,
+    )
+
+
+def _round_up(value: float) -> float:
+    """Return a number of two digits that isn't smaller."""
+    if value <= 0:
+        return 0.0
+    digit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{np.ceil(value / digit) * digit:.2g}")
+
+
+def _common_camera(cameras: list[Camera]) -> Camera:
+    """Return the camera for camera.json: a lens if all frames have one of its kind, else rays."""
+    first = cameras[0]
+    if all(camera == first for camera in cameras):
+        return first
+    if isinstance(first, Pinhole) and all(
+        isinstance(c, Pinhole) and same_distortion(c, first) for c in cameras
+    ):
+        return first
+    return RayTable(first.rays())
+
+
+def _channels(sample: list[Frame]) -> tuple[str, ...]:
+    """Return which images some frame has: all frames of a folder have the same."""
+    return tuple(
+        name for name in _CHANNELS if any(getattr(f, name, None) is not None for f in sample)
+    )
+
+
+def _completed(frame: Frame, channels: tuple[str, ...]) -> Frame:
+    """Return the frame with zeros for the images that only others have."""
+    if isinstance(frame, CloudFrame):
+        return frame
+    shape = frame.depth.shape
+    missing: dict[str, Any] = {}
+    for name in channels:
+        if getattr(frame, name) is None:
+            kind = np.float32 if name == "amplitude_image" else np.uint8
+            missing[name] = np.zeros((*shape, 3) if name == "color_image" else shape, kind)
+    drop = {n: None for n in _CHANNELS if n not in channels and getattr(frame, n) is not None}
+    changes: dict[str, Any] = missing | drop
+    return replace(frame, **changes) if changes else frame
+
+
+def _finish(
+    recording: Recording,
+    writer: RecordingWriter,
+    written: list[int],
+    correction: DepthCorrection | None,
+) -> None:
+    columns = getattr(recording.source, "frame_columns", None)
+    own = recording.indices[written]
+    lens = ("fx", "fy", "cx", "cy")
+    writer.finish(
+        groundtruth=None if recording.reference is None else recording.reference[written],
+        odometry=None if recording.odometry is None else recording.odometry[written],
+        correction=correction,
+        imu=getattr(recording.source, "imu", None),
+        frames=None
+        if columns is None
+        else {n: c[own] for n, c in columns.items() if not (writer.own_cameras and n in lens)},
+    )
