@@ -112,6 +112,8 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "reasons",
         "frames",
         "loops",
+        "optimiser",
+        "refinement",
         "filters",
     }
     assert data["schema"] == 1

@@ -8,11 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tofuse.evaluation.consistency import Consistency, PairAgreement
+from tofuse.evaluation.sightings import Sighting, Sightings
 from tofuse.geometry import se3
 from tofuse.pipeline.judge import Evidence, judge, stretches
 from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import LoopRecord, Optimisation
+from tofuse.posegraph.graph import GraphPart, LoopRecord, Optimisation
+from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.trust import pose_covariances
 from tofuse.registration.base import Registration
 from tofuse.results.types import FrameRecord, Reason
 from tofuse.results.verdict import REASONS, verdict_of
@@ -26,15 +28,14 @@ def registration(share=0.5, converged=True, unheld=False) -> Registration:
     return Registration(STEP, converged, 10, found, 1000, 0.3, 0.01, np.eye(6) * 1e4, free)
 
 
-def pair(i, j, share=0.95, rms=0.004, compared=10_000) -> PairAgreement:
-    inliers = int(share * compared)
-    return PairAgreement(i, j, 0.8, compared, inliers, inliers * rms**2)
+def pair(i, j, share=0.95, rms=0.004, said=10_000) -> Sighting:
+    return Sighting(i, j, share * said, (1 - share) * said, share * said * rms**2)
 
 
-def agreement(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> Consistency:
-    near = [pair(k, k + 1, near_share, near_rms) for k in range(4)]
-    far = [pair(0, k, far_share, far_rms) for k in range(2, 9)]
-    return Consistency.of(near + far, 9)
+def seen(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> Sightings:
+    near = [pair(k, k + 1, near_share, near_rms) for k in range(8)]
+    far = [pair(i, j, far_share, far_rms) for i in range(9) for j in range(i + 2, 9)]
+    return Sightings(tuple(range(9)), tuple(near + far))
 
 
 def evidence(
@@ -49,9 +50,14 @@ def evidence(
     images=None,
     unheld=(),
     steps=None,
+    sigma=None,
+    parts=(),
     **more,
 ) -> Evidence:
-    """Nine frames of a walk, closed by loops (i, j, error of the chain as a 6-vector)."""
+    """Nine frames of a walk, closed by loops (i, j, error of the chain as a 6-vector).
+
+    `sigma` is the standard deviation of each registration and loop, m and rad, if it is known.
+    """
     n = len(statuses)
     records = tuple(FrameRecord(k, 0.1 * k, s) for k, s in enumerate(statuses))
     posed = [k for k, s in enumerate(statuses) if s in ("tracked", "predicted")]
@@ -64,14 +70,15 @@ def evidence(
         registration(shares[k], converged[k], k in unheld) if k in posed[1:] else None
         for k in range(n)
     )
-    sequence = [Measured(a, b, STEP, np.eye(6)) for a, b in pairwise(posed)]
+    information = np.eye(6) if sigma is None else np.diag(np.repeat(sigma, 3) ** -2.0)
+    sequence = [Measured(a, b, STEP, information) for a, b in pairwise(posed)]
     row = {frame: k for k, frame in enumerate(posed)}
     closed = [
         Measured(
             i,
             j,
             se3.inverse(poses[row[i]]) @ poses[row[j]] @ se3.exp(-np.asarray(gap, float)),
-            np.eye(6),
+            information,
         )
         for i, j, gap in gaps
         if i in row and j in row
@@ -84,9 +91,10 @@ def evidence(
         registrations,
         tuple(loops),
         poses,
-        Optimisation(graph, (1.0, 0.5), settled),
-        agreement() if images is None else images,
-        frozenset(given),
+        Optimisation(graph, (1.0, 0.5), settled, parts=parts),
+        seen() if images is None else images,
+        None if sigma is None else pose_covariances(graph),
+        given=frozenset(given),
         **more,
     )
 
@@ -103,12 +111,16 @@ def test_good_evidence_gives_no_reason() -> None:
 
 CASES = {
     "few_poses": evidence(("tracked",) + ("lost",) * 7 + ("tracked",)),
-    "images_disagree": evidence(images=agreement(0.2, near_share=0.9)),
+    "images_disagree": evidence(images=seen(0.2, near_share=0.9)),
     "lost_frames": evidence(("tracked",) * 4 + ("lost",) * 2 + ("tracked",) * 3),
-    "images_differ": evidence(images=agreement(0.75)),
+    "images_differ": evidence(images=seen(0.75)),
     "weak_registration": evidence(shares=[0.5] * 4 + [0.04] + [0.5] * 4),
     "not_converged": evidence(converged=[True] * 4 + [False] + [True] * 4),
     "unchecked_drift": evidence(gaps=()),
+    "uncertain_poses": evidence(gaps=(), sigma=(0.02, 0.001)),
+    "calibration_alarm": evidence(gaps=((0, 8, [0.05, 0, 0, 0, 0, 0]),), sigma=(0.001, 0.001)),
+    "not_improved": evidence(parts=(GraphPart(0, 9, 9, 1.0, 1.0, True),)),
+    "not_refined": evidence(refinement=Refinement(np.zeros((9, 4, 4)), views=9, pairs=20)),
     "loop_gap": evidence(gaps=((0, 8, [0.2, 0, 0, 0, 0, 0]),)),
     "optimiser_gave_up": evidence(settled=False),
     "unreadable_frames": evidence(("tracked",) * 4 + ("skipped",) + ("tracked",) * 4),
@@ -221,19 +233,75 @@ def test_a_loop_that_was_found_and_rejected_is_no_news() -> None:
 
 
 def test_images_without_inliers_disagree() -> None:
-    verdict, reasons = judge(evidence(images=Consistency.of([pair(0, 1, 0.0)], 2)))
+    verdict, reasons = judge(evidence(images=Sightings((0, 1), (pair(0, 1, 0.0),))))
     assert verdict == "failed"
-    assert reasons[0].text == "Only 0% of what overlapping images saw agrees."
+    assert reasons[0].text == ("Only 0% of what overlapping images say supports the poses.")
 
 
 def test_images_that_do_not_overlap_say_nothing() -> None:
-    assert codes(evidence(images=Consistency.of([], 5))) == []
-    assert codes(replace(evidence(), agreement=None)) == []
+    assert codes(evidence(images=Sightings(tuple(range(5)), ()))) == []
+    assert codes(replace(evidence(), sightings=None)) == []
 
 
 def test_noise_that_neighbours_share_is_no_difference() -> None:
-    assert codes(evidence(images=agreement(0.8, 0.02, 0.8, 0.02))) == []
-    assert codes(evidence(images=agreement(far_rms=0.02))) == ["images_differ"]
+    assert codes(evidence(images=seen(0.8, 0.02, 0.8, 0.02))) == []
+    assert codes(evidence(images=seen(far_rms=0.02))) == ["images_differ"]
+
+
+def test_views_that_the_others_contradict_are_named() -> None:
+    said = tuple(
+        pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i in range(9) for j in range(i + 1, 9)
+    )
+    first, *others = judge(evidence(images=Sightings(tuple(range(0, 18, 2)), said)))[1]
+    assert (first.code, first.frames) == ("images_differ", (12, 12))
+    assert {r.code for r in others} <= {"images_differ"}
+
+
+def test_drift_counts_by_what_the_registrations_know() -> None:
+    # Eight steps of 1 mm and 0.5 mrad on a way of 0.4 m: well under 14 mm.
+    assert codes(evidence(gaps=(), sigma=(0.001, 0.0005))) == []
+    (loose,) = judge(evidence(gaps=(), sigma=(0.02, 0.001)))[1]
+    assert loose.frames == (2, 8)
+    # The end is off by the square root of eight of them, and a loop halves that.
+    (whole,) = judge(evidence(gaps=(), sigma=(0.008, 0.0001)))[1]
+    assert whole.code == "uncertain_poses"
+    assert "off by 18 mm rms, more than 14 mm" in whole.text
+    assert codes(evidence(sigma=(0.008, 0.0001))) == []
+
+
+def test_turns_that_are_not_held_are_told() -> None:
+    (reason,) = judge(evidence(gaps=(), sigma=(1e-5, np.radians(0.8))))[1]
+    assert reason.code == "uncertain_poses"
+    assert "2.3 degrees" in reason.text
+
+
+def test_a_part_that_nothing_joins_is_told() -> None:
+    e = evidence(gaps=(), sigma=(0.001, 0.0005))
+    graph = e.optimisation.graph
+    keep = np.arange(8) != 4
+    columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
+    torn = replace(graph, **columns)
+    e = replace(
+        e,
+        optimisation=replace(e.optimisation, graph=torn),
+        covariances=pose_covariances(torn),
+    )
+    (reason,) = judge(e)[1]
+    assert (reason.code, reason.frames) == ("uncertain_poses", (5, 8))
+    assert "not joined" in reason.text
+
+
+def test_a_gap_within_the_known_errors_is_no_alarm() -> None:
+    # The chain knows the end to sqrt(9) x 1 mm along each axis, and some more from its turns.
+    for gap, alarm in ((0.008, False), (0.03, True)):
+        found = codes(evidence(gaps=((0, 8, [0, gap, 0, 0, 0, 0]),), sigma=(0.001, 0.0005)))
+        assert ("calibration_alarm" in found) == alarm
+        assert "loop_gap" not in found
+
+
+def test_one_loop_among_many_raises_no_alarm() -> None:
+    gaps = [(0, k, np.zeros(6)) for k in (4, 6, 8)] + [(1, 7, [0.2, 0, 0, 0, 0, 0])]
+    assert "calibration_alarm" not in codes(evidence(gaps=gaps, sigma=(0.001, 0.0005)))
 
 
 def test_the_gravest_reason_decides() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -17,8 +17,9 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
 from tofuse.parts import part
 from tofuse.pipeline.config import changed, from_method
-from tofuse.pipeline.mapper import Mapper, covariance_of
+from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.graph import Optimisation, Optimiser
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -169,18 +170,39 @@ def test_clouds_alone_make_a_model(frames) -> None:
     assert result.cloud.color is None
 
 
-def test_covariance_is_the_inverse_of_the_information(whole) -> None:
-    record = whole.diagnostics.frames[2]
-    edge = np.flatnonzero((whole.graph.edges == [1, 2]).all(1))[0]
+def test_covariances_are_of_the_poses_relative_to_the_first(whole) -> None:
+    first, second, *_, last = whole.diagnostics.frames
+    np.testing.assert_array_equal(first.covariance, 0)
+    edge = np.flatnonzero((whole.graph.edges == [0, 1]).all(1))[0]
     np.testing.assert_allclose(
-        record.covariance @ whole.graph.information[edge], np.eye(6), atol=1e-6
+        second.covariance @ whole.graph.information[edge], np.eye(6), atol=1e-6
     )
+    # Nothing closes a loop there, so that errors add up.
+    assert np.trace(last.covariance[:3, :3]) > 2 * np.trace(second.covariance[:3, :3])
 
-    @dataclass
-    class Nothing:
-        information: object = field(default_factory=lambda: np.diag([1.0, 1, 1, 1, 1, 0]))
 
-    assert covariance_of(Nothing()) is None
+@part("optimiser", "test-doubting")
+@dataclass(frozen=True)
+class Doubting(Optimiser):
+    """Leaves out the second loop, as if it contradicted the others."""
+
+    def optimise(self, graph):
+        weights = np.ones(len(graph.edges))
+        weights[np.flatnonzero(graph.loop)[1]] = 0.0
+        return Optimisation(graph, (2.0, 1.0), True, weights)
+
+
+def test_loops_that_the_optimiser_leaves_out_are_rejected(frames, whole) -> None:
+    loops = [GivenLoop(0, k, whole.trajectory[k]) for k in (3, 4, 5)]
+    mapper = Mapper(replace(CONFIG, optimiser=Doubting()), loops=loops)
+    for frame in frames[:6]:
+        mapper.push(frame)
+    result = mapper.finish()
+    assert [p.accepted for p in result.diagnostics.loops] == [True, False, True]
+    assert "contradicts the rest of the graph" in result.diagnostics.loops[1].reason
+    assert result.graph.loop.sum() == 2
+    assert result.graph.edges[result.graph.loop].tolist() == [[0, 3], [0, 5]]
+    assert [r.code for r in result.diagnostics.reasons].count("loop_rejected") == 1
 
 
 @part("filter", "test-history")

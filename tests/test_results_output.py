@@ -183,6 +183,8 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "reasons",
         "frames",
         "loops",
+        "optimiser",
+        "refinement",
         "filters",
     ]
     assert data["schema"] == 1

@@ -9,10 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.evaluation.consistency import Consistency
+from tofuse.evaluation.sightings import Sightings
 from tofuse.geometry import se3
 from tofuse.odometry.motion import jumps
 from tofuse.posegraph.graph import LoopRecord, Optimisation
+from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.trust import expected_error, loop_errors
 from tofuse.registration.base import Registration
 from tofuse.results.types import FrameRecord, Reason, Verdict
 from tofuse.results.verdict import verdict_of
@@ -29,10 +31,19 @@ UNHELD_SHARE = 0.1
 NEAREST_M, FARTHEST_M = 0.3, 12.0
 # A camera that moved by no more than this stood still.
 STILL_M, STILL_RAD = 0.01, np.radians(0.5)
-# A loop that moves the end by more than this share of the path (and these floors) bends the path.
+# A result is good if its path is right to 1 cm and 1 % of its length: what the verdict promises.
+GOOD_M, GOOD_SHARE = 0.01, 0.01
+# Single poses are told that may be off by twice that, as the way from the first adds to them.
+UNCERTAIN_TIMES, UNCERTAIN_RAD = 2.0, np.radians(2)
+# Path lengths are measured over so many poses: jitter from frame to frame is no way.
+PATH_POSES = 60
+# Loops miss where odometry leads by a chi-square variable with six degrees of freedom, if both
+# know their errors: one in a thousand misses by more.
+MISSED = 22.46
+# Where errors aren't known, a loop may move the end by this share of the path, and these floors.
 GAP_SHARE, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
-# Inliers of overlapping images: below the first most of what they saw contradicts the poses;
-# below the second share of what neighbours reach, or above that much more rms, they differ.
+# Of what overlapping images say of the poses, this share has to support them, or they are wrong;
+# below that share of what neighbours reach, or above that much more rms, they differ.
 CONTRADICTED_SHARE, AGREEMENT_RATIO, RMS_RATIO = 0.5, 0.9, 1.5
 
 
@@ -50,8 +61,13 @@ class Evidence:
         (N, 4, 4) poses before optimisation, of the frames with a pose.
     optimisation
         The graph after it.
-    agreement
-        Of all overlapping images under the final poses; None where there are too few.
+    sightings
+        What overlapping images say of the final poses; None where there are too few.
+    covariances
+        (N, 6, 6) of those poses, see `trust.pose_covariances`; None where registrations don't know
+        their errors, as ICP's don't.
+    refinement
+        What became of the refinement over all views.
     given
         Pairs (i, j) of loops given by hand.
     depths
@@ -69,7 +85,9 @@ class Evidence:
     loops: tuple[LoopRecord, ...]
     sequential: Float64
     optimisation: Optimisation
-    agreement: Consistency | None
+    sightings: Sightings | None
+    covariances: Float64 | None = None
+    refinement: Refinement | None = None
     given: frozenset[tuple[int, int]] = frozenset()
     depths: tuple[float, ...] = ()
     ambiguity_m: float | None = None
@@ -85,6 +103,8 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
         *_depths(evidence),
         *_registrations(evidence),
         *_loops(evidence),
+        *(_drift(evidence) if evidence.covariances is None else _uncertainty(evidence)),
+        *_optimiser(evidence),
         *_images(evidence),
     ]
     return verdict_of(reasons), tuple(reasons)
@@ -116,7 +136,9 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     for k, words in jumps(poses, e.interruptions):
         frame = e.records[k].index
         yield Reason("jumped", (frame, frame), f"Frame {frame} has a pose, but {words}.")
-    for first, last in _runs(e.records, [r.index in e.repeated for r in e.records]):
+    for first, last in _runs(
+        [r.index for r in e.records], [r.index in e.repeated for r in e.records]
+    ):
         which = f"Frame {first} is" if first == last else f"Frames {first} to {last} are"
         text = f"{which} the same image as the one before: nothing new was measured."
         yield Reason("repeated_images", (first, last), text)
@@ -161,6 +183,8 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
             "that were compared."
         )
         yield Reason("weak_registration", (weak[0], weak[-1]), text)
+    if e.covariances is not None:
+        return  # what was not held, or did not settle, is in them
     unheld = [index for index, r in pairs if len(r.unobservable)]
     if len(unheld) > UNHELD_SHARE * len(pairs):
         text = (
@@ -175,19 +199,106 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
 
 
 def _loops(e: Evidence) -> Iterator[Reason]:
-    graph = e.optimisation.graph
-    first, last = int(graph.ids[0]), int(graph.ids[-1])
-    if len(graph.ids) > 1 and not graph.loop.any():
-        text = "No loop was closed, so nothing checks how much error has built up."
-        yield Reason("unchecked_drift", (first, last), text)
     for loop in e.loops:
         if (loop.i, loop.j) in e.given and not loop.accepted:
             text = f"The loop {loop.i} to {loop.j} given by hand was not used: {loop.reason}."
             yield Reason("loop_rejected", (loop.i, loop.j), text)
-    yield from _gap(e)
+
+
+def _optimiser(e: Evidence) -> Iterator[Reason]:
     if not e.optimisation.converged:
         text = "The optimiser ran out of iterations before it settled."
-        yield Reason("optimiser_gave_up", (first, last), text)
+        yield Reason("optimiser_gave_up", _all_posed(e), text)
+    if any(part.before > 0 and not part.improved for part in e.optimisation.parts):
+        text = "The optimiser found nothing better than the poses that it was given."
+        yield Reason("not_improved", _all_posed(e), text)
+    r = e.refinement
+    if r is not None and r.pairs and not r.kept:
+        text = "The refinement over all views made them agree worse, so it was not kept."
+        yield Reason("not_refined", _all_posed(e), text)
+
+
+def _drift(e: Evidence) -> Iterator[Reason]:
+    """Without known errors only loops tell of drift."""
+    graph = e.optimisation.graph
+    if len(graph.ids) > 1 and not graph.loop.any():
+        text = "No loop was closed, so nothing checks how much error has built up."
+        yield Reason("unchecked_drift", _all_posed(e), text)
+    yield from _gap(e)
+
+
+def _uncertainty(e: Evidence) -> Iterator[Reason]:
+    """With known errors of the registrations, those of the path follow."""
+    yield from _missed(e)
+    graph = e.optimisation.graph
+    assert e.covariances is not None
+    if len(graph.ids) < 2:
+        return
+    promised = GOOD_M + GOOD_SHARE * _way(graph.poses)
+    sigma, turn = _worst(e.covariances[:, :3, :3]), _worst(e.covariances[:, 3:, 3:])
+    doubtful = ~((sigma <= UNCERTAIN_TIMES * promised) & (turn <= UNCERTAIN_RAD))
+    found = _runs(graph.ids.tolist(), doubtful.tolist())
+    if found:
+        first, last = max(found, key=lambda ends: ends[1] - ends[0])
+        here = (graph.ids >= first) & (graph.ids <= last)
+        text = _doubt(first, last, float(sigma[here].max()), float(turn[here].max()))
+        text += f" So are {len(found) - 1} other stretches." if len(found) > 1 else ""
+        yield Reason("uncertain_poses", (first, last), text)
+        return
+    _, bound = expected_error(graph)
+    if bound > promised:
+        text = (
+            f"By what the registrations know of their errors, the path may be off by "
+            f"{bound * 1e3:.0f} mm rms, more than {promised * 1e3:.0f} mm."
+        )
+        yield Reason("uncertain_poses", _all_posed(e), text)
+
+
+def _doubt(first: int, last: int, sigma: float, turn: float) -> str:
+    which = f"Frame {first} is" if first == last else f"Frames {first} to {last} are"
+    if not np.isfinite(sigma):
+        return f"{which} not joined to the first by anything that was measured."
+    return (
+        f"{which} held to no better than {sigma:.3f} m and {np.degrees(turn):.1f} degrees (one "
+        "sigma in the worst direction), by loops and structure."
+    )
+
+
+def _worst(covariances: Float64) -> Float64:
+    """(N,) standard deviations in the worst directions of (N, 3, 3); NaN where not known."""
+    known = np.isfinite(covariances).all((1, 2))
+    out = np.full(len(covariances), np.nan)
+    out[known] = np.sqrt(np.linalg.eigvalsh(covariances[known])[:, -1])
+    return out
+
+
+def _missed(e: Evidence) -> Iterator[Reason]:
+    """Errors of the camera that all views share bend the path, and no registration knows them."""
+    graph = e.optimisation.graph
+    errors = loop_errors(graph, e.sequential)
+    known = np.isfinite(errors)
+    # Half of the loops: a few may be wrong by themselves.
+    if not known.any() or np.median(errors[known]) <= MISSED:
+        return
+    worst = int(np.nanargmax(errors))
+    i, j = graph.edges[graph.loop][worst]
+    gap = se3.inverse(graph.measurements[graph.loop][worst]) @ (
+        se3.inverse(e.sequential[i]) @ e.sequential[j]
+    )
+    first, last = sorted((int(graph.ids[i]), int(graph.ids[j])))
+    text = (
+        f"The loop {first} to {last} misses by {np.linalg.norm(gap[:3, 3]):.3f} m and "
+        f"{np.degrees(se3.angle(gap)):.1f} degrees, {np.sqrt(errors[worst] / 6):.1f} times what "
+        "noise explains: the depth offset or the focal length of the camera may be wrong."
+    )
+    yield Reason("calibration_alarm", (first, last), text)
+
+
+def _way(poses: Float64) -> float:
+    """Length of the path in m."""
+    n = len(poses)
+    some = np.unique(np.linspace(0, n - 1, min(n, PATH_POSES)).round().astype(int))
+    return float(np.linalg.norm(np.diff(poses[some, :3, 3], axis=0), axis=1).sum())
 
 
 def _gap(e: Evidence) -> Iterator[Reason]:
@@ -221,39 +332,43 @@ def _gap(e: Evidence) -> Iterator[Reason]:
 
 
 def _images(e: Evidence) -> Iterator[Reason]:
-    a = e.agreement
-    if a is None or a.pairs == 0:
+    s = e.sightings
+    if s is None or not np.isfinite(s.share()):
         return
-    frames = (int(e.optimisation.graph.ids[0]), int(e.optimisation.graph.ids[-1]))
-    found = f"{a.inlier_share:.0%} of what overlapping images saw agrees"
-    if np.isfinite(a.rms_m):
-        found += f", with {a.rms_m * 1e3:.1f} mm rms"
-    if a.inlier_share < CONTRADICTED_SHARE:
-        yield Reason("images_disagree", frames, f"Only {found}.")
+    found = f"{s.share():.0%} of what overlapping images say supports the poses"
+    if np.isfinite(s.rms_m()):
+        found += f", with {s.rms_m() * 1e3:.1f} mm rms"
+    if s.share() < CONTRADICTED_SHARE:
+        yield Reason("images_disagree", _all_posed(e), f"Only {found}.")
         return
+    alone = [share < CONTRADICTED_SHARE for share in s.share_of_views()]
+    for first, last in _runs(s.frames, alone):
+        text = f"Most of what other images say contradicts the poses of frames {first} to {last}."
+        yield Reason("images_differ", (first, last), text)
     # Images next to each other see the same errors of the sensor, but hardly any drift.
-    near = [p for p in a.agreements if p.j == p.i + 1]
-    if not near:
-        return
-    compared, inliers = sum(p.compared for p in near), sum(p.inliers for p in near)
-    share = inliers / max(compared, 1)
-    rms = float(np.sqrt(sum(p.squares for p in near) / max(inliers, 1)))
-    if a.inlier_share < AGREEMENT_RATIO * share or a.rms_m > RMS_RATIO * rms:
+    near = [p for p in s.pairs if p.j == p.i + 1]
+    share, rms = s.share(near), s.rms_m(near)
+    if s.share() < AGREEMENT_RATIO * share or s.rms_m() > RMS_RATIO * rms:
         text = f"{found}; images next to each other reach {share:.0%} and {rms * 1e3:.1f} mm."
-        yield Reason("images_differ", frames, text)
+        yield Reason("images_differ", _all_posed(e), text)
+
+
+def _all_posed(e: Evidence) -> tuple[int, int]:
+    ids = e.optimisation.graph.ids
+    return int(ids[0]), int(ids[-1])
 
 
 def stretches(records: Sequence[FrameRecord], status: str) -> list[tuple[int, int]]:
     """Return (first, last) frame index of each unbroken stretch of frames with that status."""
-    return _runs(records, [r.status == status for r in records])
+    return _runs([r.index for r in records], [r.status == status for r in records])
 
 
-def _runs(records: Sequence[FrameRecord], marked: Sequence[bool]) -> list[tuple[int, int]]:
+def _runs(frames: Sequence[int], marked: Sequence[bool]) -> list[tuple[int, int]]:
+    """Return (first, last) of each unbroken stretch of frames that are marked."""
     has = np.array([False, *marked, False])
     edges = np.flatnonzero([a != b for a, b in pairwise(has)])
     return [
-        (records[a].index, records[b - 1].index)
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        (int(frames[a]), int(frames[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.evaluation.consistency import Consistency, consistency_of_frames
+from tofuse.evaluation.sightings import Sightings, sightings, whole
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import Model, ModelBuilder
@@ -27,14 +27,14 @@ from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
 from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.registration.base import Registration
 from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
 Float64 = NDArray[np.float64]
 
 _KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
-_CHECKED_IMAGES = 60  # how many images the map-consistency check looks at
+_CHECKED_IMAGES = 60  # how many images are compared with each other in the end
 
 
 class Mapper:
@@ -86,6 +86,7 @@ class Mapper:
         self._before: RangeFrame | None = None  # as the camera gave it
         self._repeated: list[int] = []
         self._interruptions: list[int] = []
+        self._knows_errors = False
         self._seen: dict[str, int] = {}
         self._removed: dict[str, int] = {}
         self._finished = False
@@ -158,6 +159,8 @@ class Mapper:
                 with self._watch.timing("fusion"):
                     self._model.add(clean, step.surface, _KEPT_POINTS)
                 if step.surface is not None:
+                    # Only who looks at surfaces states errors that hold; ICP's are too small.
+                    self._knows_errors = True
                     self._refiner.push(step.surface, step.T_world_camera)
                     # Kept there as far as it is needed, and large.
                     self._steps[-1] = replace(step, surface=None)
@@ -258,7 +261,6 @@ class Mapper:
                 valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
                 inlier_share=None if registration is None else registration.share,
                 rms_m=None if registration is None else registration.rms_m,
-                covariance=None if registration is None else covariance_of(registration),
                 unobservable=np.zeros((0, 6))
                 if registration is None
                 else registration.unobservable,
@@ -272,9 +274,8 @@ class Mapper:
             ranges = frame.radial_range[::4, ::4]
             self._depths.append(float(np.median(ranges[ranges > 0])) if ranges.any() else 0.0)
             self._ambiguity_m = frame.ambiguity_m
-        if isinstance(filtered, RangeFrame):
-            # A fresh frame: the arrays derived from this one are not kept with it.
-            self._checks.add(replace(filtered))
+            if isinstance(filtered, RangeFrame):
+                self._checks.add(whole(frame, filtered))
 
     def finish(self) -> Reconstruction:
         """Close the loops, optimise, fuse and judge.
@@ -309,7 +310,10 @@ class Mapper:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation = self.config.optimiser.optimise(graph)
+            loops = _decided(loops, optimisation)
+            optimisation = without_left_out(optimisation)
         graph = optimisation.graph
+        covariances = pose_covariances(graph)
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
             refinement = self._refiner.finish(graph.ids.tolist(), graph.poses)
@@ -327,14 +331,17 @@ class Mapper:
             started = dict(zip(ids, sequential, strict=True))
             before = self._model.sketch(started) if moved else None
         self._progress.stage("checking")
+        records = self._finished_records(covariances)
         with self._watch.timing("checking"):
             evidence = Evidence(
-                tuple(self._records),
+                records,
                 tuple(s.registration if s else None for s in self._steps),
                 tuple(c.record for c in loops),
                 sequential,
                 optimisation,
-                self._agreement(graph),
+                self._sightings(graph),
+                covariances if self._knows_errors else None,
+                refinement,
                 frozenset((g.i, g.j) for g in self._given_loops),
                 tuple(d for d in self._depths if d > 0),
                 self._ambiguity_m,
@@ -352,7 +359,7 @@ class Mapper:
             diagnostics=Diagnostics(
                 verdict,
                 reasons,
-                tuple(self._records),
+                records,
                 tuple(c.record for c in loops),
                 self._scatter(sequential),
                 optimisation.objective,
@@ -360,6 +367,7 @@ class Mapper:
                 dict(self._watch.seconds),
                 before,
                 refinement,
+                optimisation.parts,
             ),
             config=self.config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(self._records)},
@@ -409,13 +417,24 @@ class Mapper:
             text = "clouds without a camera make no surface; there is no mesh.ply and no mesh.glb"
         return (Reason("no_surface", (self._records[0].index, self._records[-1].index), text),)
 
-    def _agreement(self, graph: PoseGraph) -> Consistency | None:
-        """How well overlapping images agree under the final poses."""
+    def _finished_records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
+        """The records with the covariances (P, 6, 6) of the frames that have a pose."""
+        known = iter(covariances)
+        out = []
+        for record, step in zip(self._records, self._steps, strict=True):
+            C = next(known) if step is not None and step.T_world_camera is not None else None
+            if C is not None and np.isfinite(C).all():
+                record = replace(record, covariance=C)
+            out.append(record)
+        return tuple(out)
+
+    def _sightings(self, graph: PoseGraph) -> Sightings | None:
+        """What overlapping images say of the final poses."""
         frames = self._checks.items
         if len(frames) < 2:
             return None
         row = {int(frame): k for k, frame in enumerate(graph.ids)}
-        return consistency_of_frames(frames, np.stack([graph.poses[row[f.index]] for f in frames]))
+        return sightings(frames, np.stack([graph.poses[row[f.index]] for f in frames]))
 
     def _scatter(self, poses: Float64) -> Float64:
         out = np.full((len(self._records), 4, 4), np.nan)
@@ -440,10 +459,15 @@ class _EvenSample:
         self._count += 1
 
 
-def covariance_of(registration: Registration) -> Float64 | None:
-    """Inverse of the information, (6, 6); None where a direction is not held at all."""
-    H = registration.information
-    if not np.isfinite(H).all() or np.linalg.cond(H) > 1e14:
-        return None
-    C = np.linalg.inv(H)
-    return (C + C.T) / 2
+def _decided(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:
+    """The loops, those rejected that the optimiser left out because they contradict the others."""
+    if optimisation.weights is None:
+        return list(loops)
+    weights = iter(optimisation.weights[optimisation.graph.loop])
+    out = []
+    for loop in loops:
+        if loop.T_i_j is not None and next(weights) < LEFT_OUT:
+            reason = f"contradicts the rest of the graph ({loop.record.reason})"
+            loop = ClosedLoop(replace(loop.record, accepted=False, reason=reason))
+        out.append(loop)
+    return out

@@ -149,6 +149,61 @@ def _error_rows(names: list[str], offsets: list[Float64], compared: bool) -> lis
     return rows
 
 
+def uncertainty(s: Subject) -> Values:
+    """Return how well each final pose is held, one sigma in the worst direction, over frames."""
+    C = np.full((len(s.index), 6, 6), np.nan)
+    for k, record in enumerate(s.result.diagnostics.frames[: len(C)]):
+        if record.covariance is not None:
+            C[k] = record.covariance
+    known = np.isfinite(C).all((1, 2))
+    if known.sum() < 2:
+        return {"uncertainty": []}
+    figures = []
+    for what, part, scale, unit in (
+        ("position", slice(0, 3), 1000.0, "mm"),
+        ("rotation", slice(3, 6), 180 / np.pi, "degrees"),
+    ):
+        sigma = np.full(len(C), np.nan)
+        sigma[known] = scale * np.sqrt(np.linalg.eigvalsh(C[known][:, part, part])[:, -1].clip(0))
+        drawn = plots.lines(
+            s.index,
+            [(sigma, plots.AFTER, "-")],
+            label=f"Standard deviation of the {what} over frames",
+            ylabel=f"{what}, {unit}",
+            floor=True,
+        )
+        figures.append(Figure(drawn))
+    return {"uncertainty": figures}
+
+
+def optimised(s: Subject) -> Values:
+    """Return what the optimiser and the refinement made of the path, in words."""
+    d = s.result.diagnostics
+    out = []
+    if len(d.parts) > 1:
+        out.append(f"The graph falls into {len(d.parts)} parts that nothing joins.")
+    if any(p.before > 0 and not p.improved for p in d.parts):
+        out.append("The optimiser found nothing better than what it was given.")
+    r = d.refinement
+    refined = ""
+    if r is not None and r.views:
+        refined = (
+            f"{words.count(r.views, 'view')} in {words.count(r.pairs, 'overlapping pair')} were "
+            "refined together. "
+        )
+        support = f"{words.share(r.support[0])} to {words.share(r.support[1])}"
+        if r.kept:
+            refined += (
+                f"They moved by up to {words.length(r.moved_m)} and "
+                f"{np.degrees(r.moved_rad):.2f}°, and their support rose from {support}."
+            )
+        elif r.pairs:
+            refined += f"Their support fell from {support}, so nothing of it was kept."
+        else:
+            refined = "No two views overlap enough to refine them together."
+    return {"optimised": " ".join(out), "refined": refined}
+
+
 def objective(s: Subject) -> Values:
     """Return the objective over iterations (figure 5.3)."""
     values = np.array(s.result.diagnostics.objective, float)

@@ -25,6 +25,8 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         section_model.views,
         section_path.cameras,
         section_path.error,
+        section_path.uncertainty,
+        section_path.optimised,
         section_path.objective,
         section_views.filters,
         section_frames.frames,

@@ -21,6 +21,8 @@ ADVICE: dict[str, str] = {
     "images_differ": "Surfaces may be doubled there; measure distances elsewhere.",
     "weak_registration": "Smaller steps between frames, or more structure in view, would help.",
     "not_converged": "More iterations or smaller steps between frames would help.",
+    "uncertain_poses": "Come back to these places, or keep corners and texture in view there.",
+    "calibration_alarm": "Check the camera's calibration: a known distance, a right angle.",
     "unchecked_drift": "Come back to where you started, so that a loop can check the path.",
     "loop_gap": "Distances across the loop may be stretched; check one that you know.",
     "optimiser_gave_up": "Give the optimiser more iterations.",

@@ -21,6 +21,7 @@ from tofuse.files.trajectory import write_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.posegraph.g2o import write_g2o
+from tofuse.posegraph.refinement import Refinement
 from tofuse.results.types import Reconstruction
 
 UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
@@ -249,9 +250,38 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 }
                 for p in d.loops
             ],
+            "optimiser": [
+                {
+                    "first": p.first,
+                    "vertices": p.vertices,
+                    "edges": p.edges,
+                    "before": p.before,
+                    "after": p.after,
+                    "improved": p.improved,
+                    "converged": p.converged,
+                }
+                for p in d.parts
+            ],
+            "refinement": _refinement(d.refinement),
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
     )
+
+
+def _refinement(r: Refinement | None) -> dict[str, Any] | None:
+    """What became of the refinement; None where no views took part."""
+    if r is None or not r.views:
+        return None
+    return {
+        "kept": r.kept,
+        "views": r.views,
+        "pairs": r.pairs,
+        "moved_m": r.moved_m,
+        "moved_rad": r.moved_rad,
+        "support_before": r.support[0],
+        "support_after": r.support[1],
+        "camera": r.errors,
+    }
 
 
 def plain(value: Any) -> Any:

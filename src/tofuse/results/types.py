@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.odometry.base import Status
-from tofuse.posegraph.graph import LoopRecord, PoseGraph
+from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
 from tofuse.posegraph.refinement import Refinement
 
 Float64 = NDArray[np.float64]
@@ -39,7 +39,7 @@ class FrameRecord:
     valid_share: float | None = None
     inlier_share: float | None = None
     rms_m: float | None = None
-    covariance: Float64 | None = None  # (6, 6), (tx ty tz rx ry rz), m and rad
+    covariance: Float64 | None = None  # (6, 6) of the final pose, relative to the first
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
 
 
@@ -61,6 +61,8 @@ class Diagnostics:
         The model as the sequential poses give it; None where nothing moved them.
     refinement
         What became of the refinement over all views.
+    parts
+        The connected parts of the graph, where the optimiser ran and tells them apart.
     """
 
     verdict: Verdict
@@ -73,6 +75,7 @@ class Diagnostics:
     seconds: dict[str, float]
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
+    parts: tuple[GraphPart, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,134 @@
+"""How well a pose graph knows its poses, and whether its measurements say the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.posegraph.descent import Problem
+from tofuse.posegraph.graph import Optimisation, PoseGraph
+from tofuse.posegraph.sparse import first_of_parts, parts_of
+
+Float64 = NDArray[np.float64]
+
+# A loop that counts with less of its information is left out.
+LEFT_OUT = 0.05
+# Of the trajectory, to tell its error.
+_POSES = 60
+
+
+def without_left_out(optimisation: Optimisation) -> Optimisation:
+    """What an optimiser made of a graph, without the edges that it left out."""
+    if optimisation.weights is None:
+        return optimisation
+    kept = optimisation.weights >= LEFT_OUT
+    graph = optimisation.graph
+    return replace(
+        optimisation,
+        graph=replace(
+            graph,
+            edges=graph.edges[kept],
+            measurements=graph.measurements[kept],
+            information=graph.information[kept],
+            loop=graph.loop[kept],
+        ),
+        weights=optimisation.weights[kept],
+    )
+
+
+def pose_covariances(graph: PoseGraph) -> Float64:
+    """(N, 6, 6) covariances of the poses relative to the first one, as right perturbations.
+
+    NaN where nothing joins a pose to the first, or the graph does not hold it.
+    """
+    out = np.full((len(graph.ids), 6, 6), np.nan)
+    if not len(out):
+        return out
+    factor = _problem(graph, first_of_parts(len(out), graph.edges)).factor(
+        graph.poses, np.ones(len(graph.edges))
+    )
+    if factor is None:
+        return out
+    joined = parts_of(len(out), graph.edges) == 0
+    try:
+        out[joined] = factor.covariances()[joined]
+    except RuntimeError:
+        return out
+    return out
+
+
+def expected_error(graph: PoseGraph, sigmas: float = 2.0) -> tuple[float, float]:
+    """Rms position error of the trajectory, aligned with the truth, that the graph leaves room for.
+
+    The positions' joint covariance, less what a rigid motion of them all takes up, has a trace
+    that is the mean of the squared error; its spread follows from the squares.
+
+    Returns
+    -------
+    m: the root of the mean, and of what so many standard deviations above it give. Both are inf
+    where the graph does not hold all poses.
+    """
+    n = len(graph.ids)
+    problem = _problem(graph, first_of_parts(n, graph.edges))
+    factor = problem.factor(graph.poses, np.ones(len(graph.edges)))
+    if factor is None or problem.fixed.sum() > 1:
+        return np.inf, np.inf
+    some = np.unique(np.linspace(0, n - 1, min(n, _POSES)).round().astype(int))
+    C = factor.joint_covariance(some).reshape(len(some), 6, len(some), 6)[:, :3, :, :3]
+    R, p = graph.poses[some, :3, :3], graph.poses[some, :3, 3]
+    C = np.einsum("iab,ibjc,jdc->iajd", R, C, R, optimize=True).reshape(3 * len(some), -1)
+    # Motions of all positions together: along each axis, and about each.
+    rigid = np.concatenate([np.tile(np.eye(3), (len(some), 1, 1)), -se3.hat(p - p.mean(0))], 2)
+    axes, size, _ = np.linalg.svd(rigid.reshape(-1, 6), full_matrices=False)
+    axes = axes[:, size > 1e-9 * size.max()]
+    left = C - axes @ (axes.T @ C)
+    left -= (left @ axes) @ axes.T
+    mean = float(np.trace(left))
+    spread = float(np.sqrt(2 * (left * left).sum()))
+    if not np.isfinite(mean):
+        return np.inf, np.inf
+    rms, bound = np.sqrt(np.maximum([mean, mean + sigmas * spread], 0) / len(some))
+    return float(rms), float(bound)
+
+
+def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
+    """(L,) squared errors of the loops against odometry alone, in units of both their covariances.
+
+    A chi-square variable with six degrees of freedom, where both are right; NaN for loops that
+    join what odometry does not.
+
+    Parameters
+    ----------
+    sequential
+        (N, 4, 4) poses as odometry has them.
+    """
+    loops = np.flatnonzero(graph.loop)
+    out = np.full(len(loops), np.nan)
+    odometry = graph.edges[~graph.loop]
+    problem = _problem(graph, first_of_parts(len(graph.ids), odometry))
+    factor = problem.factor(sequential, np.where(graph.loop, 0.0, 1.0))
+    part = parts_of(len(graph.ids), odometry)
+    i, j = graph.edges[loops].T
+    same = part[i] == part[j]
+    if factor is None or not same.any():
+        return out
+    a, b = graph.edges.T
+    T_i_j = se3.inverse(sequential[a]) @ sequential[b]
+    try:
+        C = factor.relative_covariances(T_i_j)[loops]
+    except RuntimeError:
+        return out
+    e = se3.log(se3.inverse(graph.measurements[loops]) @ T_i_j[loops])
+    C = C + np.linalg.pinv(graph.information[loops], hermitian=True)
+    d = (e * np.linalg.solve(C, e[..., None])[..., 0]).sum(1)
+    out[same] = d[same]
+    return out
+
+
+def _problem(graph: PoseGraph, fixed: NDArray[np.bool_]) -> Problem:
+    return Problem(
+        graph.edges, graph.measurements, graph.information, fixed, graph.gravity, "tangent"
+    )

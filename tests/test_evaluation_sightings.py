@@ -1,0 +1,98 @@
+"""Images of the same side support poses, space seen through contradicts them, backs say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.sightings import Sighting, Sightings, sightings, whole
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels.threads import threads
+from tofuse.recordings.frames import RangeFrame
+
+CAMERA = Pinhole(80, 60, 90.0, 90.0, 39.5, 29.5)
+CENTRE = np.array([0.0, 0.0, 1.5])
+
+
+def ball(T: np.ndarray, index: int, radius: float = 0.4, noise: float = 0.001) -> RangeFrame:
+    """A ball before nothing, as a camera at T (4, 4) sees it."""
+    v, u = np.mgrid[:60, :80]
+    rays = np.stack([(u - 39.5) / 90, (v - 29.5) / 90, np.ones((60, 80))], -1)
+    c = (se3.inverse(T) @ np.append(CENTRE, 1))[:3]
+    a, b = (rays**2).sum(-1), rays @ c
+    root = b * b - a * (c @ c - radius**2)
+    z = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    z += noise * np.random.default_rng([3, index]).standard_normal(z.shape) * (z > 0)
+    return RangeFrame(index, 0.1 * index, CAMERA, z.astype(np.float32))
+
+
+def round_it(count: int) -> np.ndarray:
+    """(count, 4, 4) poses on a circle round the ball, which they look at."""
+    about, back = np.eye(4), np.eye(4)
+    about[:3, 3], back[:3, 3] = CENTRE, -CENTRE
+    turns = [se3.exp(np.array([0, 0, 0, 0, 2 * np.pi * k / count, 0])) for k in range(count)]
+    return np.stack([about @ T @ back for T in turns])
+
+
+@pytest.fixture(scope="module")
+def turned():
+    poses = round_it(12)
+    return [ball(T, k) for k, T in enumerate(poses)], poses
+
+
+def test_the_far_side_of_a_turned_object_is_no_contradiction(turned) -> None:
+    frames, poses = turned
+    found = sightings(frames, poses)
+    assert found.frames == tuple(range(12))
+    assert found.share() > 0.99
+    assert found.rms_m() < 0.004
+    # Views that look against each other see no surface of the same side.
+    assert all(min(p.j - p.i, 12 - p.j + p.i) <= 3 for p in found.pairs)
+    assert {(k, k + 1) for k in range(11)} <= {(p.i, p.j) for p in found.pairs}
+
+
+def test_a_wrong_pose_is_seen_through(turned) -> None:
+    frames, poses = turned
+    wrong = poses.copy()
+    wrong[6] = poses[6] @ se3.exp(np.array([0.25, 0, 0, 0, 0, 0]))
+    shares = sightings(frames, wrong).share_of_views()
+    assert np.argmin(shares) == 6
+    assert shares[6] < 0.75
+    assert (np.delete(shares, [4, 5, 6, 7, 8]) > 0.95).all()
+    # All of them: the ball falls apart.
+    drift = np.stack(
+        [T @ se3.exp(np.array([0, 0, 0.06 * k, 0, 0, 0])) for k, T in enumerate(poses)]
+    )
+    assert sightings(frames, drift).share() < 0.8
+
+
+def test_the_same_for_any_number_of_threads_and_any_world(turned) -> None:
+    frames, poses = turned
+    with threads(1):
+        one = sightings(frames, poses)
+    with threads(3):
+        assert sightings(frames, poses) == one
+    moved = sightings(frames, se3.exp(np.array([1, 2, 3, 0.4, 0.5, 0.6])) @ poses)
+    assert moved.share() == pytest.approx(one.share(), abs=1e-3)
+
+
+def test_frames_without_a_pose_do_not_count(turned) -> None:
+    frames, poses = turned
+    some = poses.copy()
+    some[3] = np.nan
+    assert sightings(frames, some).frames == (0, 1, 2, *range(4, 12))
+    assert np.isnan(sightings(frames[:1], poses[:1]).share())
+    assert np.isnan(Sightings((0, 1), (Sighting(0, 1, 0.0, 10.0, 0.0),)).rms_m())
+
+
+def test_filters_that_thin_leave_the_image_whole_but_cuts_stand(turned) -> None:
+    (frame, *_), _ = turned
+    rng = np.random.default_rng(5)
+    left = np.zeros(frame.depth.shape, bool)
+    left[:, :40] = True
+    thin = frame.keep(left & (rng.random(left.shape) < 0.5))
+    again = whole(frame, thin)
+    assert again.valid[:, :39].sum() > 0.99 * frame.valid[:, :39].sum()
+    assert not again.valid[:, 41:].any()
+    np.testing.assert_array_equal(again.depth[again.valid], frame.depth[again.valid])

@@ -1,0 +1,127 @@
+"""What a graph knows of its poses agrees with how far off they are when it is solved often."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.trajectory import evaluate_trajectory
+from tofuse.geometry import se3
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.graph import Optimisation, PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.trust import (
+    LEFT_OUT,
+    expected_error,
+    loop_errors,
+    pose_covariances,
+    without_left_out,
+)
+
+N = 12
+SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
+STEP = se3.exp(np.array([0.2, 0, 0.1, 0, 2 * np.pi / N, 0]))
+TRUE = np.stack([np.linalg.matrix_power(STEP, k) for k in range(N)])
+
+
+def walk(rng: np.random.Generator | None = None, *, loops=((0, N - 1), (2, 9))) -> PoseGraph:
+    """A round walk, of which every step and loop is measured with the same noise."""
+
+    def measured(i: int, j: int) -> Measured:
+        noise = np.zeros(6) if rng is None else SIGMA * rng.standard_normal(6)
+        T = se3.inverse(TRUE[i]) @ TRUE[j] @ se3.exp(noise)
+        return Measured(i, j, T, np.diag(SIGMA**-2.0))
+
+    steps = [measured(k, k + 1) for k in range(N - 1)]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step.T_i_j)
+    return build_graph(range(N), np.stack(poses), steps, [measured(i, j) for i, j in loops])
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[PoseGraph]:
+    rng = np.random.default_rng(4)
+    return [walk(rng) for _ in range(120)]
+
+
+@pytest.fixture(scope="module")
+def solved(drawn) -> list[PoseGraph]:
+    return [LevenbergMarquardt(robust="none").optimise(graph).graph for graph in drawn]
+
+
+def test_covariances_are_those_of_many_draws(solved) -> None:
+    C = pose_covariances(walk())
+    np.testing.assert_array_equal(C[0], 0)
+    errors = np.stack([se3.log(se3.inverse(TRUE) @ g.poses) for g in solved])
+    seen = np.einsum("tna,tnb->nab", errors, errors) / len(errors)
+    for k in (1, 5, N - 1):
+        ratio = np.linalg.eigvalsh(np.linalg.solve(np.linalg.cholesky(C[k]), seen[k]) @ (
+            np.linalg.inv(np.linalg.cholesky(C[k])).T
+        ))  # fmt: skip
+        assert ratio.min() > 0.4
+        assert ratio.max() < 1.9
+        assert ratio.mean() == pytest.approx(1, abs=0.2)
+
+
+def test_the_expected_error_is_that_of_evaluation(solved) -> None:
+    time = np.arange(N, dtype=float)
+    found = [evaluate_trajectory(time, g.poses, time, TRUE).ate_rms_m for g in solved]
+    mean, bound = expected_error(walk())
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(mean, rel=0.1)
+    # Two standard deviations of the squared error.
+    assert 0.9 < np.mean(np.array(found) < bound) < 1
+    assert expected_error(walk(loops=()))[0] > 1.5 * mean
+
+
+def test_loops_miss_as_a_chi_square_variable(drawn) -> None:
+    d = np.stack([loop_errors(g, g.poses) for g in drawn])
+    assert d.shape == (len(drawn), 2)
+    assert d.mean(0) == pytest.approx(6, abs=1.2)
+    assert 0.84 < np.mean(d < 10.64) < 0.96  # nine in ten
+    # An error that all views share is no noise.
+    graph = drawn[0]
+    bent = graph.measurements.copy()
+    bent[graph.loop] = bent[graph.loop] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
+    assert (loop_errors(replace(graph, measurements=bent), graph.poses) > 30).all()
+
+
+def test_loops_between_parts_that_odometry_does_not_join_say_nothing() -> None:
+    graph = walk()
+    keep = np.arange(len(graph.edges)) != 4
+    torn = replace(
+        graph,
+        edges=graph.edges[keep],
+        measurements=graph.measurements[keep],
+        information=graph.information[keep],
+        loop=graph.loop[keep],
+    )
+    assert np.isnan(loop_errors(torn, torn.poses)).all()
+    assert np.isfinite(pose_covariances(torn)).all()  # the loops join them
+    alone = replace(torn, information=torn.information * ~torn.loop[:, None, None])
+    assert np.isnan(pose_covariances(alone)[1:]).all()
+
+
+def test_parts_that_nothing_joins_are_not_known() -> None:
+    steps = [Measured(k, k + 1, STEP, np.eye(6)) for k in (0, 1, 3, 4)]
+    graph = build_graph(range(6), TRUE[:6], steps)
+    C = pose_covariances(graph)
+    assert np.isfinite(C[:3]).all()
+    assert np.isnan(C[3:]).all()
+    assert expected_error(graph) == (np.inf, np.inf)
+    one = build_graph([7], TRUE[:1], [])
+    np.testing.assert_array_equal(pose_covariances(one), np.zeros((1, 6, 6)))
+
+
+def test_left_out_edges_are_gone() -> None:
+    graph = walk()
+    weights = np.ones(len(graph.edges))
+    assert without_left_out(Optimisation(graph, (), True)).graph is graph
+    weights[-2:] = LEFT_OUT / 2, 2 * LEFT_OUT
+    kept = without_left_out(Optimisation(graph, (), True, weights))
+    assert kept.graph.loop.sum() == 1
+    assert kept.graph.edges[-1].tolist() == [2, 9]
+    assert kept.weights is not None
+    assert kept.weights[-1] == 2 * LEFT_OUT
