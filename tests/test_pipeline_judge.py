@@ -135,7 +135,8 @@ CASES = {
 
 
 def test_every_reason_has_a_case() -> None:
-    assert set(CASES) == set(REASONS)
+    # Whether there is a surface is no question of trust: fusion tells.
+    assert set(CASES) == set(REASONS) - {"no_surface"}
 
 
 @pytest.mark.parametrize("code", CASES)
