@@ -177,15 +177,164 @@ def test_flat_nodes_are_counted_on_planes_and_not_on_bent_ones() -> None:
     assert kernels.flat_nodes(fitted(bent), 4, 0.1, 0.003) < 0.8 * flat
 
 
-def test_nearest_is_the_first_of_the_least_distances() -> None:
-    rng = np.random.default_rng(5)
-    x, y = rng.normal(size=(2, 50))
-    nodes = np.round(rng.normal(size=(70, 2)), 1)
-    away = (x[:, None] - nodes[:, 0]) ** 2 + (y[:, None] - nodes[:, 1]) ** 2
-    np.testing.assert_array_equal(kernels.nearest(x, y, nodes), away.argmin(1))
-    # Equal ones: a place in the middle of a square.
-    square = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0]])
-    assert kernels.nearest(np.zeros(1), np.zeros(1), square)[0] == 0
+SLANTEST = 0.6
+
+
+def lit_nodes(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
+    """Nodes with planes at random, some of them without, in smooth pieces of four columns."""
+    nodes = np.zeros((rows, columns, COLUMNS))
+    y, x = np.mgrid[:rows, :columns] * 0.1
+    nodes[..., X], nodes[..., Y] = x - 0.4, y - 0.3
+    nodes[..., LIGHT], nodes[..., AREA] = rng.uniform(10, 90, (2, rows, columns)) * 1e-2
+    planes = rng.normal(0, 0.3, (rows, -(-columns // 4), 3)).repeat(4, 1)[:, :columns]
+    nodes[..., A : C + 1] = planes + np.array([0, 0, 0.6])
+    nodes[..., W] = (
+        nodes[..., A : C + 1] * np.stack([nodes[..., X], nodes[..., Y], 1 + 0 * x], -1)
+    ).sum(-1)
+    nodes[rng.random((rows, columns)) < 0.1, A:] = 0
+    nodes[rng.random((rows, columns)) < 0.1, W] = 0
+    return nodes
+
+
+def surfaces_of(nodes: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, ...]:
+    shape = nodes.shape[:2]
+    good = np.empty(shape, bool)
+    points, normals, values = np.empty((*shape, 3)), np.empty((*shape, 3)), np.empty((5, *shape))
+    kernels.light_surfaces(nodes, factor, 4.0, SLANTEST, good, points, normals, values)
+    return good, points, normals, values
+
+
+def test_light_surfaces_are_the_planes_and_their_light() -> None:
+    rng = np.random.default_rng(6)
+    nodes = lit_nodes(rng, 9, 11)
+    factor = rng.uniform(1, 1.5, (9, 11))
+    good, points, normals, values = surfaces_of(nodes, factor)
+    abc = nodes[..., A : C + 1]
+    ray = np.stack([nodes[..., X], nodes[..., Y], np.ones((9, 11))], -1)
+    w = (abc * ray).sum(-1)
+    np.testing.assert_array_equal(good, (nodes[..., W] > 0) & (abc != 0).any(-1) & (w > 0))
+    assert 40 < good.sum() < 99
+    for out in (points, normals, np.moveaxis(values, 0, -1)):
+        assert not out[~good].any()
+    abc, ray, w = abc[good], ray[good], w[good]
+    np.testing.assert_allclose(points[good], ray / w[:, None])
+    n = -abc / np.linalg.norm(abc, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals[good], n)
+    length = np.linalg.norm(ray, axis=1)
+    cosine = np.clip(-(n * ray).sum(1) / length, SLANTEST, 1)
+    assert (cosine == SLANTEST).any()
+    r = length / w
+    area = nodes[..., AREA][good] / (w**2 * length * cosine)
+    lit = length**-2 * cosine / r**2
+    radiosity = nodes[..., LIGHT][good] * length**2
+    albedo = radiosity / lit / factor[good]
+    np.testing.assert_allclose(values[:, good], [r, area, lit, radiosity, albedo])
+
+
+def test_seen_sources_are_means_of_four_nodes_that_are_alike_and_the_others_alone() -> None:
+    rng = np.random.default_rng(7)
+    nodes = lit_nodes(rng, 9, 11)
+    # Beside the rough part, a large wall.
+    nodes[4:, :, A:] = [0.02, 0.01, 0.5]
+    nodes[4:, :, W] = 0.5
+    good, points, normals, values = surfaces_of(nodes, np.ones((9, 11)))
+    area = values[1]
+    light = rng.normal(size=(9, 11)) + 1j * rng.normal(size=(9, 11))
+    light[rng.random((9, 11)) < 0.1] = 0
+    out = np.full((99, 9), np.nan, np.float32)
+    count = kernels.seen_sources(good, points, normals, area, light, out)
+    assert np.isnan(out[count:]).all()
+
+    wanted = []
+    together = 0
+    for top in range(0, 9, 2):
+        for left in range(0, 11, 2):
+            block = np.s_[top : top + 2, left : left + 2]
+            power = np.where(good, area * np.abs(light), 0)[block].ravel()
+            p, n, a, q = (v[block].reshape(len(power), -1) for v in (points, normals, area, light))
+            if not power.any():
+                continue
+            k = power.argmax()
+            alike = (n @ n[k] > 0.97) & (np.abs((p - p[k]) @ n[k]) < 0.02 * np.linalg.norm(p[k]))
+            alike &= power > 0
+            together += alike.sum() > 1
+            for one in [
+                alike,
+                *(np.arange(len(power)) == m for m in np.flatnonzero(~alike & (power > 0))),
+            ]:
+                normal = power[one] @ n[one]
+                sent = (a[one] * q[one]).sum() / a[one].sum()
+                wanted.append(
+                    [
+                        *(power[one] @ p[one] / power[one].sum()),
+                        *(normal / np.linalg.norm(normal)),
+                        a[one].sum(),
+                        sent.real,
+                        sent.imag,
+                    ]
+                )
+    assert together > 5
+    assert count == len(wanted) > together + 3
+    found = out[:count][np.lexsort(out[:count].T)]
+    np.testing.assert_allclose(
+        found,
+        np.array(wanted, np.float32)[np.lexsort(np.array(wanted, np.float32).T)],
+        rtol=1e-4,
+        atol=1e-6,
+    )
+
+
+def test_unseen_sources_are_what_is_known_and_else_the_nearest_plane_of_the_border() -> None:
+    rng = np.random.default_rng(8)
+    border = lit_nodes(rng, 4, 6)
+    border = border[(border[..., W] > 0) & (border[..., C] != 0)]
+    border_albedo = rng.uniform(0.2, 0.9, len(border))
+    rays = rng.uniform(-1.5, 1.5, (80, 2))
+    size = rng.uniform(0.01, 0.02, 80)
+    planes = rng.normal(0, 0.2, (80, 3)) + np.array([0, 0, 0.5])
+    albedo = np.where(rng.random(80) < 0.5, rng.uniform(0.2, 0.9, 80), 0)
+    out = np.full((80, 9), np.nan, np.float32)
+    growth = np.array([0.5, 2.0])
+    count = kernels.unseen_sources(
+        rays, size, planes, albedo, border, border_albedo, growth, 4.0, SLANTEST, 2.5, out
+    )
+    wanted = []
+    guessed = 0
+    for ray, cell, abc, light in zip(rays, size, planes, albedo, strict=True):
+        line = np.array([*ray, 1.0])
+        if light == 0:
+            k = ((border[:, [X, Y]] - ray) ** 2).sum(1).argmin()
+            abc, light = border[k, A : C + 1], border_albedo[k]
+            if not 0.5 <= abc @ line / border[k, W] <= 2.0:
+                continue
+            guessed += 1
+        w = abc @ line
+        if w <= 0:
+            continue
+        n = -abc / np.linalg.norm(abc)
+        length = np.linalg.norm(line)
+        cosine = np.clip(-n @ line / length, SLANTEST, 1)
+        r = length / w
+        sent = light * length**-2 * cosine / r**2 * np.exp(2.5j * r)
+        wanted.append([*(line / w), *n, cell / (w**2 * length * cosine), sent.real, sent.imag])
+    assert guessed > 10
+    assert count == len(wanted) > guessed + 20
+    np.testing.assert_allclose(out[:count], wanted, rtol=1e-4, atol=1e-6)
+    assert np.isnan(out[count:]).all()
+    # With nothing at the border, what is known is left.
+    none = kernels.unseen_sources(
+        rays, size, planes, albedo, border[:0], border_albedo[:0], growth, 4.0, SLANTEST, 2.5, out
+    )
+    assert none == count - guessed
+
+
+def test_the_extent_is_that_of_the_known_rays() -> None:
+    rays = np.random.default_rng(9).normal(size=(7, 9, 2)).astype(np.float32)
+    rays[0] = rays[3, 4] = np.nan
+    found = kernels.extent(rays)
+    x, y = rays[..., 0], rays[..., 1]
+    np.testing.assert_array_equal(found, [np.nanmin(x), np.nanmax(x), np.nanmin(y), np.nanmax(y)])
+    assert np.isnan(kernels.extent(np.full_like(rays, np.nan))).all()
 
 
 def test_recall_shows_the_nearest_surfaces_that_face_the_camera_in_each_cell() -> None:

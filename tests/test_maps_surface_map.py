@@ -343,3 +343,41 @@ def test_amplitude_goes_before_colour():
     frame = replace(wall(amplitude="raw", texture=1.0), color_image=np.zeros((72, 88, 3), np.uint8))
     plain = surface_map(replace(frame, color_image=None), OPTIONS)
     np.testing.assert_array_equal(surface_map(frame, OPTIONS).photo, plain.photo)
+
+
+def test_what_pixels_share_of_an_error_is_not_averaged_away() -> None:
+    """A group of pixels with a shared error is worth what one of them is, whatever its noise."""
+    frame = wall(sigma=0.004)
+    plain = surface_map(frame, OPTIONS)
+    shared = np.zeros((72, 88), np.float32)
+    shared[:, 44:] = 0.005
+    view = surface_map(replace(frame, shared_sigma_image=shared), OPTIONS)
+    np.testing.assert_array_equal(view.planes, plain.planes)
+    np.testing.assert_array_equal(view.sigma, plain.sigma)
+    np.testing.assert_array_equal(view.plane_variance[:, :44], plain.plane_variance[:, :44])
+    added = (view.plane_variance - plain.plane_variance)[:, 44:]
+    w = view.planes[:, 44:, 3]
+    seen = w > 0
+    assert seen.sum() > 2000
+    # A hundred pixels together know z no better than to the 5 mm along the ray.
+    along = 0.005 / ray_lengths(CAMERA)[:, 44:]
+    np.testing.assert_allclose(np.sqrt(added / 100)[seen], (along * w * w)[seen], rtol=0.01)
+
+    bad = np.full((72, 88), np.nan, np.float32)
+    bad[::2] = -1
+    unknown = surface_map(replace(frame, shared_sigma_image=bad), OPTIONS)
+    np.testing.assert_array_equal(unknown.plane_variance, plain.plane_variance)
+
+
+def test_a_shared_error_is_reduced_with_the_image() -> None:
+    frame = wall(sigma=0.004)
+    shared = np.repeat(np.linspace(0.001, 0.02, 88, dtype=np.float32)[None], 72, 0)
+    small = SurfaceOptions(columns=44)
+    plain = surface_map(frame, small)
+    view = surface_map(replace(frame, shared_sigma_image=shared), small)
+    assert view.z.shape == (36, 44)
+    added = np.sqrt((view.plane_variance - plain.plane_variance) / 100)
+    seen = view.planes[..., 3] > 0
+    lengths = np.sqrt(1 + (view.rays**2).sum(-1))
+    wanted = shared[::2, ::2] / lengths * view.planes[..., 3] ** 2
+    np.testing.assert_allclose(added[seen], wanted[seen], rtol=0.15)

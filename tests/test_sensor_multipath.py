@@ -258,6 +258,26 @@ def test_the_part_corrects_depth_of_both_kinds_and_amplitude_of_both_kinds(corne
     np.testing.assert_allclose(even.amplitude_image, wanted, rtol=1e-3)
 
 
+def test_the_doubt_is_a_share_of_the_correction_on_top_of_what_was_known(corner: Seen) -> None:
+    frame = corner.frame()
+    own = np.full(frame.depth.shape, 0.003, np.float32)
+
+    def doubted(given: RangeFrame, doubt: float) -> RangeFrame:
+        fixed = Multipath(gain=GAIN, columns=30, doubt=doubt).start().apply(given)
+        assert isinstance(fixed, RangeFrame)
+        return fixed
+
+    assert doubted(frame, 0).shared_sigma_image is None
+    fixed = doubted(frame, 0.25)
+    moved = np.abs(frame.radial_range - fixed.radial_range)
+    assert np.median(moved) > 0.01
+    assert fixed.shared_sigma_image is not None
+    np.testing.assert_allclose(fixed.shared_sigma_image, moved / 4, atol=1e-6)
+    both = doubted(replace(frame, shared_sigma_image=own), 0.25).shared_sigma_image
+    assert both is not None
+    np.testing.assert_allclose(both, np.hypot(moved / 4, 0.003), atol=1e-6)
+
+
 def test_what_is_not_known_is_left_alone(corner: Seen) -> None:
     frame = corner.frame()
     cloud = CloudFrame.of(frame.points)
@@ -341,6 +361,7 @@ def test_options_that_make_no_sense_are_refused() -> None:
         {"iterations": 0},
         {"columns": 4},
         {"lamp": 0.5},
+        {"doubt": -0.1},
     ):
         with pytest.raises(ValueError, match="must be"):
             Multipath(**options)  # type: ignore[arg-type]

@@ -50,11 +50,10 @@ def seen_from(T: np.ndarray, *planes: Plane) -> Seen:
 
 
 def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
-    surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
     rays = CAMERA.rays().astype(float)
     half = 0.5 / CAMERA.fx
     low, high = rays.min((0, 1)) - half, rays.max((0, 1)) + half
-    around = Around.of(surfaces.nodes, 1.3)
+    around = Around.of(CAMERA.rays(), 1.3)
     left, right = around.rays - around.pitch / 2, around.rays + around.pitch / 2
     overlap = np.clip(np.minimum(right, high) - np.maximum(left, low), 0, None).prod(1)
     assert overlap.max() < 1e-6
@@ -74,8 +73,7 @@ def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
         T = turned(angle)
         surfaces = surfaces_of(seen_from(T, LEFT, RIGHT, FLOOR))
         known.add(surfaces, everywhere(surfaces), T)
-    middle = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
-    around = Around.of(middle.nodes, 1.3)
+    around = Around.of(CAMERA.rays(), 1.3)
     assert not around.albedo.any()
     around.recall(known, np.eye(4))
     found = around.albedo > 0

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.filters._options import above, at_least, whole
+from tofuse.filters._options import above, at_least, whole, within
 from tofuse.filters.correction import Correction, Corrector
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
@@ -48,6 +48,9 @@ class Multipath(Correction):
     lamp
         Angle up to which the lamp lights, relative to that of the image's corner. Around the image
         surfaces are taken to go on.
+    doubt
+        Standard deviation of the correction, as a share of it; neighbouring pixels share its
+        error.
     """
 
     gain: float | None = None
@@ -56,6 +59,7 @@ class Multipath(Correction):
     iterations: int = 3
     columns: int = 44
     lamp: float = 1.2
+    doubt: float = 0.2
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -67,6 +71,7 @@ class Multipath(Correction):
         whole("iterations", self.iterations, 1, 10)
         whole("columns", self.columns, 8, 200)
         at_least("lamp", self.lamp, 1)
+        within("doubt", self.doubt, 0, 10)
 
     def start(self) -> MultipathCorrector:
         """See `Correction.start`."""
@@ -111,7 +116,7 @@ class MultipathCorrector(Corrector):
         if found is None:
             return frame
         self._last = frame.index, found
-        return _corrected(frame, image, found)
+        return _corrected(frame, image, found, self._options.doubt)
 
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """See `Corrector.placed`."""
@@ -146,7 +151,9 @@ def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage 
     return LightImage(z, rays, light.astype(np.float32, copy=False), period_m)
 
 
-def _corrected(frame: RangeFrame, image: LightImage, found: Interference) -> RangeFrame:
+def _corrected(
+    frame: RangeFrame, image: LightImage, found: Interference, doubt: float
+) -> RangeFrame:
     assert frame.amplitude_image is not None
     nearer = np.where(image.z > 0, found.z / np.where(image.z > 0, image.z, 1), 1)
     factor = 1 / found.factor
@@ -154,8 +161,13 @@ def _corrected(frame: RangeFrame, image: LightImage, found: Interference) -> Ran
         factor = factor * nearer**2
     plain = (image.z <= 0) | (frame.amplitude_image >= SATURATED_AMPLITUDE)
     amplitude = np.where(plain, frame.amplitude_image, frame.amplitude_image * factor)
+    shared = frame.shared_sigma_image
+    if doubt > 0:
+        own = doubt * np.abs(frame.radial_range * (1 - nearer))
+        shared = (own if shared is None else np.hypot(shared, own)).astype(np.float32)
     return replace(
         frame,
         depth=(frame.depth * nearer).astype(np.float32),
         amplitude_image=amplitude.astype(np.float32),
+        shared_sigma_image=shared,
     )

@@ -14,6 +14,8 @@ from tofuse.kernels.jit import kernel
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Bool = NDArray[np.bool_]
 
 X, Y, W, LIGHT, AREA, A, B, C, COLUMNS = range(9)
 
@@ -30,6 +32,21 @@ _S0, _S1, _S2, _S3, _S4, _S5 = (
     np.float32(c)
     for c in (6.28318279, -41.34141933, 81.59613741, -76.579674, 41.20368208, -12.26876145)
 )
+
+
+@kernel
+def extent(rays: Float32) -> Float64:
+    """Least and largest x, and least and largest y, of the known rays (H, W, 2); nan if none is."""
+    out = np.full(4, np.nan)
+    for i in range(rays.shape[0]):
+        for j in range(rays.shape[1]):
+            x, y = np.float64(rays[i, j, 0]), np.float64(rays[i, j, 1])
+            if np.isfinite(x) and np.isfinite(y):
+                out[0] = x if not out[0] <= x else out[0]
+                out[1] = x if not out[1] >= x else out[1]
+                out[2] = y if not out[2] <= y else out[2]
+                out[3] = y if not out[3] >= y else out[3]
+    return out
 
 
 @kernel
@@ -193,17 +210,208 @@ def choose_planes(
 
 
 @kernel
-def nearest(x: Float64, y: Float64, nodes: Float64) -> NDArray[np.int64]:
-    """Index (N,) of the nearest of nodes (M, 2) to each place x, y (N,); the first of equals."""
-    out = np.zeros(x.size, np.int64)
-    for i in range(x.size):
-        least = np.inf
-        for j in range(len(nodes)):
-            away = (x[i] - nodes[j, 0]) ** 2 + (y[i] - nodes[j, 1]) ** 2
-            if away < least:
-                least = away
-                out[i] = j
-    return out
+def light_surfaces(
+    nodes: Float64,
+    factor: Float64,
+    falloff: float,
+    least_cosine: float,
+    good: Bool,
+    points: Float64,
+    normals: Float64,
+    values: Float64,
+) -> None:
+    """Geometry and light of nodes (Hn, Wn, COLUMNS) with planes; 0 where there is none.
+
+    Parameters
+    ----------
+    factor
+        (Hn, Wn) by which indirect light has raised the amplitude.
+    falloff
+        Light falls as the cosine to the axis to this power, half of it in the lens and half of it
+        from the lamp.
+    least_cosine
+        Incidence is taken to be no slanter.
+    good, points, normals
+        (Hn, Wn) whether a plane fits; (Hn, Wn, 3) in m; unit, towards the camera.
+    values
+        (5, Hn, Wn): radial range in m, area in m^2, light of the lamp, light sent out, and albedo
+        in counts, see `Surfaces`.
+    """
+    for i in range(nodes.shape[0]):
+        for j in range(nodes.shape[1]):
+            a, b, c = nodes[i, j, A], nodes[i, j, B], nodes[i, j, C]
+            x, y = nodes[i, j, X], nodes[i, j, Y]
+            slope = np.sqrt(a * a + b * b + c * c)
+            w = a * x + b * y + c
+            fits = nodes[i, j, W] > 0 and slope > 0 and w > 0
+            good[i, j] = fits
+            if not fits:
+                for n in range(3):
+                    points[i, j, n] = normals[i, j, n] = 0.0
+                for n in range(5):
+                    values[n, i, j] = 0.0
+                continue
+            length = np.sqrt(1.0 + x * x + y * y)
+            cosine = min(max(w / (slope * length), least_cosine), 1.0)
+            r = length / w
+            half = length ** (-falloff / 2)
+            points[i, j, 0], points[i, j, 1], points[i, j, 2] = x / w, y / w, 1.0 / w
+            normals[i, j, 0], normals[i, j, 1] = -a / slope, -b / slope
+            normals[i, j, 2] = -c / slope
+            values[0, i, j] = r
+            values[1, i, j] = nodes[i, j, AREA] / (w * w * length * cosine)
+            values[2, i, j] = half * cosine / (r * r)
+            values[3, i, j] = nodes[i, j, LIGHT] / half
+            values[4, i, j] = values[3, i, j] / values[2, i, j] / factor[i, j]
+
+
+@kernel
+def seen_sources(
+    good: Bool, points: Float64, normals: Float64, area: Float64, radiosity: Complex, out: Float32
+) -> int:
+    """Make sources of nodes (Hn, Wn): one of every 2 x 2 that are alike, else one of each.
+
+    Alike are nodes whose normal is within 14 degrees of that of the strongest, and that lie off its
+    plane by less than a fiftieth of its range.
+
+    Parameters
+    ----------
+    radiosity
+        Light that the nodes send out, with its phase on leaving.
+    out
+        (S, 9), as `exchange` takes them; S is at least the number of nodes.
+
+    Returns
+    -------
+    How many there are.
+    """
+    rows, columns = good.shape
+    count = 0
+    power = np.empty(4)
+    for top in range(0, rows, 2):
+        for left in range(0, columns, 2):
+            best = -1
+            for n in range(4):
+                i, j = top + n // 2, left + n % 2
+                power[n] = 0.0
+                if i < rows and j < columns and good[i, j]:
+                    power[n] = area[i, j] * abs(radiosity[i, j])
+                if power[n] > 0 and (best < 0 or power[n] > power[best]):
+                    best = n
+            if best < 0:
+                continue
+            p, q = top + best // 2, left + best % 2
+            lead, face = points[p, q], normals[p, q]
+            reach = np.sqrt(lead[0] ** 2 + lead[1] ** 2 + lead[2] ** 2)
+            weight = total = real = imaginary = 0.0
+            x = y = z = u = v = w = 0.0
+            for n in range(4):
+                if not power[n] > 0:
+                    continue
+                i, j = top + n // 2, left + n % 2
+                at, normal = points[i, j], normals[i, j]
+                turn = normal[0] * face[0] + normal[1] * face[1] + normal[2] * face[2]
+                off = (
+                    (at[0] - lead[0]) * face[0]
+                    + (at[1] - lead[1]) * face[1]
+                    + (at[2] - lead[2]) * face[2]
+                )
+                if turn > 0.97 and abs(off) < 0.02 * reach:
+                    weight += power[n]
+                    total += area[i, j]
+                    real += area[i, j] * radiosity[i, j].real
+                    imaginary += area[i, j] * radiosity[i, j].imag
+                    x += power[n] * at[0]
+                    y += power[n] * at[1]
+                    z += power[n] * at[2]
+                    u += power[n] * normal[0]
+                    v += power[n] * normal[1]
+                    w += power[n] * normal[2]
+                    continue
+                for m in range(3):
+                    out[count, m], out[count, 3 + m] = at[m], normal[m]
+                out[count, 6] = area[i, j]
+                out[count, 7], out[count, 8] = radiosity[i, j].real, radiosity[i, j].imag
+                count += 1
+            length = np.sqrt(u * u + v * v + w * w)
+            out[count, 0], out[count, 1], out[count, 2] = x / weight, y / weight, z / weight
+            out[count, 3], out[count, 4], out[count, 5] = u / length, v / length, w / length
+            out[count, 6] = total
+            out[count, 7], out[count, 8] = real / total, imaginary / total
+            count += 1
+    return count
+
+
+@kernel
+def unseen_sources(
+    rays: Float64,
+    size: Float64,
+    planes: Float64,
+    albedo: Float64,
+    border: Float64,
+    border_albedo: Float64,
+    growth: Float64,
+    falloff: float,
+    least_cosine: float,
+    wave_number: float,
+    out: Float32,
+) -> int:
+    """Make sources of the cells around an image that the lamp lights.
+
+    Parameters
+    ----------
+    rays, size
+        (M, 2) centres of the cells; (M,) the area that is lit, in the plane z = 1.
+    planes, albedo
+        (M, 3) of the surface that is known to be there, and (M,) relative to a white wall; where it
+        is 0, the nearest of the border's nodes goes on there.
+    border, border_albedo
+        (N, COLUMNS) nodes with planes, and (N,).
+    growth
+        Least and largest ratio of the inverse depth to the node's at which its plane is followed.
+    wave_number
+        Phase in rad per m of path.
+    out
+        (S, 9), as `exchange` takes them; S is at least M.
+
+    Returns
+    -------
+    How many there are.
+    """
+    count = 0
+    for m in range(len(rays)):
+        x, y = rays[m, 0], rays[m, 1]
+        a, b, c, light = planes[m, 0], planes[m, 1], planes[m, 2], albedo[m]
+        if not light > 0:
+            least = np.inf
+            near = -1
+            for n in range(len(border)):
+                away = (x - border[n, X]) ** 2 + (y - border[n, Y]) ** 2
+                if away < least:
+                    least = away
+                    near = n
+            if near < 0:
+                continue
+            a, b, c = border[near, A], border[near, B], border[near, C]
+            light = border_albedo[near]
+            ratio = (a * x + b * y + c) / border[near, W]
+            if ratio < growth[0] or ratio > growth[1]:
+                continue
+        w = a * x + b * y + c
+        if not w > 0:
+            continue
+        slope = np.sqrt(a * a + b * b + c * c)
+        length = np.sqrt(1.0 + x * x + y * y)
+        r = length / w
+        cosine = min(max(w / (slope * length), least_cosine), 1.0)
+        radiosity = light * length ** (-falloff / 2) * cosine / (r * r)
+        out[count, 0], out[count, 1], out[count, 2] = x / w, y / w, 1.0 / w
+        out[count, 3], out[count, 4], out[count, 5] = -a / slope, -b / slope, -c / slope
+        out[count, 6] = size[m] / (w * w * length * cosine)
+        out[count, 7] = radiosity * np.cos(wave_number * r)
+        out[count, 8] = radiosity * np.sin(wave_number * r)
+        count += 1
+    return count
 
 
 @kernel

@@ -41,6 +41,9 @@ _LEAST_SIGMA = 1e-6
 # Share of the depth below which no camera's errors are: a view without noise, averaged or made by
 # a program, is not known to a hundredth of a millimetre either.
 _LEAST_NOISE = 3e-4
+# An alignment takes pixels for independent. Where so many share an error, they tell together what
+# each of them would with that many times its variance.
+_SHARE_ERROR = 100.0
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ class SurfaceMap:
         (H, W, 4): a, b, c of the plane a X + b Y + c Z = 1 at the pixel, and 1/z on it; 0 where
         there is none.
     plane_variance
-        (H, W) variance of that 1/z, 1/m^2.
+        (H, W) variance of that 1/z, 1/m^2, as if pixels were independent.
     photo
         (H, W, 3) logarithm of the albedo (of amplitude, else of colour), smoothed, and its slopes
         by x/z and y/z; NaN where unknown.
@@ -288,13 +291,17 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
             rows,
             _CHUNKS,
         )
+    variance = quality[..., 1] * np.float32(scale)
+    shared = _shared_sigma(frame, rays)
+    if shared is not None:
+        variance += np.float32(_SHARE_ERROR) * (shared * planes[..., 3] ** 2) ** 2
     return SurfaceMap(
         frame.index,
         rays,
         z,
         sigma * np.float32(np.sqrt(scale)),
         planes,
-        quality[..., 1] * np.float32(scale),
+        variance,
         photo,
         projection,
         has_photo,
@@ -353,6 +360,19 @@ def _own_variance(frame: RangeFrame) -> Float32 | None:
     # The noise is that of the range, along the ray.
     sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
     return np.asarray(sigma * sigma, np.float32)
+
+
+def _shared_sigma(frame: RangeFrame, rays: Float32) -> Float32 | None:
+    """Sigma of z (H, W) in m that pixels share, at the resolution of rays (H, W, 2)."""
+    image = frame.shared_sigma_image
+    if image is None:
+        return None
+    rows, columns = rays.shape[:2]
+    step = image.shape[1] // columns
+    # It varies slowly: a pixel of each block will do.
+    picked = image[step // 2 :: step, step // 2 :: step][:rows, :columns]
+    known = np.isfinite(picked) & (picked > 0)
+    return np.where(known, picked, 0) / np.sqrt(np.float32(1) + (rays * rays).sum(-1))
 
 
 def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:

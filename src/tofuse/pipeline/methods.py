@@ -62,7 +62,7 @@ def default(kind: ViewKind) -> Config:
         return replace(base, odometry=Sequential(registration=icp, guess="previous"))
     return replace(
         base,
-        corrections=(Noise(), Multipath(lamp=1.0)),
+        corrections=(Noise(), Multipath()),
         filters=(),
         model_filters=(Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),

@@ -99,6 +99,9 @@ class RangeFrame:
         (H, W, 3) uint8 RGB at the pixels of depth.
     sigma_image
         (H, W) float32, standard deviation of the range in m.
+    shared_sigma_image
+        (H, W) float32, standard deviation of that error of the range in m which a pixel shares
+        with its neighbours, so that it does not average out; on top of `sigma_image`.
     normal_image
         (H, W, 3) float32 unit normals towards the camera, NaN where unknown.
     amplitude_kind
@@ -126,10 +129,18 @@ class RangeFrame:
     amplitude_kind: AmplitudeKind = "raw"
     ambiguity_m: float | None = None
     color_registered: bool = True
+    shared_sigma_image: Float32 | None = None
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
-        for name in ("depth", "amplitude_image", "confidence_image", "color_image", "sigma_image"):
+        for name in (
+            "depth",
+            "amplitude_image",
+            "confidence_image",
+            "color_image",
+            "sigma_image",
+            "shared_sigma_image",
+        ):
             image = getattr(self, name)
             if image is not None and image.shape[:2] != shape:
                 raise InputError(

@@ -132,8 +132,10 @@ class Reflections:
         """
         step = self._step(image)
         nodes = block_nodes(image.z, image.rays, image.light, step)
-        around = None if known is None or T_world_camera is None else (known, T_world_camera)
-        found = self._at_nodes(nodes, image.period_m, gain, at_edges=True, around=around)
+        around = Around.of(image.rays, self.lamp)
+        if known is not None and T_world_camera is not None:
+            around.recall(known, T_world_camera)
+        found = self._at_nodes(nodes, image.period_m, gain, around, at_edges=True)
         if found is None:
             return None
         shift, ratio, surfaces = found
@@ -163,7 +165,8 @@ class Reflections:
         """
         nodes = block_nodes(image.z, image.rays, image.light, self._step(image))
         measured = ray_ranges(nodes)
-        found = self._at_nodes(nodes, image.period_m, gain, at_edges=False)
+        around = Around.of(image.rays, self.lamp)
+        found = self._at_nodes(nodes, image.period_m, gain, around, at_edges=False)
         if found is None:
             return 0.0
         _correct(nodes, measured, found[0])
@@ -178,9 +181,9 @@ class Reflections:
         nodes: Float64,
         period_m: float,
         gain: float,
+        around: Around,
         *,
         at_edges: bool,
-        around: tuple[LightMap, Float64] | None = None,
     ) -> tuple[Float64, Complex, Surfaces] | None:
         """Bias of the range (Hn, Wn) in m, I / D (Hn, Wn), and the surfaces that they are of.
 
@@ -195,9 +198,6 @@ class Reflections:
         measured = ray_ranges(nodes)
         shift = np.zeros(seen.shape)
         ratio = np.zeros(seen.shape, complex)
-        grid = Around.of(nodes, self.lamp)
-        if around is not None:
-            grid.recall(*around)
         for _ in range(self.iterations):
             _correct(nodes, measured, shift)
             if at_edges:
@@ -207,17 +207,13 @@ class Reflections:
             surfaces = Surfaces.of(nodes, np.abs(1 + ratio))
             if not (surfaces.good & (surfaces.albedo > 0)).any():
                 return None
-            radiosity = surfaces.radiosity / gain
             # Measured there and back; on leaving towards elsewhere the way back is not yet gone.
             phase = 2 * k * measured - k * surfaces.range_m
+            radiosity = surfaces.radiosity / gain * np.exp(1j * phase)
             if self.bounces == "one":
-                radiosity = radiosity / np.abs(1 + ratio)
-                phase = phase - np.angle(1 + ratio)
+                radiosity /= 1 + ratio
             sources = np.concatenate(
-                [
-                    seen_sources(surfaces, radiosity, phase),
-                    grid.sources(surfaces, gain, k),
-                ]
+                [seen_sources(surfaces, radiosity), around.sources(surfaces, gain, k)]
             )
             ratio = _arriving(surfaces, sources, k)
             shift = np.minimum(np.angle(1 + ratio) / (2 * k), measured / 2)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import multipath as kernels
-from tofuse.kernels.multipath import COLUMNS, PATCH, A, C, W, X, Y
+from tofuse.kernels.multipath import PATCH
 from tofuse.sensor.multipath_surfaces import FALLOFF, LEAST_COSINE, Surfaces
 
 Float32 = NDArray[np.float32]
@@ -24,7 +25,7 @@ _CELLS = 12
 # Of the nodes along an image's border, this many rows and columns are taken to go on beyond it.
 _BORDER = 3
 # A plane that runs away, or into the camera, says nothing about what is there.
-_LEAST_GROWTH, _MOST_GROWTH = 0.3, 3.0
+_GROWTH = np.array([0.3, 3.0])
 # Views are remembered when the camera has moved so far since the last that was: rad, and as a share
 # of the depth; and never more than so many.
 _ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
@@ -64,17 +65,18 @@ class LightMap:
             reach = _DISTANCE * float(np.median(surfaces.range_m[lit]))
             if se3.angle(motion) < _ANGLE and np.linalg.norm(motion[:3, 3]) < reach:
                 return
-        cosine = -(surfaces.points * surfaces.normals).sum(-1) / surfaces.range_m
-        pick = (lit & trusted & (cosine > _LEAST_LIT))[::2, ::2]
-        points, normals, albedo, weight = (
-            of[::2, ::2][pick]
-            for of in (surfaces.points, surfaces.normals, surfaces.albedo, cosine)
+        pick = np.zeros_like(lit)
+        pick[::2, ::2] = (lit & trusted)[::2, ::2]
+        points, normals, albedo = (
+            of[pick] for of in (surfaces.points, surfaces.normals, surfaces.albedo)
         )
+        cosine = -(points * normals).sum(-1) / surfaces.range_m[pick]
+        table = np.concatenate([points, normals, albedo[:, None], cosine[:, None]], 1)
+        table = table[cosine > _LEAST_LIT]
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
         # einsum, not a matrix product: BLAS may sum differently with more threads.
-        placed = np.einsum("nc,dc->nd", points, R) + t
-        turned = np.einsum("nc,dc->nd", normals, R)
-        table = np.concatenate([placed, turned, albedo[:, None], weight[:, None]], 1)
+        table[:, :3] = np.einsum("nc,dc->nd", table[:, :3], R) + t
+        table[:, 3:6] = np.einsum("nc,dc->nd", table[:, 3:6], R)
         self._views.append(table.astype(np.float32))
         self._T = T_world_camera
         self._patches = np.concatenate(list(self._views))
@@ -105,40 +107,20 @@ class Around:
     albedo: Float64
 
     @classmethod
-    def of(cls, nodes: Float64, lamp: float) -> Around:
-        """Lay the grid around nodes (Hn, Wn, COLUMNS), whole cells to the image.
+    def of(cls, rays: Float32, lamp: float) -> Around:
+        """Lay the grid around an image, whose rays (H, W, 2) are x/z and y/z, NaN where unknown.
 
         Parameters
         ----------
         lamp
             Angle up to which the lamp lights, relative to that of the image's corner.
         """
-        inside = nodes[..., W] > 0
-        rays = nodes[inside][:, X : Y + 1]
-        cells = np.zeros((0, 2))
-        share = np.zeros(0)
-        pitch = np.ones(2)
-        if len(rays) > 1 and (np.ptp(rays, 0) > 0).all():
-            # A node stands for the half block beyond it as well.
-            half = np.ptp(rays, 0) / (2 * np.maximum(np.array(inside.shape[::-1]) - 1, 1))
-            low, high = rays.min(0) - half, rays.max(0) + half
-            count = np.array(
-                [_CELLS, max(1, round(_CELLS * float(np.divide(*(high - low)[::-1]))))]
-            )
-            pitch = (high - low) / count
-            corner = float(np.arctan(np.sqrt(np.maximum(low**2, high**2).sum())))
-            widest = min(lamp * corner, _WIDEST_LAMP)
-            limit = np.tan(widest)
-            first = np.floor((-limit - low) / pitch)
-            last = np.ceil((limit - low) / pitch)
-            i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
-            gi, gj = (g.ravel() for g in np.meshgrid(i, j))
-            outside = (gi < 0) | (gi >= count[0]) | (gj < 0) | (gj >= count[1])
-            cells = low + (np.stack([gi, gj], 1)[outside] + 0.5) * pitch
-            tangent = np.sqrt((cells**2).sum(1))
-            share = np.clip((limit - tangent) / pitch.mean() + 0.5, 0, 1)
-            cells, share = cells[share > 0], share[share > 0]
-        return cls(pitch, cells, share, np.zeros((len(cells), 3)), np.zeros(len(cells)))
+        left, right, top, bottom = kernels.extent(rays).tolist()
+        # A ray is that of its pixel's middle.
+        x = (right - left) / (2 * max(rays.shape[1] - 1, 1))
+        y = (bottom - top) / (2 * max(rays.shape[0] - 1, 1))
+        cells = _cells(left - x, top - y, right + x, bottom + y, lamp)
+        return cls(*cells, np.zeros((len(cells[1]), 3)), np.zeros(len(cells[1])))
 
     def recall(self, known: LightMap, T_world_camera: Float64) -> None:
         """Set the planes of the cells that show a surface of the map."""
@@ -165,34 +147,43 @@ class Around:
         wave_number
             Phase in rad per m of path.
         """
-        gx, gy = self.rays.T
-        planes, albedo = self.planes.copy(), self.albedo.copy()
-        known = albedo > 0
-        w = (planes[:, 0] * gx + planes[:, 1] * gy + planes[:, 2]) * known
-        border = np.ones(surfaces.good.shape, bool)
+        border = surfaces.good & (surfaces.albedo > 0)
         border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
-        chosen = np.flatnonzero(border & surfaces.good & (surfaces.albedo > 0))
-        new = np.flatnonzero(~known)
-        if len(chosen) and len(new):
-            nodes = surfaces.nodes.reshape(-1, COLUMNS)[chosen]
-            places = np.ascontiguousarray(nodes[:, X : Y + 1])
-            near = kernels.nearest(gx[new].copy(), gy[new].copy(), places)
-            planes[new] = nodes[near, A : C + 1]
-            albedo[new] = surfaces.albedo.reshape(-1)[chosen[near]]
-            w[new] = planes[new, 0] * gx[new] + planes[new, 1] * gy[new] + planes[new, 2]
-            growth = w[new] / nodes[near, W]
-            w[new[(growth < _LEAST_GROWTH) | (growth > _MOST_GROWTH)]] = 0
-        fine = w > 0
-        w, gx, gy, planes, albedo = w[fine], gx[fine], gy[fine], planes[fine], albedo[fine]
-        cell = self.share[fine] * self.pitch.prod()
-        normals = -planes / np.sqrt((planes**2).sum(1))[:, None]
-        points = np.stack([gx, gy, np.ones_like(gx)], -1) / w[:, None]
-        r = np.sqrt((points**2).sum(1))
-        cosine = np.clip(-(normals * points).sum(1) / r, LEAST_COSINE, 1)
-        length = r * w
-        lit = length ** (-FALLOFF / 2) * cosine / r**2
-        radiosity = albedo / gain * lit
-        phase = wave_number * r
-        area = cell / (w * w * length * cosine)
-        light = np.stack([area, radiosity * np.cos(phase), radiosity * np.sin(phase)], -1)
-        return np.concatenate([points, normals, light], 1).astype(np.float32)
+        out = np.empty((len(self.rays), 9), np.float32)
+        count = kernels.unseen_sources(
+            self.rays,
+            self.share * self.pitch.prod(),
+            self.planes,
+            self.albedo / gain,
+            surfaces.nodes[border],
+            surfaces.albedo[border] / gain,
+            _GROWTH,
+            FALLOFF,
+            LEAST_COSINE,
+            wave_number,
+            out,
+        )
+        return out[:count]
+
+
+@lru_cache(maxsize=16)
+def _cells(
+    left: float, top: float, right: float, bottom: float, lamp: float
+) -> tuple[Float64, Float64, Float64]:
+    """Pitch (2,), rays (M, 2) and lit share (M,) of the cells: whole ones to the image."""
+    low, high = np.array([left, top]), np.array([right, bottom])
+    width, height = high - low
+    if not (width > 0 and height > 0):
+        return np.ones(2), np.zeros((0, 2)), np.zeros(0)
+    count = np.array([_CELLS, max(1, round(_CELLS * height / width))])
+    pitch = (high - low) / count
+    corner = float(np.arctan(np.sqrt(np.maximum(low**2, high**2).sum())))
+    limit = float(np.tan(min(lamp * corner, _WIDEST_LAMP)))
+    first, last = np.floor((-limit - low) / pitch), np.ceil((limit - low) / pitch)
+    i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
+    gi, gj = (g.ravel() for g in np.meshgrid(i, j))
+    outside = (gi < 0) | (gi >= count[0]) | (gj < 0) | (gj >= count[1])
+    rays = low + (np.stack([gi, gj], 1)[outside] + 0.5) * pitch
+    # A cell on the border of what is lit counts in part.
+    share = np.clip((limit - np.sqrt((rays**2).sum(1))) / pitch.mean() + 0.5, 0, 1)
+    return pitch, rays[share > 0], share[share > 0]

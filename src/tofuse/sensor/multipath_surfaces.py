@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.kernels import multipath as kernels
-from tofuse.kernels.multipath import AREA, COLUMNS, LIGHT, A, B, C, W, X, Y
+from tofuse.kernels.multipath import COLUMNS, A, W, X, Y
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Complex = NDArray[np.complex128]
 
 # Light in a pixel falls as the cosine of its angle to the axis to this power, in the lens and from
 # the lamp together, and half of it in each.
@@ -105,29 +106,12 @@ class Surfaces:
         factor
             (Hn, Wn) by which indirect light has raised the amplitude, as far as known.
         """
-        x, y = nodes[..., X], nodes[..., Y]
-        slope = np.sqrt((nodes[..., A:] ** 2).sum(-1))
-        w = nodes[..., A] * x + nodes[..., B] * y + nodes[..., C]
-        good = (nodes[..., W] > 0) & (slope > 0) & (w > 0)
-        w, slope = np.where(good, w, 1), np.where(good, slope, 1)
-        length = np.sqrt(1 + x * x + y * y)
-        cosine = np.clip(w / (slope * length), LEAST_COSINE, 1)
-        r = length / w
-        # length is 1 / cosine of the ray's angle to the axis.
-        half = length ** (-FALLOFF / 2)
-        radiosity = nodes[..., LIGHT] / half
-        lit = half * cosine / r**2
-        return cls(
-            nodes,
-            good,
-            np.stack([x / w, y / w, 1 / w], -1),
-            -nodes[..., A:] / slope[..., None],
-            r,
-            nodes[..., AREA] / (w * w * length * cosine),
-            lit,
-            radiosity,
-            radiosity / lit / factor,
-        )
+        shape = nodes.shape[:2]
+        good = np.empty(shape, bool)
+        points, normals = np.empty((*shape, 3)), np.empty((*shape, 3))
+        values = np.empty((5, *shape))
+        kernels.light_surfaces(nodes, factor, FALLOFF, LEAST_COSINE, good, points, normals, values)
+        return cls(nodes, good, points, normals, *values)
 
     def bright(self) -> float:
         """Albedo in counts that a tenth of the surface's area exceeds; 0 without light."""
@@ -140,40 +124,16 @@ class Surfaces:
         return float(albedo[order][np.searchsorted(share, 0.9 * share[-1])])
 
 
-def seen_sources(surfaces: Surfaces, radiosity: Float64, phase: Float64) -> Float32:
+def seen_sources(surfaces: Surfaces, radiosity: Complex) -> Float32:
     """Sources (S, 9) as `kernels.multipath.exchange` takes them: 2 x 2 nodes, one where alike.
 
     Parameters
     ----------
-    radiosity, phase
-        (Hn, Wn) of the light that the nodes send out: strength, and phase in rad on leaving.
+    radiosity
+        (Hn, Wn) of the light that the nodes send out, with its phase on leaving.
     """
-    power = np.where(surfaces.good, surfaces.area * radiosity, 0)
-    table = np.concatenate(
-        [
-            surfaces.points,
-            surfaces.normals,
-            np.where(surfaces.good, surfaces.area, 0)[..., None],
-            (power * np.cos(phase))[..., None],
-            (power * np.sin(phase))[..., None],
-            power[..., None],
-        ],
-        -1,
+    out = np.empty((surfaces.good.size, 9), np.float32)
+    count = kernels.seen_sources(
+        surfaces.good, surfaces.points, surfaces.normals, surfaces.area, radiosity, out
     )
-    rows, columns = (-(-n // 2) for n in surfaces.good.shape)
-    padded = np.zeros((2 * rows, 2 * columns, 10))
-    padded[: table.shape[0], : table.shape[1]] = table
-    fours = padded.reshape(rows, 2, columns, 2, 10).transpose(0, 2, 1, 3, 4).reshape(-1, 4, 10)
-    fours = fours[fours[..., 9].max(1) > 0]
-    lead = fours[np.arange(len(fours)), fours[..., 9].argmax(1)]
-    turn = np.einsum("gmc,gc->gm", fours[..., 3:6], lead[:, 3:6])
-    off = np.abs(np.einsum("gmc,gc->gm", fours[..., :3] - lead[:, None, :3], lead[:, 3:6]))
-    lit = fours[..., 9] > 0
-    alike = lit & (turn > 0.97) & (off < 0.02 * np.linalg.norm(lead[:, :3], axis=1)[:, None])
-    weight = np.where(alike, fours[..., 9], 0)
-    mean = np.einsum("gm,gmc->gc", weight, fours[..., :6]) / weight.sum(1)[:, None]
-    total = np.where(alike[..., None], fours[..., 6:9], 0).sum(1)
-    out = np.concatenate([np.concatenate([mean, total], 1), fours[lit & ~alike][:, :9]])
-    out[:, 3:6] /= np.linalg.norm(out[:, 3:6], axis=1, keepdims=True)
-    out[:, 7:9] /= out[:, 6:7]
-    return out.astype(np.float32)
+    return out[:count]
