@@ -149,7 +149,7 @@ def test_frames_in_between_follow():
 def refiner(part, views, poses):
     out = part.start()
     for view, T in zip(views, poses, strict=True):
-        out.push(view, T)
+        out.push(corner(T), view, T)
     return out.finish(list(range(len(poses))), poses)
 
 
@@ -188,15 +188,15 @@ def test_the_store_never_holds_more_than_it_may():
     store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10))
     for k in range(400):
         store.push(replace(view, index=k), se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])))
-        assert len(store.surfaces) <= 10
-    kept = [s.index for s in store.surfaces]
+        assert len(store.views) <= 10
+    kept = [s.index for s in store.views]
     assert kept[0] == 0
     assert kept[-1] > 300
     assert max(np.diff(kept)) <= 2 * min(np.diff(kept))
     still = ViewStore(Spacing())
     for k in range(5):
         still.push(replace(view, index=k), np.eye(4))
-    assert [s.index for s in still.surfaces] == [0]
+    assert [s.index for s in still.views] == [0]
 
 
 @pytest.mark.parametrize(

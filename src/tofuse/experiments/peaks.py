@@ -8,13 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.experiments.bound import mean_distance, pose_covariances
 from tofuse.geometry import se3
 from tofuse.odometry.sequential import Sequential
 from tofuse.posegraph.build import Measured, chain
 from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.graph import Optimiser
+from tofuse.posegraph.planes import Planes
+from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.icp import algorithm_1
-from tofuse.simulation.peaks import peaks_views
+from tofuse.simulation.peaks import (
+    peaks_cameras,
+    peaks_normals,
+    peaks_points,
+    peaks_seen,
+    peaks_views,
+)
 
 Float64 = NDArray[np.float64]
 
@@ -99,6 +108,33 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
         optimisation.graph.poses,
         truth,
     )
+
+
+def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
+    """Errors after registration from coarse to fine, and after the refinement of all views.
+
+    Nothing is told of the closing motion.
+    """
+    views, truth = peaks_views(sigma, seed)
+    tracker = Sequential(registration=CoarseToFine(), guess="previous").start(seed)
+    refiner = Planes().start()
+    poses: list[Float64] = []
+    for view in views:
+        step = tracker.push(view)
+        poses.append(poses[-1] if step.T_world_camera is None else step.T_world_camera)
+        refiner.push(view, None, poses[-1])
+    start = np.array(poses)
+    refined = refiner.finish([view.index for view in views], start).poses
+    return PoseErrors.of(start, truth), PoseErrors.of(refined, truth)
+
+
+def peaks_bound(sigma: float) -> float:
+    """Lowest mean error (m) of the 20 positions that the surface alone allows; see `bound`."""
+    seen = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
+    for k, rows in enumerate(peaks_seen()):
+        seen[rows, k] = True
+    C = pose_covariances(peaks_points(), peaks_normals(), seen, peaks_cameras(), sigma)
+    return mean_distance(C[:, :3, :3])
 
 
 @dataclass(frozen=True, eq=False)

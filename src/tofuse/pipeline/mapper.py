@@ -158,10 +158,10 @@ class Mapper:
                     self._loops.push(view, step.T_world_camera, step.surface)
                 with self._watch.timing("fusion"):
                     self._model.add(clean, step.surface, _KEPT_POINTS)
+                self._refiner.push(view, step.surface, step.T_world_camera)
                 if step.surface is not None:
                     # Only who looks at surfaces states errors that hold; ICP's are too small.
                     self._knows_errors = True
-                    self._refiner.push(step.surface, step.T_world_camera)
                     # Kept there as far as it is needed, and large.
                     self._steps[-1] = replace(step, surface=None)
                 with self._watch.timing("loops"):

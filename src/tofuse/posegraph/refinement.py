@@ -14,8 +14,9 @@ from tofuse.kernels import refinement as kernels
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.refine import Refined, RefineOptions, refine
+from tofuse.posegraph.refine import RefineOptions, refine
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore
+from tofuse.recordings.frames import Frame
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -70,8 +71,8 @@ class Refinement:
 class Refiner(Protocol):
     """Refinement at work on one recording: holds what it needs of the views so far."""
 
-    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
-        """Add the next view that has a pose."""
+    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
+        """Add the next view that has a pose, with its surface where the tracker prepared one."""
         ...
 
     def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
@@ -100,7 +101,7 @@ class NoRefinement(Refining):
 
 
 class _Idle(Refiner):
-    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
+    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
         """Keep nothing."""
 
     def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
@@ -146,17 +147,18 @@ class Joint(Refining):
 class _Joint(Refiner):
     def __init__(self, options: Joint) -> None:
         self._options = options
-        self._store = ViewStore(options.spacing)
+        self._store: ViewStore[SurfaceMap] = ViewStore(options.spacing)
 
-    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
+    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
         """See `Refiner.push`."""
-        self._store.push(surface.thinned(_COLUMNS), T_world_camera)
+        if surface is not None:
+            self._store.push(surface.thinned(_COLUMNS), T_world_camera)
 
     def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
         """See `Refiner.finish`."""
         options = self._options
         row = {int(index): k for k, index in enumerate(ids)}
-        views = [KeptView.of(s, options.refine.points) for s in self._store.surfaces]
+        views = [KeptView.of(s, options.refine.points) for s in self._store.views]
         at = np.array([row[v.surface.index] for v in views], np.intp)
         if len(views) < 2:
             return Refinement(poses, views=len(views))
@@ -168,7 +170,7 @@ class _Joint(Refiner):
         unchanged = Refinement(poses, False, len(views), len(refined.pairs), support=mean)
         if not len(refined.pairs) or mean[1] < mean[0]:
             return unchanged
-        after = _without_losers(before, refined, support[1] < support[0] - options.loss)
+        after = without_losers(before, refined.poses, support[1] < support[0] - options.loss)
         motion = se3.log(se3.inverse(before) @ after)
         return replace(
             unchanged,
@@ -186,14 +188,22 @@ class _Joint(Refiner):
         )
 
 
-def _without_losers(before: Float64, refined: Refined, lost: NDArray[np.bool_]) -> Float64:
-    """The refined poses, but views that lost support stay where a neighbour had them."""
-    after = refined.poses.copy()
+def without_losers(before: Float64, after: Float64, lost: NDArray[np.bool_]) -> Float64:
+    """Poses (N, 4, 4) `after`, but views that lost support stay where a neighbour had them.
+
+    Parameters
+    ----------
+    before
+        (N, 4, 4) poses that were refined.
+    lost
+        (N,) views that lost support.
+    """
+    out = after.copy()
     good = np.flatnonzero(~lost)
     for k in np.flatnonzero(lost) if len(good) else ():
         near = good[np.argmin(np.abs(good - k))]
-        after[k] = after[near] @ se3.inverse(before[near]) @ before[k]
-    return se3.inverse(after[0]) @ after if lost[0] else after
+        out[k] = out[near] @ se3.inverse(before[near]) @ before[k]
+    return se3.inverse(out[0]) @ out if lost[0] else out
 
 
 def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:

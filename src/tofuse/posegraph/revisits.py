@@ -137,7 +137,7 @@ class Revisits(LoopDetector):
 class _RevisitLoops(Loops):
     def __init__(self, options: Revisits, given: Sequence[GivenLoop]) -> None:
         self._options = options
-        self._store = ViewStore(options.spacing)
+        self._store: ViewStore[SurfaceMap] = ViewStore(options.spacing)
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
         self._asked = {frame for loop in given for frame in (loop.i, loop.j)}
@@ -157,7 +157,7 @@ class _RevisitLoops(Loops):
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
         """See `Loops.look`."""
-        surfaces = self._store.surfaces
+        surfaces = self._store.views
         if not surfaces or surfaces[-1].index != next(reversed(self._poses)):
             return None
         newest = len(surfaces) - 1
@@ -166,7 +166,7 @@ class _RevisitLoops(Loops):
         return (lambda: [self._confirm(*pair) for pair in ends]) if ends else None
 
     def _views(self) -> list[KeptView]:
-        surfaces = self._store.surfaces
+        surfaces = self._store.views
         self._kept = {s.index: self._kept.get(s.index) or KeptView.of(s, _POINTS) for s in surfaces}
         return list(self._kept.values())
 
@@ -175,7 +175,7 @@ class _RevisitLoops(Loops):
 
     def finish(self) -> list[ClosedLoop]:
         """See `Loops.finish`. What a person gives takes the place of what was found."""
-        surfaces = self._store.surfaces
+        surfaces = self._store.views
         closed = {
             (surfaces[i].index, surfaces[j].index): self._confirm(surfaces[i], surfaces[j])
             for i, j in self._options.candidates(self._views(), self._poses_of(surfaces))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,37 +72,54 @@ class Spacing:
             raise ValueError(f"most is {self.most}, not 2 to 100000")
 
 
-class ViewStore:
+class Placed(Protocol):
+    """What is kept of a view."""
+
+    @property
+    def index(self) -> int:
+        """Of the frame in its recording."""
+        ...
+
+    @property
+    def depth(self) -> float:
+        """Median distance of what it sees, m."""
+        ...
+
+
+V = TypeVar("V", bound=Placed)
+
+
+class ViewStore(Generic[V]):
     """Keeps views spaced by the motion of the camera, and never more than a fixed number.
 
     Attributes
     ----------
-    surfaces
+    views
         The kept views, oldest first; the first one that was pushed stays.
     """
 
     def __init__(self, spacing: Spacing) -> None:
-        self.surfaces: list[SurfaceMap] = []
+        self.views: list[V] = []
         self._poses: list[Float64] = []
         self._spacing = spacing
         self._stretch = 1.0
 
-    def push(self, surface: SurfaceMap, T_world_camera: Float64) -> None:
+    def push(self, view: V, T_world_camera: Float64) -> None:
         """Add the next view that has a pose."""
-        if self.surfaces and not self._far(surface, self._poses[-1], T_world_camera):
+        if self.views and not self._far(view, self._poses[-1], T_world_camera):
             return
-        self.surfaces.append(surface)
+        self.views.append(view)
         self._poses.append(T_world_camera)
-        if len(self.surfaces) > self._spacing.most:
-            self.surfaces, self._poses = self.surfaces[::2], self._poses[::2]
+        if len(self.views) > self._spacing.most:
+            self.views, self._poses = self.views[::2], self._poses[::2]
             self._stretch *= 2
 
-    def _far(self, surface: SurfaceMap, T_before: Float64, T: Float64) -> bool:
+    def _far(self, view: V, T_before: Float64, T: Float64) -> bool:
         motion = se3.inverse(T_before) @ T
         s = self._spacing
         return bool(
             se3.angle(motion) >= s.angle * self._stretch
-            or np.linalg.norm(motion[:3, 3]) >= s.distance * self._stretch * surface.depth
+            or np.linalg.norm(motion[:3, 3]) >= s.distance * self._stretch * view.depth
         )
 
 

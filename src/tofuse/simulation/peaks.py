@@ -37,6 +37,17 @@ def peaks_points() -> Float64:
     return np.stack([x, peaks(x, y), y], -1).reshape(-1, 3)[:POINTS]
 
 
+def peaks_normals() -> Float64:
+    """(5000, 3) unit normals of the surface at `peaks_points`, pointing up."""
+    points = peaks_points()
+    x, y = points[:, 0], points[:, 2]
+    step = 1e-5
+    slope_x = (peaks(x + step, y) - peaks(x - step, y)) / (2 * step)
+    slope_y = (peaks(x, y + step) - peaks(x, y - step)) / (2 * step)
+    normals = np.stack([-slope_x, np.ones_like(x), -slope_y], -1)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
 def peaks_cameras() -> Float64:
     """(20, 4, 4) T_object_camera of the cameras, 18 degrees apart, 10 m from the origin.
 
@@ -52,6 +63,13 @@ def peaks_cameras() -> Float64:
     T[:, :3, 0] = np.cross(T[:, :3, 1], T[:, :3, 2])
     T[:, :3, 3] = position
     return T
+
+
+def peaks_seen() -> list[NDArray[np.intp]]:
+    """Rows of `peaks_points` that each camera sees: the 2500 nearest to it, ascending."""
+    points = peaks_points()
+    distances = [np.linalg.norm(points - T[:3, 3], axis=1) for T in peaks_cameras()]
+    return [np.sort(np.argsort(d, kind="stable")[:POINTS_PER_VIEW]) for d in distances]
 
 
 def peaks_views(sigma: float, seed: int) -> tuple[list[CloudFrame], Float64]:
@@ -75,10 +93,8 @@ def peaks_views(sigma: float, seed: int) -> tuple[list[CloudFrame], Float64]:
     points = peaks_points()
     T_object_camera = peaks_cameras()
     views = []
-    for k, T in enumerate(T_object_camera):
-        distance = np.linalg.norm(points - T[:3, 3], axis=1)
-        nearest = np.sort(np.argsort(distance, kind="stable")[:POINTS_PER_VIEW])
-        seen = se3.transform(se3.inverse(T), points[nearest])
+    for k, (T, rows) in enumerate(zip(T_object_camera, peaks_seen(), strict=True)):
+        seen = se3.transform(se3.inverse(T), points[rows])
         noise = np.random.default_rng([seed, k]).normal(size=seen.shape)
         cloud = (seen + sigma * noise).astype(np.float32)
         views.append(CloudFrame(k, float(k), cloud))

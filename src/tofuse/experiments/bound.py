@@ -1,0 +1,63 @@
+"""The lowest error that unbiased estimates of poses can have from a surface that nobody knows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+_DRAWS = 20_000
+
+
+def pose_covariances(
+    points: Float64, normals: Float64, seen: Bool, poses: Float64, sigma: float
+) -> Float64:
+    """Cramer-Rao bound of poses from the distances of their points from a surface.
+
+    Every point has isotropic noise, of which only the part along the normal counts: where on the
+    surface a point lies is not known. Nor is the height of the surface at any of the samples,
+    which is eliminated from the Fisher information; the first pose is known.
+
+    Parameters
+    ----------
+    points, normals
+        (S, 3) samples of the surface in the frame of the poses, and its unit normals.
+    seen
+        (S, N) which sample each view sees.
+    poses
+        (N, 4, 4) true poses, which map a view into the frame of the points.
+    sigma
+        Standard deviation of each coordinate of a point, m.
+
+    Returns
+    -------
+    (N, 6, 6) covariances of the right perturbations of the poses (m, rad); 0 for the first.
+    """
+    samples, views = seen.shape
+    J = np.zeros((samples, views, 6))
+    H = np.zeros((views, 6, views, 6))
+    for k, T in enumerate(poses):
+        p = se3.transform(se3.inverse(T), points)
+        m = normals @ T[:3, :3]
+        J[:, k] = np.hstack([m, np.cross(p, m)]) * seen[:, [k]]
+        H[k, :, k] = J[:, k].T @ J[:, k]
+    # The height of a sample is best taken from all who see it.
+    J /= np.sqrt(np.maximum(seen.sum(1), 1))[:, None, None]
+    rows = J.reshape(samples, -1)
+    information = H.reshape(6 * views, 6 * views) - rows.T @ rows
+    C = np.zeros((views, 6, views, 6))
+    inverse = sigma**2 * np.linalg.inv(information[6:, 6:])
+    C[1:, :, 1:] = inverse.reshape(views - 1, 6, views - 1, 6)
+    return C[np.arange(views), :, np.arange(views)]
+
+
+def mean_distance(covariances: Float64) -> float:
+    """Mean length of normal vectors with covariances (N, 3, 3), over all of them."""
+    values = np.linalg.eigvalsh(covariances)
+    draws = np.random.default_rng([0]).normal(size=(_DRAWS, 1, 3))
+    lengths = np.linalg.norm(draws * np.sqrt(np.maximum(values, 0)), axis=2)
+    return float(lengths.mean())

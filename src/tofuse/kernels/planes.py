@@ -1,0 +1,236 @@
+"""Planes that many views share, and the normal equations of all poses without them.
+
+All points lie in cells, and each cell has one plane. With x a point of the world, c the mean of
+its cell and n, u, v the axes of the cell's points (n across), the residual of a point is
+``r = n . (x - c)``. It moves with the pose of its view by J, and with the plane by
+``b = (1, u . (x - c), v . (x - c))``: its offset and its two slopes. The planes are eliminated
+from the normal equations (Schur complement), so that what a view says of a plane that no other
+view sees says nothing of its pose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.cloud_shape import symmetric_eigen
+from tofuse.kernels.jit import kernel
+from tofuse.kernels.projection import jacobian_row
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_FLAT = 1e-9
+
+
+@kernel
+def fit_cells(
+    x: Float64,
+    view: Int64,
+    start: Int64,
+    mean: Float64,
+    axes: Float64,
+    spread: Float64,
+    views: Int64,
+) -> None:
+    """Mean, axes and spread of the points of each cell, and how many views see it.
+
+    Parameters
+    ----------
+    x, view
+        (M, 3) points of the world and (M,) their views, by cell and within it by view.
+    start
+        (S + 1,) where the points of each cell begin.
+    mean, axes, spread, views
+        (S, 3), (S, 3, 3), (S, 3) and (S,), to write to. Axes are in rows, and the variances along
+        them rise; they are 0 where there are fewer than four points.
+    """
+    C = np.empty((3, 3))
+    vectors = np.empty((3, 3))
+    for s in range(len(start) - 1):
+        a, b = start[s], start[s + 1]
+        mean[s] = 0.0
+        axes[s] = 0.0
+        spread[s] = 0.0
+        views[s] = 0
+        for k in range(a, b):
+            for c in range(3):
+                mean[s, c] += x[k, c]
+            if k == a or view[k] != view[k - 1]:
+                views[s] += 1
+        if b - a < 4:
+            continue
+        for c in range(3):
+            mean[s, c] /= b - a
+        C[:, :] = 0.0
+        for k in range(a, b):
+            for c in range(3):
+                for d in range(3):
+                    C[c, d] += (x[k, c] - mean[s, c]) * (x[k, d] - mean[s, d])
+        for c in range(3):
+            for d in range(3):
+                C[c, d] /= b - a - 3
+        symmetric_eigen(C, spread[s], vectors)
+        for c in range(3):
+            for d in range(3):
+                axes[s, c, d] = vectors[d, c]
+
+
+@kernel
+def plane_equations(
+    p: Float64,
+    x: Float64,
+    view: Int64,
+    start: Int64,
+    mean: Float64,
+    axes: Float64,
+    variance: Float64,
+    rotations: Float64,
+    number: Int64,
+    robust: float,
+    own: Float64,
+    gradient: Float64,
+    mixed: Float64,
+) -> None:
+    """Add the normal equations of the cells to those of the poses, without the planes.
+
+    Parameters
+    ----------
+    p, x, view, start
+        Points (M, 3) as the views gave them and in the world, as in `fit_cells`.
+    mean, axes
+        As from `fit_cells`.
+    variance
+        (S,) of the residuals of each cell; 0 where it takes no part.
+    rotations
+        (N, 3, 3) of the poses T_world_camera.
+    number
+        (N, N) row in `mixed` of each pair of views i < j.
+    robust
+        Residuals beyond so many standard deviations count nothing (Tukey's biweight).
+    own, gradient, mixed
+        (N, 6, 6), (N, 6) and (pairs, 6, 6), to add to: of right perturbations of the poses.
+    """
+    J = np.empty(6)
+    b = np.empty(3)
+    most = 1
+    for s in range(len(start) - 1):
+        most = max(most, start[s + 1] - start[s])
+    most = min(most, len(rotations))
+    F = np.empty((most, 6, 3))
+    E = np.empty((most, 6, 3))
+    of = np.empty(most, np.int64)
+    B = np.empty((3, 3))
+    h = np.empty(3)
+    for s in range(len(start) - 1):
+        if variance[s] <= 0:
+            continue
+        seen = 0
+        B[:, :] = 0.0
+        h[:] = 0.0
+        n0, n1, n2 = axes[s, 0, 0], axes[s, 0, 1], axes[s, 0, 2]
+        for k in range(start[s], start[s + 1]):
+            i = view[k]
+            if seen == 0 or of[seen - 1] != i:
+                of[seen] = i
+                F[seen] = 0.0
+                seen += 1
+            d0, d1, d2 = x[k, 0] - mean[s, 0], x[k, 1] - mean[s, 1], x[k, 2] - mean[s, 2]
+            r = n0 * d0 + n1 * d1 + n2 * d2
+            e2 = r * r / (variance[s] * robust * robust)
+            if e2 >= 1:
+                continue
+            w = (1 - e2) * (1 - e2) / variance[s]
+            R = rotations[i]
+            jacobian_row(
+                J,
+                R[0, 0] * n0 + R[1, 0] * n1 + R[2, 0] * n2,
+                R[0, 1] * n0 + R[1, 1] * n1 + R[2, 1] * n2,
+                R[0, 2] * n0 + R[1, 2] * n1 + R[2, 2] * n2,
+                p[k, 0],
+                p[k, 1],
+                p[k, 2],
+            )
+            b[0] = 1.0
+            for c in range(1, 3):
+                b[c] = axes[s, c, 0] * d0 + axes[s, c, 1] * d1 + axes[s, c, 2] * d2
+            for c in range(3):
+                h[c] += w * b[c] * r
+                for d in range(3):
+                    B[c, d] += w * b[c] * b[d]
+            for c in range(6):
+                wJ = w * J[c]
+                gradient[i, c] += wJ * r
+                for d in range(6):
+                    own[i, c, d] += wJ * J[d]
+                for d in range(3):
+                    F[seen - 1, c, d] += wJ * b[d]
+        # Cholesky: B = L L^T, in place. A slope that nothing holds is left out.
+        first0, first1, first2 = B[0, 0], B[1, 1], B[2, 2]
+        for c in range(3):
+            first = first0 if c == 0 else (first1 if c == 1 else first2)
+            rest = B[c, c]
+            for e in range(c):
+                rest -= B[c, e] * B[c, e]
+            B[c, c] = np.sqrt(rest) if rest > _FLAT * first else 0.0
+            for d in range(c + 1, 3):
+                value = B[d, c]
+                for e in range(c):
+                    value -= B[d, e] * B[c, e]
+                B[d, c] = value / B[c, c] if B[c, c] > 0 else 0.0
+        for c in range(3):
+            for e in range(c):
+                h[c] -= B[c, e] * h[e]
+            h[c] = h[c] / B[c, c] if B[c, c] > 0 else 0.0
+        # E = F L^-T, so that F B^-1 F^T = E E^T.
+        for j in range(seen):
+            for a in range(6):
+                for c in range(3):
+                    value = F[j, a, c]
+                    for e in range(c):
+                        value -= B[c, e] * E[j, a, e]
+                    E[j, a, c] = value / B[c, c] if B[c, c] > 0 else 0.0
+                    gradient[of[j], a] -= E[j, a, c] * h[c]
+        for j in range(seen):
+            for i in range(j + 1):
+                out = own[of[j]] if i == j else mixed[number[of[i], of[j]]]
+                for a in range(6):
+                    for c in range(6):
+                        value = 0.0
+                        for e in range(3):
+                            value += E[i, a, e] * E[j, c, e]
+                        out[a, c] -= value
+
+
+@kernel
+def plane_support(
+    x: Float64,
+    view: Int64,
+    start: Int64,
+    mean: Float64,
+    axes: Float64,
+    views: Int64,
+    limit: float,
+    support: Float64,
+) -> None:
+    """Add what supports each view: its points on planes that other views see as well.
+
+    Parameters
+    ----------
+    x, view, start, mean, axes, views
+        As in `fit_cells`.
+    limit
+        Distance from the plane, m, at which a point supports nothing (Tukey's biweight).
+    support
+        (N,) to add to: 1 for a point on a plane.
+    """
+    for s in range(len(start) - 1):
+        if views[s] < 2:
+            continue
+        for k in range(start[s], start[s + 1]):
+            r = 0.0
+            for c in range(3):
+                r += axes[s, 0, c] * (x[k, c] - mean[s, c])
+            e2 = r * r / (limit * limit)
+            if e2 < 1:
+                support[view[k]] += (1 - e2) ** 3

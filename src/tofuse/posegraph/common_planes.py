@@ -1,0 +1,365 @@
+"""Refinement of clouds over all that overlap: planes that they share, and all poses, at once.
+
+The maximum likelihood of eq 2.8 for a surface that nobody knows: the points of all views together
+are cut into cells, each with a plane, and the poses move to where the points lie nearest to these
+planes. The planes are unknowns as well, and are eliminated from the normal equations (bundle
+adjustment of planes; Liu and Zhang 2021, "BALM"). Then points look for their cells again, and
+cells shrink from coarse to fine, for as long as the noise leaves planes in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels import planes as kernels
+from tofuse.kernels.kdtree import KdTree
+from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph.sparse import Factor, PairSystem
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Integers = NDArray[np.intp]
+
+# Rounds in which cells move to the middle of their points, which lays them along the surface.
+_SETTLING = 2
+# Each chunk has its own blocks of all pairs.
+_CHUNKS = 8
+# Little compared with what a cell knows of a pose, so that what nothing holds stays.
+_DAMPING = 1e-6
+# Cells much thinner than the others are so by chance.
+_THINNEST = 0.25
+
+
+@dataclass(frozen=True)
+class PlaneOptions:
+    """How clouds are refined together.
+
+    Attributes
+    ----------
+    coarsest
+        Size of the first cells, as a share of the diagonal of the middle 90 % of all points.
+    shrink
+        Size of the next cells by that of the last.
+    iterations
+        With each size, unless nothing moves; three times as many with the last.
+    least
+        Points of a cell, at least; and half as many again in the median cell.
+    flatness
+        Cells shrink while the median cell's thickness is at most this share of its width (of the
+        shorter side; both as standard deviations).
+    divisions
+        Ways of cutting the points into the last cells, each shifted; their mean counts.
+    robust
+        Residuals beyond so many standard deviations count nothing (Tukey's biweight).
+    settled
+        Iterations end when points move by less, as a share of the size of the cells.
+    """
+
+    coarsest: float = 0.2
+    shrink: float = 0.8
+    iterations: int = 4
+    least: int = 10
+    flatness: float = 0.6
+    divisions: int = 4
+    robust: float = 3.5
+    settled: float = 0.002
+
+    def __post_init__(self) -> None:
+        for name in ("coarsest", "shrink", "flatness"):
+            if not 0.01 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0.01 to below 1")
+        if not 1 <= self.iterations <= 1000:
+            raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
+        if not 1 <= self.divisions <= 100:
+            raise ValueError(f"divisions is {self.divisions}, not 1 to 100")
+        if self.least < 4:
+            raise ValueError(f"least is {self.least}, not 4 or more")
+        for name in ("robust", "settled"):
+            if not 1e-6 <= getattr(self, name) <= 1e6:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """What a refinement of clouds found.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera; the first of each connected part has not moved.
+    pairs
+        (M, 2) positions of the views i < j that share planes.
+    covariance
+        (M, 6, 6) of the right perturbations of their relative poses T_i_j, as far as the noise
+        tells, all views taken together.
+    size
+        Of the last cells, m; 0 where there were none.
+    sigma
+        Standard deviation of the points across the surface, m.
+    before, after
+        (N,) support of each view at the poses to start from and at those found: 1 where all its
+        points lie on planes that other views see as well.
+    """
+
+    poses: Float64
+    pairs: Integers
+    covariance: Float64
+    size: float
+    sigma: float
+    before: Float64
+    after: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """The points of all views, one view after the other."""
+
+    p: Float64
+    view: Int64
+    count: int
+
+    def world(self, poses: Float64) -> Float64:
+        """(M, 3) where the poses put them."""
+        chunks = run_chunks(
+            lambda a, b: (
+                np.einsum("kij,kj->ki", poses[self.view[a:b], :3, :3], self.p[a:b])
+                + poses[self.view[a:b], :3, 3]
+            ),
+            len(self.p),
+        )
+        return np.concatenate(chunks) if chunks else np.zeros((0, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Points sorted into cells, and the plane of each."""
+
+    order: Integers
+    start: Int64
+    p: Float64
+    x: Float64
+    view: Int64
+    mean: Float64
+    axes: Float64
+    spread: Float64
+    views: Int64
+
+    @cached_property
+    def shared(self) -> NDArray[np.bool_]:
+        """(S,) cells that several views see."""
+        return self.views > 1
+
+    def typical(self) -> tuple[float, float, float]:
+        """Thickness and width (m) and number of points of the median cell that is shared."""
+        if not self.shared.any():
+            return np.inf, 1.0, 0.0
+        deviation = np.sqrt(np.maximum(self.spread[self.shared], 0))
+        thick, wide = np.median(deviation[:, :2], axis=0)
+        return float(thick), float(wide), float(np.median(np.diff(self.start)[self.shared]))
+
+
+def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptions) -> Aligned:
+    """Move all views until their points lie nearest to the planes that they share.
+
+    Parameters
+    ----------
+    clouds
+        (n, 3) points of each view, in its frame.
+    poses
+        (N, 4, 4) T_world_camera to start from; the first of each connected part stays.
+    """
+    start = poses
+    points = _Points(
+        np.ascontiguousarray(np.concatenate(clouds), np.float64),
+        np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]),
+        len(clouds),
+    )
+    size = options.coarsest * _extent(points.world(poses))
+    best: tuple[float, Float64] | None = None
+    while size > 0:
+        moved, cells = _level(points, poses, size, options.iterations, options)
+        thick, wide, most = cells[0].typical()
+        if most < 1.5 * options.least:
+            break
+        flat = thick <= options.flatness * wide
+        if best is not None and not flat:
+            break
+        poses = moved
+        if flat:
+            best = size, moved
+        size *= options.shrink
+    if best is None:
+        return _unmoved(start)
+    size, poses = best
+    poses, cells = _level(points, poses, size, 3 * options.iterations, options, options.divisions)
+    sigma = cells[0].typical()[0]
+    limit = options.robust * sigma
+    factor, system = _system(points, poses, cells, options)
+    if factor is None:
+        return _unmoved(start)
+    i, j = system.pairs.T
+    relative = se3.inverse(poses[i]) @ poses[j]
+    covariance = factor.relative_covariances(relative)
+    first = _cells(points, start, _centres(points, start, size))
+    return Aligned(
+        poses,
+        system.pairs,
+        covariance,
+        size,
+        sigma,
+        _support(points, first, limit),
+        _support(points, cells[0], limit),
+    )
+
+
+def _unmoved(poses: Float64) -> Aligned:
+    none = np.zeros(len(poses))
+    return Aligned(poses, np.zeros((0, 2), np.intp), np.zeros((0, 6, 6)), 0.0, 0.0, none, none)
+
+
+def _level(
+    points: _Points,
+    poses: Float64,
+    size: float,
+    iterations: int,
+    options: PlaneOptions,
+    divisions: int = 1,
+) -> tuple[Float64, list[_Cells]]:
+    """Iterate with cells of one size; the cells are those of the poses found."""
+    shifts = np.arange(divisions) / divisions
+    cells = [_cells(points, poses, _centres(points, poses, size, shift)) for shift in shifts]
+    for _ in range(iterations):
+        factor, _ = _system(points, poses, cells, options)
+        step = factor.step() if factor is not None else None
+        if step is None:
+            break
+        before = poses
+        poses = se3.orthonormalise(poses @ se3.exp(step))
+        cells = [_cells(points, poses, c.mean[np.diff(c.start) > 0]) for c in cells]
+        motion = np.abs(points.world(poses) - points.world(before)).mean()
+        if motion < options.settled * size:
+            break
+    return poses, cells
+
+
+def _extent(x: Float64) -> float:
+    if not len(x):
+        return 0.0
+    low, high = np.percentile(x, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _centres(points: _Points, poses: Float64, size: float, shift: float = 0.0) -> Float64:
+    """Middles of cells of about one size: of cubes at first, then along the surface."""
+    x = points.world(poses)
+    cube = np.floor((x - x.min(0)) / size + shift).astype(np.int64)
+    _, cell = np.unique(cube, axis=0, return_inverse=True)
+    centres = _means(x, cell.ravel())
+    for _ in range(_SETTLING):
+        centres = _means(x, KdTree(centres).nearest(x)[0])
+    return centres
+
+
+def _means(x: Float64, cell: Int64) -> Float64:
+    count = np.bincount(cell)
+    sums = np.stack([np.bincount(cell, x[:, a]) for a in range(3)], 1)
+    return sums[count > 0] / count[count > 0, None]
+
+
+def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
+    """Give each point to the nearest centre, and fit the planes."""
+    x = points.world(poses)
+    cell, _ = KdTree(centres).nearest(x)
+    # Points are in the order of their views already.
+    order = np.argsort(cell, kind="stable")
+    size = len(centres)
+    start = np.searchsorted(cell[order], np.arange(size + 1)).astype(np.int64)
+    x, view = x[order], points.view[order]
+    mean, axes = np.empty((size, 3)), np.empty((size, 3, 3))
+    spread, views = np.empty((size, 3)), np.empty(size, np.int64)
+
+    def work(a: int, b: int) -> None:
+        kernels.fit_cells(x, view, start[a : b + 1], mean[a:b], axes[a:b], spread[a:b], views[a:b])
+
+    run_chunks(work, size)
+    return _Cells(order, start, points.p[order], x, view, mean, axes, spread, views)
+
+
+def _system(
+    points: _Points, poses: Float64, divisions: Sequence[_Cells], options: PlaneOptions
+) -> tuple[Factor | None, PairSystem]:
+    """Normal equations of all poses, the planes eliminated; the mean of several divisions."""
+    n = points.count
+    variances = [_variance(cells, options.least) for cells in divisions]
+    pairs = _pairs(divisions, variances, n)
+    number = np.full((n, n), -1, np.int64)
+    number[pairs[:, 0], pairs[:, 1]] = np.arange(len(pairs))
+    rotations = np.ascontiguousarray(poses[:, :3, :3])
+    own, gradient = np.zeros((n, 6, 6)), np.zeros((n, 6))
+    mixed = np.zeros((len(pairs), 6, 6))
+    for cells, variance in zip(divisions, variances, strict=True):
+
+        def work(
+            a: int, b: int, cells: _Cells = cells, variance: Float64 = variance
+        ) -> tuple[Float64, Float64, Float64]:
+            out = np.zeros_like(own), np.zeros_like(gradient), np.zeros_like(mixed)
+            kernels.plane_equations(
+                cells.p,
+                cells.x,
+                cells.view,
+                cells.start[a : b + 1],
+                cells.mean[a:b],
+                cells.axes[a:b],
+                variance[a:b],
+                rotations,
+                number,
+                options.robust,
+                *out,
+            )
+            return out
+
+        for parts in run_chunks(work, len(variance), _CHUNKS):
+            for total, part in zip((own, gradient, mixed), parts, strict=True):
+                total += part / len(divisions)
+    system = PairSystem(n, pairs)
+    none, flat = np.zeros_like(mixed), np.zeros((len(pairs), 6))
+    matrix, right = system.assemble(none, mixed, none, flat, flat, (own, gradient))
+    return system.factor(matrix, right, _DAMPING), system
+
+
+def _variance(cells: _Cells, least: int) -> Float64:
+    """(S,) of the residuals of each cell, 0 where it holds too few points or one view."""
+    enough = cells.shared & (np.diff(cells.start) >= least)
+    variance = np.where(enough, cells.spread[:, 0], 0.0)
+    if enough.any():
+        floor = _THINNEST * float(np.median(variance[enough]))
+        variance[enough] = np.maximum(variance[enough], max(floor, 1e-18))
+    return variance
+
+
+def _pairs(divisions: Sequence[_Cells], variances: Sequence[Float64], n: int) -> Integers:
+    """Pairs of views i < j that see the same cell."""
+    common = np.zeros((n, n))
+    for cells, variance in zip(divisions, variances, strict=True):
+        cell = np.repeat(np.arange(len(variance)), np.diff(cells.start))
+        sees = np.zeros((len(variance), n))
+        sees[cell, cells.view] = 1
+        sees = sees[variance > 0]
+        common += sees.T @ sees
+    return np.argwhere(np.triu(common, 1) > 0).astype(np.intp)
+
+
+def _support(points: _Points, cells: _Cells, limit: float) -> Float64:
+    out = np.zeros(points.count)
+    kernels.plane_support(
+        cells.x, cells.view, cells.start, cells.mean, cells.axes, cells.views, limit, out
+    )
+    total = np.bincount(points.view, minlength=points.count)
+    found: Float64 = out / np.maximum(total, 1)
+    return found

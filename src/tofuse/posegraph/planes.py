@@ -1,0 +1,120 @@
+"""Refinement of clouds as a part: planes that all views share (see `common_planes`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.parts import part
+from tofuse.posegraph.build import Measured
+from tofuse.posegraph.common_planes import Aligned, PlaneOptions, refine_clouds
+from tofuse.posegraph.refinement import (
+    Refinement,
+    Refiner,
+    Refining,
+    followed,
+    without_losers,
+)
+from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
+
+
+@part("refinement", "planes")
+@dataclass(frozen=True)
+class Planes(Refining):
+    """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
+
+    See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
+    them. The outcome is believed only if the views support each other at least as well as before,
+    and views that lose support stay where their neighbours had them.
+
+    Attributes
+    ----------
+    spacing
+        Which views take part.
+    refine
+        How they are refined.
+    points
+        Of each view, at most, taken at an even stride.
+    loss
+        A view has lost support if it fell by more.
+    """
+
+    spacing: Spacing = Spacing(most=100)  # noqa: RUF009 - immutable
+    refine: PlaneOptions = PlaneOptions()  # noqa: RUF009 - immutable
+    points: int = 5000
+    loss: float = 0.03
+
+    def __post_init__(self) -> None:
+        if self.points < 100:
+            raise ValueError(f"points is {self.points}, not 100 or more")
+        if not 0 <= self.loss <= 1:
+            raise ValueError(f"loss is {self.loss}, not 0 to 1")
+
+    def start(self) -> Refiner:
+        """See `Refining.start`."""
+        return _Planes(self)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """What is kept of a view."""
+
+    index: int
+    depth: float
+    points: Float64
+
+
+class _Planes(Refiner):
+    def __init__(self, options: Planes) -> None:
+        self._options = options
+        self._store: ViewStore[_Kept] = ViewStore(options.spacing)
+
+    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
+        """See `Refiner.push`."""
+        stride = max(1, -(-len(view) // self._options.points))
+        points = view.points[::stride].astype(np.float64)
+        depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+        self._store.push(_Kept(view.index, depth, points), T_world_camera)
+
+    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+        """See `Refiner.finish`."""
+        views = self._store.views
+        if len(views) < 2:
+            return Refinement(poses, views=len(views))
+        row = {int(index): k for k, index in enumerate(ids)}
+        at = np.array([row[view.index] for view in views], np.intp)
+        before = poses[at]
+        found = refine_clouds([view.points for view in views], before, self._options.refine)
+        mean = float(found.before.mean()), float(found.after.mean())
+        unchanged = Refinement(poses, False, len(views), len(found.pairs), support=mean)
+        if not len(found.pairs) or mean[1] < mean[0]:
+            return unchanged
+        lost = found.after < found.before - self._options.loss
+        after = without_losers(before, found.poses, lost)
+        motion = se3.log(se3.inverse(before) @ after)
+        return replace(
+            unchanged,
+            poses=followed(poses, at, after),
+            kept=True,
+            moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
+            moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+            edges=tuple(_edges(found, [view.index for view in views], lost)),
+        )
+
+
+def _edges(found: Aligned, ids: Sequence[int], lost: NDArray[np.bool_]) -> list[Measured]:
+    """What all views together say of neighbours: of all pairs it would be said many times."""
+    out = []
+    for (i, j), C in zip(found.pairs, found.covariance, strict=True):
+        if j == i + 1 and not (lost[i] or lost[j]):
+            T = se3.inverse(found.poses[i]) @ found.poses[j]
+            out.append(Measured(ids[i], ids[j], T, np.linalg.inv(C)))
+    return out
