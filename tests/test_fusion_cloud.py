@@ -48,6 +48,15 @@ def test_a_voxel_averages_views_and_each_view_has_one_vote() -> None:
     assert found.points.dtype == np.float32
 
 
+def test_black_is_no_colour() -> None:
+    points = np.array([[0.05, 0.05, 1.05], [0.55, 0.05, 1.05]], np.float32)
+    seen = view(points, color=np.array([[10, 20, 30], [0, 0, 0]], np.uint8))
+    dark = view(points, 1, color=np.zeros((2, 3), np.uint8))
+    found = fuse([seen, dark])
+    assert found.color is not None
+    np.testing.assert_array_equal(found.color, [[10, 20, 30], [128, 128, 128]])
+
+
 def test_voxels_below_zero_are_as_large_as_others() -> None:
     found = fuse([view([[-0.01, 0.05, 1.05], [0.01, 0.05, 1.05], [-0.09, 0.05, 1.05]])])
     np.testing.assert_allclose(sorted(found.points[:, 0]), [-0.05, 0.01], atol=1e-6)

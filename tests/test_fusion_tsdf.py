@@ -317,6 +317,17 @@ def test_colour_is_the_mean_of_what_the_views_saw() -> None:
     assert (mesh.views == 2).all()
 
 
+def test_views_without_colour_do_not_darken() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    red = np.zeros((72, 88, 3), np.uint8)
+    red[..., 0] = 200
+    colors = (None, np.zeros_like(red), red, None)
+    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate(colors)]
+    mesh = fuse_surface(views, np.stack([EYE] * 4), Fusion(voxel_m=0.03))
+    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[200, 0, 0]])
+    assert (mesh.views == 4).all()
+
+
 def test_albedo_is_grey_and_does_not_fall_with_range() -> None:
     # Two walls of one albedo, at 1 m and 2 m, and a dark patch.
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.geometry.se3 import inverse, transform
+from tofuse.inspection.inspect import inspect_recording
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
@@ -145,18 +146,42 @@ def test_lidar_pair_gt(shared_data: Path) -> None:
     np.testing.assert_array_equal(recording[0].amplitude, rows[:, 3])
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "azure_kinect_mkv",
-        "ifm_o3r",
-        "iphone_chair_3dscannerapp",
-        "iphone_stray",
-        "kinectv2_loop",
-        "pico_zense_static",
-        "pose_graphs",
-    ],
-)
+@pytest.mark.parametrize("name", ["kinectv2_loop", "pose_graphs"])
 def test_what_is_not_known_is_refused(shared_data: Path, name: str) -> None:
     with pytest.raises(InputError, match=name):
         open_recording(shared_data / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "format_", "sensor"),
+    [
+        ("sr4000_corridor", "sr4000", "SR4000"),
+        ("kinectv2_loop/recording", "native", None),
+        ("kinectv2_loop/pcd", "pcd", None),
+        ("sevenscenes_kitchen", "7scenes", "Kinect v1"),
+        ("iphone_chair_3dscannerapp", "3dscannerapp", "iPhone"),
+        ("iphone_stray", "stray", "iPhone"),
+        ("iphone_record3d", "record3d", "iPhone"),
+        ("azure_kinect_mkv", "azure-kinect", "Azure Kinect"),
+        ("ifm_o3r", "ifm-o3r", "ifm O3R"),
+        ("pico_zense_static", "zense", "Pico Zense"),
+        ("open3d_rgbd5", "redwood", None),
+        ("pcl_pairwise", "pcd", None),
+        ("lidar_pair_gt", "ply", None),
+        ("slam6d_scans", "slam6d", None),
+    ],
+)
+def test_every_folder_opens_unasked_and_is_described(
+    shared_data: Path, name: str, format_: str, sensor: str | None
+) -> None:
+    recording = open_recording(shared_data / name)
+    assert recording.format == format_
+    facts = inspect_recording(recording.select(end=9)).facts
+    assert facts["format"] == format_
+    if sensor is not None:
+        assert sensor in facts["sensor"]
+    # Metres: what lies before the camera is between a hand's breadth and a large hall.
+    median = float(facts["depth"].rsplit(" ", 2)[1])
+    assert 0.2 < median < 30
+    if format_ not in ("ply", "slam6d"):
+        assert facts["depth is"] == ("radial range" if format_ == "ifm-o3r" else "z")

@@ -146,9 +146,12 @@ class RangeView:
         return out
 
     def light_image(self, channels: int) -> Float32:
-        """(H, W, channels) light as float32: the root of the albedo, or RGB."""
+        """(H, W, channels) light as float32: the root of the albedo, or RGB; 0 where unknown.
+
+        Albedo says nothing where the others have colour.
+        """
         out = np.zeros((*self.z.shape, channels), np.float32)
-        if self.light is not None and channels:
+        if self.light is not None and channels == self.channels:
             out[:] = self.light.reshape(*self.z.shape, -1)
         return out
 

@@ -394,8 +394,16 @@ def integrate(
                     if d < reach:
                         if seen[b, v] < 65535:
                             seen[b, v] += 1
+                        # Black is no colour: it is neither kept from before nor mixed in.
+                        lit = False
+                        tinted = False
                         for q in range(channels):
-                            color[b, v, q] += (light[r, c, q] - color[b, v, q]) / seen[b, v]
+                            lit = lit or light[r, c, q] > 0
+                            tinted = tinted or color[b, v, q] > 0
+                        if lit:
+                            count = np.int64(seen[b, v]) if tinted else 1
+                            for q in range(channels):
+                                color[b, v, q] += (light[r, c, q] - color[b, v, q]) / count
                     else:
                         d = reach
                     total = weight[b, v] + pixels[r, c, 4]
