@@ -54,7 +54,7 @@ class RangeView:
         (H, W) float16, root of the albedo in the recording's counts times m^2; or (H, W, 3) uint8
         RGB; None where neither is known.
     sigma_m
-        Median standard deviation of z.
+        Typical standard deviation of z.
     """
 
     index: int
@@ -110,7 +110,7 @@ class RangeView:
             np.round(127 * np.nan_to_num(normals)).astype(np.int8),
             _encoded(weight),
             _light(frame, shape),
-            float(np.median(surface.sigma[good])) if good.any() else 0.0,
+            float(np.sqrt(np.median(variance[good]))) if good.any() else 0.0,
         )
 
     @property

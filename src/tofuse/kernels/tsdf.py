@@ -209,11 +209,18 @@ def ray_cells(
 
 @kernel
 def _bounds(
-    x: float, y: float, z: float, radius: float, cells: Float32, lookup_frame: Float64
+    x: float,
+    y: float,
+    z: float,
+    radius: float,
+    cells: Float32,
+    lookup_frame: Float64,
+    margin: float,
 ) -> tuple[float, float, float]:
     """Free before, hidden behind, least weight for a ball around (x, y, z) in the camera's frame.
 
-    Hidden behind minus infinity: the view shows nothing of it.
+    Hidden behind minus infinity: the view shows nothing of it. `margin` is the half width of a
+    pixel, in cells.
     """
     if z - radius < 0.2 * z:
         return -np.inf, np.inf, 0.0
@@ -222,12 +229,12 @@ def _bounds(
     far = 1 / (z + radius)
     a = min((x - radius) * near, (x - radius) * far)
     b = max((x + radius) * near, (x + radius) * far)
-    fu = (a - lookup_frame[0]) * lookup_frame[2] - 1
-    gu = (b - lookup_frame[0]) * lookup_frame[2] + 1
+    fu = (a - lookup_frame[0]) * lookup_frame[2] - margin
+    gu = (b - lookup_frame[0]) * lookup_frame[2] + margin
     a = min((y - radius) * near, (y - radius) * far)
     b = max((y + radius) * near, (y + radius) * far)
-    fv = (a - lookup_frame[1]) * lookup_frame[3] - 1
-    gv = (b - lookup_frame[1]) * lookup_frame[3] + 1
+    fv = (a - lookup_frame[1]) * lookup_frame[3] - margin
+    gv = (b - lookup_frame[1]) * lookup_frame[3] + margin
     if gu < 0 or gv < 0 or fu >= cells.shape[1] or fv >= cells.shape[0]:
         return 0.0, -np.inf, 0.0
     least = np.inf
@@ -314,6 +321,8 @@ def integrate(
     channels = light.shape[2]
     middle = 0.5 * (EDGE - 1) * voxel_m
     radius = np.sqrt(3.0) * middle
+    # Half a pixel, and as much for lenses whose pixels differ in size.
+    margin = max(cells.shape[1] / columns, cells.shape[0] / rows)
     # A block is cut in eight where it can't be told as a whole.
     small = np.sqrt(3.0) * 1.5 * voxel_m
     for b in range(start, stop):
@@ -326,7 +335,7 @@ def integrate(
             continue
         x = T[0, 0] * (ox + middle) + T[0, 1] * (oy + middle) + T[0, 2] * (oz + middle) + T[0, 3]
         y = T[1, 0] * (ox + middle) + T[1, 1] * (oy + middle) + T[1, 2] * (oz + middle) + T[1, 3]
-        low, high, least = _bounds(x, y, z, radius, cells, lookup_frame)
+        low, high, least = _bounds(x, y, z, radius, cells, lookup_frame, margin)
         if z - radius > high:
             continue
         if least > 0 and z + radius < low:
@@ -344,7 +353,7 @@ def integrate(
                 continue
             x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
             y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            low, high, least = _bounds(x, y, z, small, cells, lookup_frame)
+            low, high, least = _bounds(x, y, z, small, cells, lookup_frame, margin)
             if z - small > high:
                 continue
             all_free = least > 0 and z + small < low
