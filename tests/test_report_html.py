@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tofuse.fusion.cloud import Cloud, CloudBuilder, empty_cloud
+from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
@@ -23,6 +24,7 @@ from tofuse.posegraph.graph import LoopRecord, PoseGraph
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.report.extras import ReportExtras
 from tofuse.report.html import write_report
+from tofuse.report.scene import MAX_FACES, make_scene, packed
 from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
 # A room of 6.0 x 2.5 x 3.2 m around the first camera, and two blocks in it.
@@ -406,6 +408,35 @@ def test_loops_timings_and_objective(shown):
 
 def decode(text, kind):
     return np.frombuffer(base64.b64decode(text), kind).reshape(-1, 3)
+
+
+def test_viewer_holds_a_surface_with_not_too_many_faces():
+    # A wavy sheet of far more faces than a phone should draw.
+    n = 420
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    z = 2 + 0.05 * np.sin(6 * x)
+    vertices = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
+    k = np.arange(n * n).reshape(n, n)
+    a, b, c, d = k[:-1, :-1].ravel(), k[:-1, 1:].ravel(), k[1:, 1:].ravel(), k[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]).astype(np.int32)
+    normals = np.tile(np.float32([0, 0, -1]), (n * n, 1))
+    color = np.full((n * n, 3), 90, np.uint8)
+    ones = np.ones(n * n)
+    mesh = Mesh(
+        vertices, faces, normals, color, ones.astype(np.float32), ones.astype(np.int32), np.zeros(3)
+    )
+    result, rows = room()[0], {}
+    scene = make_scene(replace(result, mesh=mesh), rows)
+    assert len(scene.mesh.faces) <= MAX_FACES
+    assert len(scene.mesh.faces) > MAX_FACES / 4
+    data = packed(scene)
+    shown = decode(data["mesh"]["points"], "<u2") / 65535 * data["extent"] + data["low"]
+    off = shown[:, 2] - (2 + 0.05 * np.sin(6 * shown[:, 0]))
+    assert np.abs(off).max() < 0.003
+    triangles = decode(data["mesh"]["faces"], "<u4")
+    assert triangles.max() == len(shown) - 1
+    assert len(decode(data["mesh"]["colors"], np.uint8)) == len(shown)
+    assert packed(make_scene(result, rows))["mesh"] is None
 
 
 def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):

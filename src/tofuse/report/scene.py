@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.report import images
 from tofuse.results.types import Reconstruction
@@ -20,6 +21,7 @@ UInt8 = NDArray[np.uint8]
 Integers = NDArray[np.intp]
 
 MAX_POINTS = 150_000
+MAX_FACES = 120_000
 MAX_CAMERAS = 72
 YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
 
@@ -40,6 +42,8 @@ class Scene:
         (n, 4, 4) poses, finite ones only; `reference` may be empty.
     loops
         (L, 2, 3) ends of the accepted loops.
+    mesh
+        The surface, with so few faces that a browser on a phone shows it; None without one.
     """
 
     points: Float64
@@ -51,6 +55,7 @@ class Scene:
     after: Float64
     reference: Float64
     loops: Float64
+    mesh: Mesh | None = None
 
     @property
     def box(self) -> Float64:
@@ -88,6 +93,12 @@ class Scene:
             after=T @ self.after,
             reference=T @ self.reference,
             loops=self.loops @ R.T,
+            mesh=self.mesh
+            and replace(
+                self.mesh,
+                vertices=(self.mesh.vertices @ R.T).astype(np.float32),
+                normals=(self.mesh.normals @ R.T).astype(np.float32),
+            ),
         )
 
 
@@ -123,13 +134,28 @@ def make_scene(
         finite(result.trajectory),
         finite(reference),
         loops[np.isfinite(loops).all((1, 2))],
+        _shown(result.mesh),
     )
+
+
+def _shown(mesh: Mesh | None) -> Mesh | None:
+    """The mesh with at most `MAX_FACES` faces; None where there are none."""
+    if mesh is None or len(mesh.faces) == 0:
+        return None
+    cell = 2 * float(np.median(np.abs(np.diff(mesh.vertices[mesh.faces[:1000]], axis=1)).max(2)))
+    shown = mesh
+    while len(shown.faces) > MAX_FACES:
+        shown = mesh.simplified(cell)
+        cell *= 1.4
+    return shown
 
 
 def packed(scene: Scene) -> dict[str, Any]:
     """Return the scene for the viewer: plain data, arrays as base64 (little endian)."""
-    low = scene.points.min(0) if len(scene.points) else np.zeros(3)
-    high = scene.points.max(0) if len(scene.points) else np.ones(3)
+    placed = [scene.points] + ([] if scene.mesh is None else [scene.mesh.vertices.astype(float)])
+    both = np.concatenate(placed)
+    low = both.min(0) if len(both) else np.zeros(3)
+    high = both.max(0) if len(both) else np.ones(3)
     extent = np.maximum(high - low, 1e-6)
     steps = np.round((scene.points - low) / extent * 65535).astype("<u2")
     normals = None if scene.normals is None else np.nan_to_num(scene.normals.astype(float))
@@ -148,12 +174,23 @@ def packed(scene: Scene) -> dict[str, Any]:
         "points": _base64(steps),
         "colors": _base64(scene.colors),
         "normals": None if normals is None else _base64(np.round(normals * 127).astype(np.int8)),
+        "mesh": None if scene.mesh is None else _packed_mesh(scene.mesh, low, extent),
         "lines": {
             "before": _base64(camera_lines(scene.before, edge, step).astype("<f4")),
             "after": _base64(camera_lines(scene.after, edge, step).astype("<f4")),
             "reference": _base64(path_lines(scene.reference).astype("<f4")),
             "loops": _base64(scene.loops.reshape(-1, 3).astype("<f4")),
         },
+    }
+
+
+def _packed_mesh(mesh: Mesh, low: Float64, extent: Float64) -> dict[str, str]:
+    color = height_colors(mesh.vertices.astype(float)) if mesh.color is None else mesh.color
+    return {
+        "points": _base64(np.round((mesh.vertices - low) / extent * 65535).astype("<u2")),
+        "colors": _base64(color),
+        "normals": _base64(np.round(mesh.normals * 127).astype(np.int8)),
+        "faces": _base64(mesh.faces.astype("<u4")),
     }
 
 

@@ -19,6 +19,8 @@ def model(s: Subject) -> Values:
     if len(scene.points) == 0 and len(scene.after) == 0:
         return {"scene": None, "still": "", "toggles": [], "thinned": ""}
     toggles = [("points", "Points", "", True)]
+    if scene.mesh is not None:
+        toggles.append(("mesh", "Surface", "", False))
     if scene.normals is not None:
         toggles.append(("peel", "Hide walls seen from behind", "", True))
     if len(scene.points):

@@ -67,6 +67,21 @@
     color: buffer(bytes(scene.colors)),
     normal: scene.normals ? buffer(bytes(scene.normals)) : null,
   };
+  // More than 65536 vertices need an extension, which all but very old browsers have.
+  const wide = gl.getExtension("OES_element_index_uint");
+  const mesh = scene.mesh && wide ? {
+    place: buffer(bytes(scene.mesh.points)),
+    color: buffer(bytes(scene.mesh.colors)),
+    normal: buffer(bytes(scene.mesh.normals)),
+    faces: gl.createBuffer(),
+    count: 0,
+  } : null;
+  if (mesh) {
+    const raw = bytes(scene.mesh.faces);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.faces);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, raw, gl.STATIC_DRAW);
+    mesh.count = raw.length / 4;
+  }
   const lines = {};
   for (const name in scene.lines) {
     const raw = bytes(scene.lines[name]);
@@ -122,7 +137,8 @@
       0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0]);
     const at = [0, 1, 2].map((k) => eye.target[k] - R[2][k] * eye.distance);
 
-    if (on("points") && scene.count) {
+    const surface = on("mesh") && mesh;
+    if ((on("points") && scene.count) || surface) {
       gl.useProgram(dots);
       const u = (name) => gl.getUniformLocation(dots, name);
       gl.uniformMatrix4fv(u("view"), false, view);
@@ -132,14 +148,27 @@
       gl.uniform3fv(u("eye"), at);
       gl.uniform1f(u("size"), 1.5 * scene.spacing * f * narrow * height / 2);
       gl.uniform1f(u("most"), 10 * ratio);
-      gl.uniform1f(u("peel"), on("peel") && buffers.normal ? 1 : 0);
-      gl.uniform1f(u("shade"), buffers.normal ? 1 : 0);
       gl.uniform1f(u("byHeight"), on("height") ? 1 : 0);
       gl.uniform2f(u("heights"), scene.heights[0], Math.max(scene.heights[1] - scene.heights[0], 1e-6));
-      attribute(dots, "place", buffers.place, gl.UNSIGNED_SHORT, true);
-      attribute(dots, "color", buffers.color, gl.UNSIGNED_BYTE, true);
-      if (buffers.normal) attribute(dots, "normal", buffers.normal, gl.BYTE, true);
-      gl.drawArrays(gl.POINTS, 0, scene.count);
+      const use = (set) => {
+        gl.uniform1f(u("shade"), set.normal ? 1 : 0);
+        attribute(dots, "place", set.place, gl.UNSIGNED_SHORT, true);
+        attribute(dots, "color", set.color, gl.UNSIGNED_BYTE, true);
+        if (set.normal) attribute(dots, "normal", set.normal, gl.BYTE, true);
+      };
+      if (surface) {
+        gl.uniform1f(u("peel"), 0);
+        if (on("peel")) gl.enable(gl.CULL_FACE);
+        use(mesh);
+        gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.faces);
+        gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
+        gl.disable(gl.CULL_FACE);
+      }
+      if (on("points") && scene.count) {
+        gl.uniform1f(u("peel"), on("peel") && buffers.normal ? 1 : 0);
+        use(buffers);
+        gl.drawArrays(gl.POINTS, 0, scene.count);
+      }
       for (const name of ["color", "normal"]) {
         const place = gl.getAttribLocation(dots, name);
         if (place >= 0) gl.disableVertexAttribArray(place);

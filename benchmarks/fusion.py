@@ -1,0 +1,160 @@
+"""How near the fused surface is to the truth, and what fusion costs.
+
+The simulated room is taken by the SR4000, by default with noise, mixed pixels, phase wraps and
+saturation only (`--all`: with all errors of the camera). The surface is made at the true
+poses, and (`--estimated`) at those of the default method; errors are the distances to the true
+surface. Completeness is the share of the truth within 1 cm of the model: of what was seen by a
+pixel that is valid (this camera gives noise where there is too little light), and of what the
+filters keep. Then one pass over the views
+is fused again and again, to see whether a frame costs the same in a volume that has been filled.
+Times are of one thread, process time.
+
+    python benchmarks/fusion.py [--every 1] [--all] [--estimated] [--repeat 4]
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.evaluation.surface import Shape, compare_surfaces, distances
+from tofuse.filters.base import apply_filters
+from tofuse.filters.multipath import Multipath
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.options import Fusion
+from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
+from tofuse.fusion.views import RangeView
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.pipeline.config import Config, from_method
+from tofuse.pipeline.mapper import Mapper
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import corrected_depth
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import Plan, plan
+
+Float64 = NDArray[np.float64]
+
+_NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
+_CELL_M = 0.01  # of the points that were seen, one is taken in each
+
+
+def simulated(every: int, everything: bool) -> tuple[Plan, list[RangeFrame]]:
+    """The plan and its frames, with the factory correction applied."""
+    made = plan("room", effects=Effects() if everything else _NOISE)
+    made = replace(made, raw=made.raw[::every])
+    frames = []
+    for rendered in made.frames(None):
+        frame = rendered.frame
+        depth = corrected_depth(made.correction, frame.camera, frame.depth, frame.depth_kind)
+        frames.append(replace(frame, depth=depth))
+    return made, frames
+
+
+def seen_by(made: Plan, masks: list[NDArray[np.bool_]], frames: list[RangeFrame]) -> Float64:
+    """True points (N, 3) behind the pixels of the masks, one in each voxel."""
+    seen = []
+    rate = made.sequence.frame_rate_hz
+    for raw, T_world, mask, frame in zip(made.raw, made.poses, masks, frames, strict=True):
+        T = made.sequence.T_room_camera(raw / rate)
+        d = np.insert(frame.camera.rays()[mask].astype(float), 2, 1, -1)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        hits = made.scene.cast(T[:3, 3], d @ T[:3, :3].T)
+        points = se3.transform(T_world, d * hits.distance[:, None].astype(float))
+        seen.append(points[np.isfinite(points).all(1)])
+    points = np.concatenate(seen)
+    _, first = np.unique(np.floor(points / _CELL_M).astype(np.int64), axis=0, return_index=True)
+    return points[first]
+
+
+def method(everything: bool) -> Config:
+    """The default, without compensating for indirect light where there is none."""
+    config = from_method("default")
+    corrections = (c for c in config.corrections if everything or not isinstance(c, Multipath))
+    return replace(config, corrections=tuple(corrections))
+
+
+def views_of(
+    frames: list[RangeFrame], config: Config
+) -> tuple[list[RangeView], list[NDArray[np.bool_]]]:
+    """What the method keeps of the frames for fusion, and which pixels its filters leave."""
+    correctors = [correction.start() for correction in config.corrections]
+    views, masks = [], []
+    for frame in frames:
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        surface = surface_map(frame, SurfaceOptions())
+        clean, _ = apply_filters(config.model_filters, frame, ())
+        assert isinstance(clean, RangeFrame)
+        views.append(RangeView.of(clean, surface))
+        masks.append(clean.valid)
+    return views, masks
+
+
+def row(label: str, mesh: Mesh, truth: Shape, seen: Float64, kept: Float64) -> str:
+    """One line of the table."""
+    shape = Shape(mesh.vertices, mesh.faces)
+    found = compare_surfaces(shape, truth, seen=kept)
+    recall = (distances(seen, shape) <= found.threshold_m).mean()
+    return (
+        f"{label:<16} {1e3 * found.accuracy_m:7.1f} {1e3 * found.accuracy_median_m:7.1f} "
+        f"{1e3 * found.accuracy_p95_m:7.1f} {100 * found.precision:7.1f} {100 * recall:9.1f} "
+        f"{100 * found.recall:9.1f} {100 * found.fscore:7.1f} {100 * found.outliers:8.3f} "
+        f"{len(mesh.faces):9,}"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--all", action="store_true", help="all errors of the camera")
+    parser.add_argument("--estimated", action="store_true", help="also at estimated poses")
+    parser.add_argument("--repeat", type=int, default=4)
+    options = parser.parse_args(arguments)
+    made, frames = simulated(options.every, options.all)
+    vertices, faces = made.scene.truth_mesh()
+    T_world_truth = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
+    truth = Shape(se3.transform(T_world_truth, vertices), faces)
+    config = method(options.all)
+    views, masks = views_of(frames, config)
+    seen = seen_by(made, [frame.valid for frame in frames], frames)
+    kept = seen_by(made, masks, frames)
+    print(f"{len(frames)} frames; {len(seen):,} cm^3 with surface seen, {len(kept):,} kept")
+    print(
+        f"{'poses':<16} {'mean mm':>7} {'median':>7} {'95 %':>7} {'<1cm %':>7} {'of seen %':>9} "
+        f"{'of kept %':>9} {'F':>7} {'>5cm %':>8} {'faces':>9}"
+    )
+    print(row("true", fuse_surface(views, made.poses), truth, seen, kept))
+    if options.estimated:
+        mapper = Mapper(config)
+        for frame in frames:
+            mapper.push(frame)
+        result = mapper.finish()
+        assert result.mesh is not None
+        print(row("estimated", result.mesh, truth, seen, kept))
+        seconds = result.diagnostics.seconds["fusion"]
+        print(f"fusion took {1e3 * seconds / len(frames):.0f} ms a frame, all included")
+    with threads(1):
+        volume = Volume.around(views, made.poses, fitting_voxel(views), Fusion())
+        print(f"voxels of {1e3 * volume.voxel_m:.1f} mm, {len(volume.keys):,} blocks")
+        for turn in range(options.repeat):
+            times = []
+            for view, T in zip(views, made.poses, strict=True):
+                started = time.process_time()
+                volume.add(view, T)
+                times.append(time.process_time() - started)
+            print(f"pass {turn + 1}: {1e3 * np.median(times):.1f} ms a frame")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    print(f"peak memory {peak:.0f} MB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
