@@ -10,12 +10,14 @@ import pytest
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import surface_map
 from tofuse.odometry import keyframes as module
 from tofuse.odometry.keyframes import Acceptance, Keyframes, Recovery
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import Agreement
+from tofuse.registration.projective import Target, align
 from tofuse.registration.search import Candidate, Match
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
@@ -324,6 +326,28 @@ def test_where_a_recording_begins_the_motion_need_not_go_on(room):
     steps = run([replace(frame, index=k) for k, frame in enumerate(frames)])
     assert_marked(steps[6])
     assert "from where the motion leads" in steps[6].reason
+    # The next frame shows that it was right.
+    ((index, step),) = steps[7].earlier
+    assert index == 6
+    assert_near(step, poses[6])
+    assert "jumped" in steps[7].reason
+    assert not any(s.earlier for k, s in enumerate(steps) if k != 7)
+
+
+def test_at_low_frame_rates_the_motion_may_change(room):
+    frames = [*room.frames[:4], *room.frames[:4]]
+    poses = [*room.poses[:4], *room.poses[:4]]
+    slow = [replace(f, index=k, timestamp=0.8 * k) for k, f in enumerate(frames)]
+    for step, true in zip(run(slow), poses, strict=True):
+        assert_near(step, true)
+
+
+def test_how_far_points_may_lie_off_grows_with_the_depth(room):
+    views = [surface_map(frame, Keyframes().surface) for frame in room.frames[:2]]
+    aligned = align(views[1], [Target(views[0], np.eye(4))], np.eye(4), Keyframes().alignment)
+    strict = Acceptance(rms_m=0.5 * aligned.rms_m, rms_share=0.01)
+    assert "mm from the surfaces" in strict.objection(aligned, 60 * aligned.rms_m)
+    assert not strict.objection(aligned, 120 * aligned.rms_m)
 
 
 def test_clouds_are_refused():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.odometry.motion import Motion, jumps
+from tofuse.odometry.motion import Moment, Motion, is_small, jumps
 
 STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
@@ -114,3 +114,49 @@ def test_jumps_of_a_whole_path() -> None:
     assert jumps(broken, {9}) == []
     spike = [*poses[:8], shift @ poses[8], *poses[9:]]
     assert [k for k, _ in jumps(spike)] == [8, 9]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "believed"), [(None, False), (0.1, False), (0.2, False), (0.45, True), (2.0, True)]
+)
+def test_the_longer_between_frames_the_further_a_motion_may_change(seconds, believed) -> None:
+    """0.2 m: what 3 m/s^2 lead to in 0.37 s."""
+    poses = walk(8)
+    motion = followed(poses[:7])
+    words = motion.surprise(elsewhere(poses[7], 0.2), motion.expected, seconds)
+    assert (words == "") == believed
+
+
+def test_after_the_longest_time_not_everything_is_believed() -> None:
+    poses = walk(8)
+    motion = followed(poses[:7])
+    assert motion.surprise(elsewhere(poses[7], 1.5), motion.expected, 60.0)
+
+
+def test_the_time_over_a_lost_frame_is_that_of_two() -> None:
+    poses = walk(9)
+    motion = followed(poses[:7])
+    motion.miss()
+    assert motion.surprise(elsewhere(poses[8], 0.2), motion.expected, 0.4)
+    assert not motion.surprise(elsewhere(poses[8], 0.2), motion.expected, 0.9)
+
+
+def test_frames_that_are_only_counted_have_no_time() -> None:
+    assert Moment(5, 0.5).seconds_since(Moment(3, 0.3)) == pytest.approx(0.2)
+    assert Moment(5, 5.0).seconds_since(Moment(3, 3.0)) is None
+    assert Moment(5, 0.5).seconds_since(None) is None
+
+
+def test_jumps_know_the_time() -> None:
+    poses = walk(20)
+    broken = [*poses[:8], *(elsewhere(np.eye(4), 0.3) @ T for T in poses[8:])]
+    for rate, found in ((30.0, [8]), (2.0, [])):
+        moments = [Moment(k, k / rate) for k in range(20)]
+        assert [k for k, _ in jumps(broken, (), moments)] == found
+
+
+def test_small_motions() -> None:
+    assert is_small(np.eye(4))
+    assert is_small(elsewhere(np.eye(4), 0.05, 0.06))
+    assert not is_small(elsewhere(np.eye(4), 0.07))
+    assert not is_small(elsewhere(np.eye(4), 0.0, 0.08))

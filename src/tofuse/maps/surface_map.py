@@ -62,6 +62,9 @@ class SurfaceOptions:
         they mix light of both sides.
     misfit
         How much larger than the noise shown by small windows the variance in wider ones may be.
+    flatness
+        A surface that is this flat, as a share of its depth, is a plane, however little noise the
+        view shows: cameras that smooth their images hide it.
     fill, offset
         Least share of a window that must be valid, and largest squared offset of its centre, as a
         share of its squared spread.
@@ -74,6 +77,7 @@ class SurfaceOptions:
     edge_jump: float = 0.04
     edge_margin: int = 1
     misfit: float = 1.2
+    flatness: float = 0.002
     fill: float = 0.7
     offset: float = 0.2
     photo_radius: int = 1
@@ -90,6 +94,8 @@ class SurfaceOptions:
         for name in ("edge_jump", "fill", "offset"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
+        if not 0 <= self.flatness <= 1:
+            raise ValueError(f"flatness is {self.flatness}, not 0 to 1")
         if not 0 < self.misfit < 1e6:
             raise ValueError(f"misfit is {self.misfit}, not above 0")
 
@@ -267,10 +273,10 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     quality = np.empty((rows, columns, 2), np.float32)
     scale = max(
         _noise_scale(w, rays, weight, sums, options.radii[0]),
-        _least_scale(z, sigma) if own is None else 1.0,
+        _scale_at(_LEAST_NOISE, z, sigma) if own is None else 1.0,
     )
     radii = np.array(options.radii, np.int64)
-    limit = options.misfit * scale
+    limit = options.misfit * max(scale, _scale_at(options.flatness, z, sigma))
     run_chunks(
         lambda a, b: fit_planes(
             w, rays, weight, sums, radii, limit, options.fill, options.offset, planes, quality, a, b
@@ -419,13 +425,13 @@ def _noise_law(
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
 
 
-def _least_scale(z: Float32, sigma: Float32) -> float:
-    """Scale of the variance at which a typical pixel's sigma is the least share of its depth."""
+def _scale_at(share: float, z: Float32, sigma: Float32) -> float:
+    """Scale of the variance at which a typical pixel's sigma is a share of its depth."""
     z, sigma = z[::4, ::4], sigma[::4, ::4]
     known = (z > 0) & (sigma > 0)
     if not known.any():
         return 0.0
-    return median(_LEAST_NOISE * z[known] / sigma[known]) ** 2
+    return median(share * z[known] / sigma[known]) ** 2
 
 
 def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radius: int) -> float:

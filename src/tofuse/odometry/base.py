@@ -36,6 +36,9 @@ class Step:
     surface
         The view as it was made ready for tracking; None where the method makes none, and for
         frames without a pose.
+    earlier
+        Steps of frames that were lost when they came, by `Frame.index`, and that this frame shows
+        to have been where they seemed to be.
     """
 
     status: Status
@@ -44,6 +47,7 @@ class Step:
     reference: int | None = None
     registration: Registration | None = None
     surface: SurfaceMap | None = None
+    earlier: tuple[tuple[int, Step], ...] = ()
 
 
 class Tracker(Protocol):

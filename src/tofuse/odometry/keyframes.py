@@ -14,7 +14,7 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.odometry.likeness import likeness, thumbnail
-from tofuse.odometry.motion import Motion
+from tofuse.odometry.motion import Moment, Motion, is_small
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
@@ -57,8 +57,9 @@ class Acceptance:
         Largest share of the compared points that lie where the target saw through.
     inliers
         Fewest points that fit, of those the finest level used.
-    rms_m
-        Largest rms of the distances of the points that fit.
+    rms_m, rms_share
+        Largest rms of the distances of the points that fit: the larger of a length and a share of
+        the typical depth, with which the errors of cameras grow.
     fit
         Least score of the points that land in the target: what lies where the target has no
         surface speaks against a view as well.
@@ -73,17 +74,21 @@ class Acceptance:
     rms_m: float = 0.03
     fit: float = 0.5
     albedo: float = 0.1
+    rms_share: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("inlier_share", "overlap", "in_front", "fit"):
+        for name in ("inlier_share", "overlap", "in_front", "fit", "rms_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
         for name in ("inliers", "rms_m", "albedo"):
             if not 0 <= getattr(self, name) < 1e9:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
-    def objection(self, a: Aligned) -> str:
-        """Return why an alignment is not believed, or nothing if it is."""
+    def objection(self, a: Aligned, depth: float = 0.0) -> str:
+        """Return why an alignment is not believed, or nothing if it is.
+
+        `depth` is the median depth of what was aligned, m.
+        """
         if a.overlap < self.overlap:
             return f"only {a.overlap:.0%} of the points land in the view of the keyframe"
         if a.inliers < self.inliers:
@@ -92,7 +97,7 @@ class Acceptance:
             return f"only {a.inlier_share:.0%} of the points fit, not {self.inlier_share:.0%}"
         if a.in_front > self.in_front * a.compared:
             return f"{a.in_front / a.compared:.0%} of the points lie where the keyframe saw through"
-        if a.rms_m > self.rms_m:
+        if a.rms_m > max(self.rms_m, self.rms_share * depth):
             return f"the points that fit lie {a.rms_m * 1e3:.0f} mm from the surfaces"
         if a.score < self.fit * a.overlap:
             return f"only {max(a.score / a.overlap, 0):.0%} of what is seen fits well"
@@ -193,7 +198,7 @@ class Keyframes(Odometry):
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     acceptance: Acceptance = Acceptance()
-    relocated: Acceptance = Acceptance(0.85, 0.4, 0.05, 300, 0.02, 0.62)
+    relocated: Acceptance = Acceptance(0.85, 0.4, 0.05, 300, 0.02, 0.62, rms_share=0.015)
     recovery: Recovery = Recovery()
     guess: Guess = "previous"
     keyframe_angle: float = 0.2
@@ -224,6 +229,16 @@ class _Keyframe:
     thumbnail: Float64
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Where a view is: how it was aligned, with what, beside which keyframe, and in words."""
+
+    aligned: Aligned
+    targets: list[Target]
+    reference: _Keyframe
+    how: str = ""
+
+
 class _KeyframeTracker(Tracker):
     def __init__(self, options: Keyframes) -> None:
         self._options = options
@@ -231,6 +246,8 @@ class _KeyframeTracker(Tracker):
         self._T: Float64 | None = None  # of the last frame with a pose
         self._T_odometry: Float64 | None = None
         self._motion = Motion()
+        self._before: Moment | None = None  # and when that was
+        self._doubted: tuple[int, Step] | None = None  # a surprise that may yet be confirmed
         self._lost = False
         self._depth = 0.0  # median of the last frame with a pose, m
         self._searched = 0  # frames in a row that only a search could find, or not even that
@@ -249,11 +266,12 @@ class _KeyframeTracker(Tracker):
         view = surface_map(frame, options.surface)
         if np.count_nonzero(view.planes[..., 3]) < options.minimum_points:
             return self._lose("nearly no surface in what is left of the image")
+        now = Moment(frame.index, frame.timestamp)
         if self._T is None:
             self._keep(view, np.eye(4))
             self._T, self._T_odometry = np.eye(4), T_odometry
             self._motion.follow(self._T)
-            self._depth = self._keyframes[0].depth
+            self._depth, self._before = self._keyframes[0].depth, now
             return Step("tracked", "", np.eye(4), surface=view)
 
         reasons: list[str] = []
@@ -268,34 +286,48 @@ class _KeyframeTracker(Tracker):
             self._searched = 0
         if found is None:
             return self._lose(reasons[0])
-        aligned, reference, chosen = found
-        T = aligned.T_world_source
-        surprise = self._motion.surprise(T, expected)
+        reference = found.reference
+        T = found.aligned.T_world_source
+        surprise = self._motion.surprise(T, expected, now.seconds_since(self._before))
+        step = self._step(view, found, lit=frame.amplitude_image is not None)
         if surprise:
+            self._doubted = frame.index, step
             return self._lose(f"fits keyframe {reference.view.index}, but {surprise}")
         self._depth = depth
-        notes = [chosen] if chosen else []
+        earlier: tuple[tuple[int, Step], ...] = ()
         if self._motion.follow(T):
-            notes.append("the camera jumped, and this view goes on from there")
+            words = "the camera jumped, and this view goes on from there"
+            step = replace(step, reason="; ".join(filter(None, (step.reason, words))))
+            if self._doubted is not None:
+                earlier = (self._doubted,)
+        self._doubted = None
         if self._searched:  # a camera that is put down anew for each view has no velocity
             self._motion.interrupt()
-        if frame.amplitude_image is not None and not aligned.photometric:
-            notes.append("the albedo took no part")
         self._T, self._T_odometry, self._lost = T, T_odometry, False
+        self._before = now
         if self._is_new(T, reference):
             self._keep(view, T)
-        target = Target(reference.view, se3.inverse(reference.T_world_camera))
-        C = covariance(view, [target], aligned, options.alignment, options.uncertainty)
+        return replace(step, earlier=earlier)
+
+    def _step(self, view: SurfaceMap, found: _Found, *, lit: bool) -> Step:
+        """What a view is taken for that was aligned and is believed."""
+        options, aligned, reference = self._options, found.aligned, found.reference
+        notes = [found.how] if found.how else []
+        if lit and not aligned.photometric:
+            notes.append("the albedo took no part")
+        C = covariance(view, found.targets, aligned, options.alignment, options.uncertainty)
         registration = _registration(aligned, reference.T_world_camera, C)
         status: Literal["tracked", "predicted"] = "tracked"
         if len(aligned.unobservable) == 6:
             status = "predicted"
             notes.insert(0, "nothing in view holds the camera in any direction")
+        T = aligned.T_world_source
         return Step(status, "; ".join(notes), T, reference.view.index, registration, view)
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
         self._motion.interrupt()
+        self._doubted = None
         self._lost = True
 
     def _expected(self, T_odometry: Float64 | None) -> Float64 | None:
@@ -317,7 +349,7 @@ class _KeyframeTracker(Tracker):
 
     def _track(
         self, view: SurfaceMap, expected: Float64 | None, reasons: list[str]
-    ) -> tuple[Aligned, _Keyframe, str] | None:
+    ) -> _Found | None:
         """Align with the newest keyframes, from the guess and then from where the camera was."""
         options = self._options
         newest = self._keyframes[-options.targets :]
@@ -325,13 +357,19 @@ class _KeyframeTracker(Tracker):
         for predicted, start, how, chosen in self._predictions(view, targets, expected):
             aligned = align(view, targets, predicted, how, start=start)
             if how is options.alignment:
-                objection = options.acceptance.objection(aligned)
+                objection = options.acceptance.objection(aligned, view.depth)
             else:
-                objection = options.relocated.objection(aligned) or self._doubt(aligned)
+                acceptance = options.acceptance if self._is_near(aligned) else options.relocated
+                objection = acceptance.objection(aligned, view.depth) or self._doubt(aligned)
             if not objection:
-                return aligned, newest[-1], chosen
+                return _Found(aligned, targets, newest[-1], chosen)
             reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
         return None
+
+    def _is_near(self, aligned: Aligned) -> bool:
+        """Whether the camera hardly moved since the last frame, which needs no prediction."""
+        assert self._T is not None
+        return not self._lost and is_small(se3.inverse(self._T) @ aligned.T_world_source)
 
     def _doubt(self, aligned: Aligned) -> str:
         """Why an alignment that nothing predicted is not believed though it fits."""
@@ -366,7 +404,7 @@ class _KeyframeTracker(Tracker):
         unknown = "the prediction did not fit" if expected is not None else "nothing predicted it"
         yield T, chosen.T_world_source, how, f"{unknown}: found from {where}"
 
-    def _relocate(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe, str] | None:
+    def _relocate(self, view: SurfaceMap) -> _Found | None:
         """Look for the view among the keyframes that look most like it."""
         options = self._options
         wide = replace(options.alignment, levels=_WIDE, prior_m=3.0, prior_rad=3.0)
@@ -376,19 +414,20 @@ class _KeyframeTracker(Tracker):
             keyframe = self._keyframes[k]
             target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
             coarse = align(view, target, keyframe.T_world_camera, wide)
-            if not options.relocated.objection(coarse):
+            if not options.relocated.objection(coarse, view.depth):
                 found.append((coarse.score, k, coarse.T_world_source))
         for _, k, T in sorted(found, key=lambda one: (-one[0], one[1])):
             keyframe = self._keyframes[k]
             target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
             aligned = align(view, target, T, fine)
             # A flat wall fits anywhere: only a view that is held in every direction is found again.
-            objection = options.relocated.objection(aligned)
+            objection = options.relocated.objection(aligned, view.depth)
             if not objection and aligned.converged and not len(aligned.unobservable):
-                return aligned, keyframe, f"found again at keyframe {keyframe.view.index}"
+                how = f"found again at keyframe {keyframe.view.index}"
+                return _Found(aligned, target, keyframe, how)
         return None
 
-    def _search(self, view: SurfaceMap) -> tuple[Aligned, _Keyframe, str] | None:
+    def _search(self, view: SurfaceMap) -> _Found | None:
         """Search the newest keyframes exhaustively, from no guess at all."""
         options = self._options
         recovery = options.recovery
@@ -409,7 +448,7 @@ class _KeyframeTracker(Tracker):
             )
             lead = f"leading by {match.margin:.0%} of the points"
             how = f"found by a search of keyframe {keyframe.view.index}, {lead}"
-            return align(view, target, T, near), keyframe, how
+            return _Found(align(view, target, T, near), target, keyframe, how)
         return None
 
     def _is_new(self, T: Float64, reference: _Keyframe) -> bool:

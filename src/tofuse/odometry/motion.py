@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,28 @@ from tofuse.geometry import se3
 Float64 = NDArray[np.float64]
 
 # What a motion may differ from the expected one, whatever was seen before: m and rad. Carried
-# cameras at 5 to 30 frames a second stay below.
+# cameras at 5 to 30 frames a second stay below. At lower rates the same accelerations, of 3 m/s^2,
+# take them further, by the square of the time; after 0.6 s nothing can be expected any more.
 FLOOR = np.array([0.06, np.radians(4.0)])
+_SECONDS, _FARTHEST = 0.2, 10.0
 # Over that, so many times the largest of so many recent differences.
 _TIMES, _RECENT = 2.0, 4
 # After so many frames without a pose the camera can be anywhere.
 _FORGOTTEN = 3
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a frame was taken: its index, and its time in s, which is the index if none is known."""
+
+    index: int
+    timestamp: float
+
+    def seconds_since(self, before: Moment | None) -> float | None:
+        """Time since another frame; None where only frames were counted."""
+        if before is None or (before.timestamp, self.timestamp) == (before.index, self.index):
+            return None
+        return self.timestamp - before.timestamp
 
 
 class Motion:
@@ -44,8 +61,10 @@ class Motion:
             return None
         return _onward(self._T, self._per_frame, self._missed + 1)
 
-    def surprise(self, T: Float64, expected: Float64 | None) -> str:
+    def surprise(self, T: Float64, expected: Float64 | None, seconds: float | None = None) -> str:
         """Return in words how a pose differs from what was expected, or nothing if it is believed.
+
+        `seconds` is the time since the last frame with a pose, where it is known.
 
         A surprise is believed if the frame before it was one too and the camera went on from there
         as it moved before: a jump of the camera, or of the recording, does not change how it moves,
@@ -58,7 +77,7 @@ class Motion:
             usual = np.max(self._differences, axis=0)
         else:
             usual = _size(se3.inverse(self._T) @ expected)
-        allowed = FLOOR + _TIMES * usual
+        allowed = _reach(seconds, self._missed + 1) + _TIMES * usual
         if (difference <= allowed * (self._missed + 1)).all():
             self._differences.append(difference / (self._missed + 1))
             self._elsewhere = None
@@ -99,26 +118,44 @@ class Motion:
             self._per_frame, self._elsewhere = None, None
 
 
+def is_small(T: Float64) -> bool:
+    """Whether a motion (4, 4) is one that needs no explanation."""
+    return bool((_size(T) <= FLOOR).all())
+
+
 def jumps(
-    poses: Sequence[Float64 | None], interruptions: Collection[int] = ()
+    poses: Sequence[Float64 | None],
+    interruptions: Collection[int] = (),
+    moments: Sequence[Moment] = (),
 ) -> list[tuple[int, str]]:
     """Positions of poses (4, 4) that the motion before does not lead to, and how far off they are.
 
-    None is a frame without a pose; `interruptions` are positions at which a recording begins.
+    None is a frame without a pose; `interruptions` are positions at which a recording begins;
+    `moments` say when each was taken.
     """
     motion = Motion()
     found = []
+    before = None
     for k, T in enumerate(poses):
         if k in interruptions:
             motion.interrupt()
         if T is None:
             motion.miss()
             continue
-        words = motion.surprise(T, motion.expected)
+        seconds = moments[k].seconds_since(before) if moments else None
+        words = motion.surprise(T, motion.expected, seconds)
         if words:
             found.append((k, words))
         motion.follow(T)
+        before = moments[k] if moments else None
     return found
+
+
+def _reach(seconds: float | None, frames: int) -> Float64:
+    """What a motion may differ from the expected one for each of so many frames, m and rad."""
+    if seconds is None or not seconds > 0:
+        return FLOOR
+    return FLOOR * min(max((seconds / frames / _SECONDS) ** 2, 1.0), _FARTHEST)
 
 
 def _onward(T: Float64, per_frame: Float64, frames: int) -> Float64:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.evaluation.sightings import Sightings
 from tofuse.geometry import se3
-from tofuse.odometry.motion import jumps
+from tofuse.odometry.motion import Moment, jumps
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.trust import expected_error, loop_errors
@@ -133,7 +133,8 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     posed = iter(e.sequential)
     has_pose = [r.status in ("tracked", "predicted") for r in e.records]
     poses = [next(posed) if has else None for has in has_pose]
-    for k, words in jumps(poses, e.interruptions):
+    moments = [Moment(r.index, r.timestamp) for r in e.records]
+    for k, words in jumps(poses, e.interruptions, moments):
         frame = e.records[k].index
         yield Reason("jumped", (frame, frame), f"Frame {frame} has a pose, but {words}.")
     for first, last in _runs(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,17 @@ from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstructio
 Float64 = NDArray[np.float64]
 
 _KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
+_DOUBTED_FRAMES = 3  # so many lost ones may get a pose from what comes after
 _CHECKED_IMAGES = 60  # how many images are compared with each other in the end
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A frame, corrected and filtered for tracking, and cleaned for the model, and its number."""
+
+    position: int
+    frame: Frame
+    clean: Frame
 
 
 class Mapper:
@@ -85,6 +95,7 @@ class Mapper:
         self._ambiguity_m: float | None = None
         self._before: RangeFrame | None = None  # as the camera gave it
         self._repeated: list[int] = []
+        self._lost: dict[int, _Place] = {}  # the last frames, if they have no pose
         self._interruptions: list[int] = []
         self._knows_errors = False
         self._seen: dict[str, int] = {}
@@ -151,19 +162,19 @@ class Mapper:
                 reason = f"the same image as frame {self._records[-1].index}, to the last pixel"
                 step = replace(step, status="predicted", reason=reason)
             self._follow(filtered, step)
-            self._add(frame, clean, step)
-            if step.T_world_camera is not None:
-                with self._watch.timing("loops"):
-                    view = as_cloud(clean, _KEPT_POINTS)
-                    self._loops.push(view, step.T_world_camera, step.surface)
-                with self._watch.timing("fusion"):
-                    self._model.add(clean, step.surface, _KEPT_POINTS)
-                self._refiner.push(view, step.surface, step.T_world_camera)
-                if step.surface is not None:
-                    # Only who looks at surfaces states errors that hold; ICP's are too small.
-                    self._knows_errors = True
-                    # Kept there as far as it is needed, and large.
-                    self._steps[-1] = replace(step, surface=None)
+            for index, believed in step.earlier:
+                if index in self._lost:
+                    self._take(self._lost.pop(index), believed)
+            place = _Place(len(self._records), frame, clean)
+            self._records.append(FrameRecord(frame.index, frame.timestamp, "lost"))
+            self._steps.append(None)
+            self._take(place, replace(step, earlier=()))
+            if step.T_world_camera is None:
+                self._lost[frame.index] = place
+                while len(self._lost) > _DOUBTED_FRAMES:
+                    del self._lost[next(iter(self._lost))]
+            else:
+                self._lost.clear()
                 with self._watch.timing("loops"):
                     if self._live.step():
                         self._follow_loops()
@@ -250,23 +261,21 @@ class Mapper:
                 remedy="number the frames in the order in which they are pushed",
             )
 
-    def _add(self, frame: Frame, filtered: Frame, step: Step) -> None:
-        registration = step.registration
-        self._records.append(
-            FrameRecord(
-                frame.index,
-                frame.timestamp,
-                step.status,
-                step.reason,
-                valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
-                inlier_share=None if registration is None else registration.share,
-                rms_m=None if registration is None else registration.rms_m,
-                unobservable=np.zeros((0, 6))
-                if registration is None
-                else registration.unobservable,
-            )
+    def _take(self, place: _Place, step: Step) -> None:
+        """Take what became of a frame, or what it turns out later to have been."""
+        frame, clean, registration = place.frame, place.clean, step.registration
+        self._records[place.position] = FrameRecord(
+            frame.index,
+            frame.timestamp,
+            step.status,
+            step.reason,
+            valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
+            inlier_share=None if registration is None else registration.share,
+            rms_m=None if registration is None else registration.rms_m,
+            unobservable=np.zeros((0, 6)) if registration is None else registration.unobservable,
         )
-        self._steps.append(step)
+        # The surface is kept by the refiner as far as it is needed, and large.
+        self._steps[place.position] = replace(step, surface=None)
         if step.T_world_camera is None:
             return
         self._posed += 1
@@ -274,8 +283,17 @@ class Mapper:
             ranges = frame.radial_range[::4, ::4]
             self._depths.append(float(np.median(ranges[ranges > 0])) if ranges.any() else 0.0)
             self._ambiguity_m = frame.ambiguity_m
-            if isinstance(filtered, RangeFrame):
-                self._checks.add(whole(frame, filtered))
+            if isinstance(clean, RangeFrame):
+                self._checks.add(whole(frame, clean))
+        with self._watch.timing("loops"):
+            view = as_cloud(clean, _KEPT_POINTS)
+            self._loops.push(view, step.T_world_camera, step.surface)
+        with self._watch.timing("fusion"):
+            self._model.add(clean, step.surface, _KEPT_POINTS)
+        self._refiner.push(view, step.surface, step.T_world_camera)
+        if step.surface is not None:
+            # Only who looks at surfaces states errors that hold; ICP's are too small.
+            self._knows_errors = True
 
     def finish(self) -> Reconstruction:
         """Close the loops, optimise, fuse and judge.

@@ -63,7 +63,8 @@ def default(kind: ViewKind) -> Config:
     return replace(
         base,
         corrections=(Noise(), Multipath()),
-        filters=(),
+        # What the camera itself takes for no measurement is none: phones fill gaps in with guesses.
+        filters=(Confidence(minimum=1),),
         model_filters=(Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),
         loops=Revisits(),
