@@ -157,3 +157,20 @@ def test_ray_tables_of_the_wrong_shape_are_refused(shape: tuple[int, ...]) -> No
 def test_ray_table_without_rays_is_refused() -> None:
     with pytest.raises(InputError, match="no finite rays"):
         RayTable(np.full((10, 10, 2), np.nan, np.float32))
+
+
+@pytest.mark.parametrize("mirror", [(-1, 1), (1, -1)])
+def test_ray_tables_that_mirror_the_image_are_refused(mirror: tuple[int, int]) -> None:
+    rays = Pinhole(40, 30, 50.0, 50.0, 19.5, 14.5).rays() * np.array(mirror, np.float32)
+    rays[:5] = np.nan
+    with pytest.raises(InputError, match="mirror the image"):
+        RayTable(rays)
+
+
+def test_a_ray_table_may_hold_holes_and_noise_and_a_camera_upside_down() -> None:
+    rays = Pinhole(40, 30, 50.0, 50.0, 19.5, 14.5).rays()
+    rng = np.random.default_rng(3)
+    for sign in (1, -1):
+        table = sign * rays + rng.normal(0, 0.004, rays.shape)
+        table[rng.random(rays.shape[:2]) < 0.5] = np.nan
+        assert RayTable(table.astype(np.float32)).width == 40

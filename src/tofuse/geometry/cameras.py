@@ -217,6 +217,15 @@ class Fisheye(Pinhole):
         return np.where(seen[..., None], xy * scale[..., None], np.nan)
 
 
+def _is_mirrored(table: NDArray[np.generic]) -> bool:
+    """Whether rays (H, W, 2) turn the other way than their pixels, by the sign of the Jacobian."""
+    rays = np.asarray(table, float)
+    by_u = rays[:-1, 1:] - rays[:-1, :-1]
+    by_v = rays[1:, :-1] - rays[:-1, :-1]
+    area = by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0]
+    return bool(np.count_nonzero(area < 0) > np.count_nonzero(area > 0))
+
+
 @dataclass(frozen=True)
 class RayTable:
     """A camera known only by its table of rays, (H, W, 2) x/z and y/z, NaN where unknown.
@@ -234,6 +243,12 @@ class RayTable:
             raise InputError(f"has shape {table.shape}", where="rays", remedy="give (H, W, 2)")
         if np.isfinite(table).all(-1).sum() < 16:
             raise InputError("holds no finite rays", where="rays")
+        if _is_mirrored(table):
+            raise InputError(
+                "mirror the image: either x/z or y/z runs against the pixels",
+                where="rays",
+                remedy="negate one of the two: x is right and y is down, or both the other way",
+            )
         object.__setattr__(self, "table", _frozen(np.array(table, np.float32)))
 
     @property
