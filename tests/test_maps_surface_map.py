@@ -282,6 +282,20 @@ def test_a_nearly_flat_surface_is_one_however_little_noise_it_shows():
     assert strict < 0.75 < 0.95 < default
 
 
+def test_noise_is_no_edge():
+    """At 1.5 m, 4 cm between neighbours is noise here, and a step of 40 cm still is none."""
+    frame = wall(sigma=0.04, seed=2)
+    strict, default = (
+        surface_map(frame, replace(OPTIONS, edge_sigmas=k)).planar_share for k in (0.0, 3.0)
+    )
+    assert strict < 0.3 < 0.75 < default
+    step = frame.depth.copy()
+    step[:, 44:] += 0.4
+    planes = surface_map(replace(frame, depth=step), OPTIONS).planes[4:-4, :, 3]
+    assert (planes[:, 43:45] > 0).mean() < 0.2
+    assert (planes[:, 10:30] > 0).mean() > 0.7
+
+
 def test_pixels_of_a_reduced_view_weigh_by_their_stated_noise():
     """Where sigma is wrong by place, planes follow the bad pixels; where it is right, the good."""
     camera = Pinhole(176, 144, 230.0, 230.0, 87.5, 71.5)

@@ -44,6 +44,8 @@ _LEAST_NOISE = 3e-4
 # An alignment takes pixels for independent. Where so many share an error, they tell together what
 # each of them would with that many times its variance.
 _SHARE_ERROR = 100.0
+# Of the absolute values of a normal distribution, in standard deviations.
+_MEDIAN_OF_NORMAL = 0.6745
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,10 @@ class SurfaceOptions:
     radii
         Half widths of the windows of the plane fits, pixels: the smallest gives the depth, the
         widest that is one surface the slope.
-    edge_jump, edge_margin
-        Pixels this near (in pixels) to a jump in depth by this share are left out of the fits:
-        they mix light of both sides.
+    edge_jump, edge_margin, edge_sigmas
+        Pixels this near (`edge_margin`, in pixels) to a jump in depth by this share are left out of
+        the fits: they mix light of both sides. No jump is what differs by less than so many sigmas
+        of the view's typical noise.
     misfit
         How much larger than the noise shown by small windows the variance in wider ones may be.
     flatness
@@ -76,6 +79,7 @@ class SurfaceOptions:
     radii: tuple[int, ...] = (2, 5)
     edge_jump: float = 0.04
     edge_margin: int = 1
+    edge_sigmas: float = 3.0
     misfit: float = 1.2
     flatness: float = 0.002
     fill: float = 0.7
@@ -94,6 +98,8 @@ class SurfaceOptions:
         for name in ("edge_jump", "fill", "offset"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
+        if not 0 <= self.edge_sigmas < 1e3:
+            raise ValueError(f"edge_sigmas is {self.edge_sigmas}, not 0 or more")
         if not 0 <= self.flatness <= 1:
             raise ValueError(f"flatness is {self.flatness}, not 0 to 1")
         if not 0 < self.misfit < 1e6:
@@ -264,7 +270,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     # d(1/z) = dz / z^2
     weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
     if options.edge_margin:
-        weight[_near_edges(w, options.edge_jump, options.edge_margin)] = 0
+        jump = max(options.edge_jump, options.edge_sigmas * _typical_noise(w, weight))
+        weight[_near_edges(w, jump, options.edge_margin)] = 0
     rows, columns = z.shape
     sums = np.zeros((rows + 1, columns + 1, SUMS))
     run_chunks(lambda a, b: weighted_sums(w, rays, weight, sums, a, b), rows, _CHUNKS)
@@ -398,11 +405,28 @@ def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
     """
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        across = np.abs(w[a] - w[b]) > np.float32(jump) * np.maximum(w[a], w[b])
+        across = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
     size = 2 * margin + 1
     return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
+
+
+def _typical_noise(w: Float32, weight: Float32) -> float:
+    """Standard deviation of the difference of two neighbours, as a share of their depth.
+
+    That of the typical pixel: its law's scale is the median of second differences along some of
+    the rows, as most pixels are on surfaces, and few of those are at edges.
+    """
+    rows = np.s_[::4]
+    some = [w[rows, k : w.shape[1] - 2 + k] for k in range(3)]
+    known = np.logical_and.reduce([weight[rows, k : w.shape[1] - 2 + k] > 0 for k in range(3)])
+    if not known.any():
+        return 0.0
+    before, here, after = (values[known] for values in some)
+    bend = np.abs(before - 2 * here + after) / here
+    # sqrt(6) in a second difference, sqrt(2) in a first one.
+    return median(bend) / _MEDIAN_OF_NORMAL / np.sqrt(3.0)
 
 
 def _noise_law(
