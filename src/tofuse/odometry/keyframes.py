@@ -289,6 +289,9 @@ class _KeyframeTracker(Tracker):
         reference = found.reference
         T = found.aligned.T_world_source
         surprise = self._motion.surprise(T, expected, now.seconds_since(self._before))
+        if surprise:  # few iterations do for small motions alone
+            how = replace(options.alignment, levels=_PATIENT)
+            found = replace(found, aligned=align(view, found.targets, T, how))
         step = self._step(view, found, lit=frame.amplitude_image is not None)
         if surprise:
             self._doubted = frame.index, step
