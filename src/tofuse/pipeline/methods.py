@@ -17,8 +17,10 @@ from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.loops import Confirmation
 from tofuse.posegraph.nearby import Nearby
+from tofuse.posegraph.planes import Planes
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.revisits import Revisits
+from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.icp import algorithm_1
 
 
@@ -52,14 +54,16 @@ def default(kind: ViewKind) -> Config:
 
     Range images are told their noise, lose the light that came by way of other surfaces, and are
     aligned with keyframes, by planes and albedo; only what goes into the model is filtered, and
-    only loops given by hand are closed. Clouds are registered as in the thesis, but with a
-    resolution of 3 cm: two random subsets of 1000 points of a room lie several centimetres apart,
-    so at 1 cm few points find a partner.
+    only loops given by hand are closed. Clouds are registered from coarse to fine, and moved to
+    the planes that all of them share.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
-        icp = algorithm_1(resolution=0.03, points=1000)
-        return replace(base, odometry=Sequential(registration=icp, guess="previous"))
+        return replace(
+            base,
+            odometry=Sequential(registration=CoarseToFine(), guess="previous"),
+            refinement=Planes(),
+        )
     return replace(
         base,
         corrections=(Noise(), Multipath()),

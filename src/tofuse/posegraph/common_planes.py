@@ -32,6 +32,15 @@ _SETTLING = 2
 _CHUNKS = 8
 # Little compared with what a cell knows of a pose, so that what nothing holds stays.
 _DAMPING = 1e-6
+# The median cell holds so many times what a cell must.
+_FULL = 1.5
+# Sizes above the smallest that is flat to begin with, and beyond the last that is full.
+_BACK = 3
+_MORE = 3
+# By which support changes when points are cut in another way.
+CHANCE = 0.003
+# Farther than such a share of a cell no step moves the points of a view.
+_BOLDEST = 0.5
 # Cells much thinner than the others are so by chance.
 _THINNEST = 0.25
 
@@ -43,7 +52,8 @@ class PlaneOptions:
     Attributes
     ----------
     coarsest
-        Size of the first cells, as a share of the diagonal of the middle 90 % of all points.
+        Size of the largest cells, as a share of the diagonal of the middle 90 % of all points; the
+        first that are used are three sizes above the smallest that are flat to begin with.
     shrink
         Size of the next cells by that of the last.
     iterations
@@ -180,20 +190,15 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
         np.repeat(np.arange(len(clouds)), [len(c) for c in clouds]),
         len(clouds),
     )
-    size = options.coarsest * _extent(points.world(poses))
     best: tuple[float, Float64] | None = None
-    while size > 0:
-        moved, cells = _level(points, poses, size, options.iterations, options)
+    for size in _sizes(points, poses, options).tolist():
+        poses, cells = _level(points, poses, size, options.iterations, options)
         thick, wide, most = cells[0].typical()
-        if most < 1.5 * options.least:
-            break
         flat = thick <= options.flatness * wide
-        if best is not None and not flat:
+        if most < _FULL * options.least or (best is not None and not flat):
             break
-        poses = moved
         if flat:
-            best = size, moved
-        size *= options.shrink
+            best = size, poses
     if best is None:
         return _unmoved(start)
     size, poses = best
@@ -206,16 +211,36 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
     i, j = system.pairs.T
     relative = se3.inverse(poses[i]) @ poses[j]
     covariance = factor.relative_covariances(relative)
-    first = _cells(points, start, _centres(points, start, size))
+    first = _divided(points, start, size, options.divisions)
     return Aligned(
         poses,
         system.pairs,
         covariance,
         size,
         sigma,
-        _support(points, first, limit),
-        _support(points, cells[0], limit),
+        np.mean([_support(points, each, limit) for each in first], axis=0),
+        np.mean([_support(points, each, limit) for each in cells], axis=0),
     )
+
+
+def _sizes(points: _Points, poses: Float64, options: PlaneOptions) -> Float64:
+    """Sizes of cells, falling, to begin with: coarser ones than needed would lose what is known.
+
+    The first is some steps above the smallest whose cells are flat already, as far as the poses
+    to start from are good for; all of them where none is flat.
+    """
+    sizes, first = [options.coarsest * _extent(points.world(poses))], 0
+    while sizes[-1] > 0:
+        cells = _cells(points, poses, _centres(points, poses, sizes[-1]))
+        thick, wide, most = cells.typical()
+        if most < _FULL * options.least:
+            break
+        if thick <= options.flatness * wide:
+            first = max(0, len(sizes) - 1 - _BACK)
+        sizes.append(options.shrink * sizes[-1])
+    # Once the poses are better, there may be more that share a cell.
+    more = sizes[-1] * options.shrink ** np.arange(1, _MORE + 1)
+    return np.concatenate([sizes[first:], more[more > 0]])
 
 
 def _unmoved(poses: Float64) -> Aligned:
@@ -231,21 +256,45 @@ def _level(
     options: PlaneOptions,
     divisions: int = 1,
 ) -> tuple[Float64, list[_Cells]]:
-    """Iterate with cells of one size; the cells are those of the poses found."""
-    shifts = np.arange(divisions) / divisions
-    cells = [_cells(points, poses, _centres(points, poses, size, shift)) for shift in shifts]
+    """Iterate with cells of one size; the cells are those of the poses found.
+
+    These are the ones to start from, unless the views support each other about as well.
+    """
+    first = _divided(points, poses, size, divisions)
+    found, cells = poses, first
     for _ in range(iterations):
-        factor, _ = _system(points, poses, cells, options)
+        factor, _ = _system(points, found, cells, options)
         step = factor.step() if factor is not None else None
         if step is None:
             break
-        before = poses
-        poses = se3.orthonormalise(poses @ se3.exp(step))
-        cells = [_cells(points, poses, c.mean[np.diff(c.start) > 0]) for c in cells]
-        motion = np.abs(points.world(poses) - points.world(before)).mean()
+        step, motion = _bounded(points, found, step, _BOLDEST * size)
+        found = se3.orthonormalise(found @ se3.exp(step))
+        cells = [_cells(points, found, c.mean[np.diff(c.start) > 0]) for c in cells]
         if motion < options.settled * size:
             break
-    return poses, cells
+    # Cut afresh: cells that went along have had longer to fit.
+    cells = _divided(points, found, size, divisions)
+    limit = options.robust * first[0].typical()[0]
+    before, after = (np.mean([_support(points, c, limit) for c in each]) for each in (first, cells))
+    return (found, cells) if after >= before - CHANCE else (poses, first)
+
+
+def _divided(points: _Points, poses: Float64, size: float, divisions: int) -> list[_Cells]:
+    """Cut all points into cells in several ways."""
+    shifts = np.arange(divisions) / divisions
+    return [_cells(points, poses, _centres(points, poses, size, shift)) for shift in shifts]
+
+
+def _bounded(points: _Points, poses: Float64, step: Float64, most: float) -> tuple[Float64, float]:
+    """The step, or as much of it as moves no view's points further; and how far points move, m."""
+    before = points.world(poses)
+    while True:
+        motion = np.linalg.norm(points.world(poses @ se3.exp(step)) - before, axis=1)
+        total = np.bincount(points.view, motion, minlength=points.count)
+        mean = total / np.maximum(np.bincount(points.view, minlength=points.count), 1)
+        if mean.max() <= most:
+            return step, float(motion.mean())
+        step = step * min(0.9 * most / mean.max(), 0.9)
 
 
 def _extent(x: Float64) -> float:

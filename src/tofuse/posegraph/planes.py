@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.common_planes import Aligned, PlaneOptions, refine_clouds
+from tofuse.posegraph.common_planes import CHANCE, Aligned, PlaneOptions, refine_clouds
 from tofuse.posegraph.refinement import (
     Refinement,
     Refiner,
@@ -32,8 +32,8 @@ class Planes(Refining):
     """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
 
     See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
-    them. The outcome is believed only if the views support each other at least as well as before,
-    and views that lose support stay where their neighbours had them.
+    them. The outcome is believed only if the views support each other about as well as before, and
+    views that lose support stay where their neighbours had them.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class _Planes(Refiner):
         found = refine_clouds([view.points for view in views], before, self._options.refine)
         mean = float(found.before.mean()), float(found.after.mean())
         unchanged = Refinement(poses, False, len(views), len(found.pairs), support=mean)
-        if not len(found.pairs) or mean[1] < mean[0]:
+        if not len(found.pairs) or mean[1] < mean[0] - CHANCE:
             return unchanged
         lost = found.after < found.before - self._options.loss
         after = without_losers(before, found.poses, lost)
