@@ -575,7 +575,11 @@ def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
     assert main(["demo", "--scene", "peaks", "--out", str(out)]) in (0, 3)
     assert {p.name for p in out.iterdir()} == FILES | {"recording"}
-    assert run_json(out)["config"]["odometry"]["registration"]["resolution"] == 1.0
+    assert run_json(out)["config"]["filters"] == []
+    thesis = tmp_path / "thesis"
+    words = ["demo", "--scene", "peaks", "--method", "thesis", "--out", str(thesis)]
+    assert main(words) in (0, 3)
+    assert run_json(thesis)["config"]["odometry"]["registration"]["resolution"] == 1.0
     before = contents(tmp_path)
     assert main(["demo", "--scene", "peaks", "--out", str(out)]) == 2
     assert "--overwrite" in capsys.readouterr().err

@@ -59,7 +59,8 @@ def demo(
         with _replacing_recording(out / RECORDING) as fresh:
             simulate_to(scene, fresh, seed=seed, progress=progress)
             if scene == "peaks":
-                write_text(fresh / "peaks.toml", PEAKS_CONFIG)
+                thesis = options.method == "thesis"
+                write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
                 options = replace(options, config=out / RECORDING / "peaks.toml")
             os.replace(fresh, out / RECORDING)
             return run([out / RECORDING], options, progress)
@@ -93,10 +94,11 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
     shutil.rmtree(old, ignore_errors=True)
 
 
-# Section 4.1.6: all points, a resolution of 1 m, no filters; loops would be 3 m apart.
+# Section 4.1.6: all points, no filters; and a resolution of 1 m. Loops would be 3 m apart.
 PEAKS_CONFIG = """\
 filters = []
-
+"""
+PEAKS_ICP = """
 [odometry]
 guess = "previous"
 
