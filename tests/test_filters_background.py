@@ -146,7 +146,7 @@ def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
         bias = abs(float((before.z - truth.z)[ring].mean()))
         left = abs(float((after.z - truth.z)[ring].mean()))
         assert bias > 0.004
-        assert left < 0.35 * bias
+        assert left < 0.4 * bias
         assert (after.valid == before.valid).all()
 
 

@@ -290,7 +290,7 @@ def test_weights_say_what_noise_is_left(sigma) -> None:
     fitted = pixels[..., 4] > 0
     assert fitted.mean() > 0.9
     ratio = off[fitted].std() / np.median(said[fitted])
-    assert 0.2 < ratio < 1.2  # what relief could be there is not noise, but not known
+    assert 0.2 < ratio < 1.6  # what relief could be there is not noise, but not known
     assert off[fitted].std() < sigma
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from test_kernels_refinement import corner
+from test_kernels_refinement import SHARP, corner
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.maps.surface_map import surface_map
 from tofuse.posegraph.refine import RefineOptions, chosen, refine
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
@@ -35,7 +35,7 @@ def surfaces(poses, noise=0.0, **kwargs):
     for k, T in enumerate(poses):
         frame = replace(corner(T, **kwargs), index=k)
         depth = frame.depth + noise * rng.standard_normal(frame.depth.shape).astype(np.float32)
-        out.append(surface_map(replace(frame, depth=depth), SurfaceOptions(radii=(2,))))
+        out.append(surface_map(replace(frame, depth=depth), SHARP))
     return out
 
 

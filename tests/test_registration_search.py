@@ -335,7 +335,7 @@ def test_rough_planes_fill_what_noise_left_open():
     new = ~own & (filled.planes[..., 3] > 0)
     assert new.sum() > 0.5 * (far & ~own).sum() > 500
     off = 1 / filled.planes[new][:, 3] - frame.depth[new]
-    assert np.sqrt(np.mean(off**2)) < 0.012
+    assert 1.48 * np.median(np.abs(off)) < 0.012
 
 
 # The search
@@ -389,7 +389,7 @@ def test_views_of_different_places_have_little_in_common(pair):
     elsewhere = view(camera(0.0, 0.2, 0.9), boxes=other)
     found = search(elsewhere, pair[1], SearchOptions(mode="both"))
     assert found.score < 0.8 * agreement(*pair, TRUE).score
-    assert found.margin < 0.05
+    assert not Recovery().believes(found, lost=True)
 
 
 def test_the_answer_does_not_depend_on_the_number_of_threads(pair):
