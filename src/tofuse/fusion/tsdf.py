@@ -34,7 +34,7 @@ _CHUNKS = 16
 # Nearer cuts would take off more of the noise on one side of a surface than on the other.
 _REACH_SIGMAS = 3.0
 _LARGEST_REACH = 8.0  # voxels: the noise of a bad sensor is no reason to fill space
-_KNOWN = 1.5  # voxels: the largest standard deviation of a surface
+_KNOWN = 2.5  # voxels: the largest standard deviation of a surface
 # How much larger voxels get when there are too many.
 _COARSER = 1.25
 
@@ -151,7 +151,7 @@ class Volume:
     def surface(self, min_views: int = 1) -> Mesh:
         """Return where the distances change sign, between voxels that views saw.
 
-        What is not known to within 1.5 voxels is left out: there noise makes the surface.
+        What is not known to within a few voxels is left out: there noise makes the surface.
         """
         blocks = len(self.keys)
         run_chunks(

@@ -184,7 +184,8 @@ def _smoothed(surface: SurfaceMap) -> tuple[Float32, Float32]:
     detail = np.square(np.float32(_DETAIL) * z)
     gain = np.where(fitted, detail / np.maximum(detail + noise, np.float32(1e-12)), np.float32(1))
     # d z = z^2 d(1/z)
-    of_plane = np.where(fitted, surface.plane_variance * np.square(plane * plane), np.float32(0))
+    said = surface.plane_variance if surface.pixel_variance is None else surface.pixel_variance
+    of_plane = np.where(fitted, said * np.square(plane * plane), np.float32(0))
     variance = np.square(gain) * noise + np.square(1 - gain) * of_plane
     # What is left of the relief is not known either.
     variance += np.square(1 - gain) * np.minimum(detail, noise)

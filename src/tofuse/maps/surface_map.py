@@ -189,6 +189,9 @@ class SurfaceMap:
         by x/z and y/z; NaN where unknown.
     projection
         Where points of this view's frame land.
+    pixel_variance
+        (H, W) the same as `plane_variance` for one pixel by itself: there errors that neighbours
+        share count once, and not as often as they are shared. None where nothing is shared.
     """
 
     index: int
@@ -200,6 +203,7 @@ class SurfaceMap:
     photo: Float32
     projection: Projection
     has_photo: bool = field(default=False)
+    pixel_variance: Float32 | None = None
 
     @cached_property
     def normals(self) -> Float32:
@@ -306,8 +310,11 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         )
     variance = quality[..., 1] * np.float32(scale)
     shared = _shared_sigma(frame, rays)
+    own_variance = variance
     if shared is not None:
-        variance += np.float32(_SHARE_ERROR) * (shared * planes[..., 3] ** 2) ** 2
+        once = (shared * planes[..., 3] ** 2) ** 2
+        own_variance = variance + once
+        variance = variance + np.float32(_SHARE_ERROR) * once
     return SurfaceMap(
         frame.index,
         rays,
@@ -318,6 +325,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         photo,
         projection,
         has_photo,
+        pixel_variance=None if shared is None else own_variance,
     )
 
 
