@@ -279,11 +279,14 @@ class _KeyframeTracker(Tracker):
         depth = float(np.median(view.z[view.z > 0]))
         if not self._lost and not 1 / _RESCALED < depth / self._depth < _RESCALED:
             return self._lose(f"the typical depth was {self._depth:.2g} m and is {depth:.2g} m")
-        found = self._track(view, expected, reasons) or self._relocate(view)
-        if found is None:
-            found = self._search(view)
-        else:
+        found = self._track(view, expected, reasons)
+        if found is not None:
             self._searched = 0
+        elif self._lost:
+            found = self._relocate(view) or self._search(view)
+        else:
+            # It was there a moment ago, and an older keyframe may show a place that looks alike.
+            found = self._search(view) or self._relocate(view)
         if found is None:
             return self._lose(reasons[0])
         reference = found.reference
