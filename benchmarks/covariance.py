@@ -169,7 +169,7 @@ def main() -> None:
         for kind, seed, made in chains(arguments, noise):
             frames = made.frames
             if arguments.compensate:
-                compensation = Multipath(lamp=1.0).start()
+                compensation = Multipath().start()
                 frames = [compensation.apply(frame) for frame in frames]  # type: ignore[misc]
             views = [surface_map(frame, SurfaceOptions()) for frame in frames]
             for pair in PAIRS:

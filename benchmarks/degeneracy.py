@@ -151,7 +151,7 @@ def main() -> None:
             scene, sequence = build(kind, seed=seed, texture=texture)
             step = int(rng.integers(1, 5))
             first = int(rng.integers(0, sequence.frames - step))
-            compensation = Multipath(lamp=1.0).start()
+            compensation = Multipath().start()
             poses, views = [], []
             for index in (first, first + step):
                 raw = render(scene, sequence, model, index, effects=effects, seed=seed).frame
