@@ -47,10 +47,8 @@ UNKNOWNS = 7 + ERRORS
 H = 0  # upper triangle over the unknowns
 G = UNKNOWNS * (UNKNOWNS + 1) // 2
 COMPARED = G + UNKNOWNS  # points that land where the target has a plane
-INLIERS = COMPARED + 1
-IN_FRONT = INLIERS + 1  # points in free space of the target
-SQUARES_M = IN_FRONT + 1  # of the inliers' distances, m^2
-WEIGHT_P = SQUARES_M + 1  # sums of the robust weights and squares of the log albedo's residuals
+IN_FRONT = COMPARED + 1  # points in free space of the target
+WEIGHT_P = IN_FRONT + 1  # sums of the robust weights and squares of the log albedo's residuals
 SQUARES_P = WEIGHT_P + 1
 TERMS = SQUARES_P + 1  # residuals of both terms
 SUPPORT = TERMS + 1  # their robust costs (Tukey's biweight), from 1 for none to 0 for the largest
@@ -183,8 +181,6 @@ def pair_equations(
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
         f = 1 - e2
-        out[INLIERS] += 1
-        out[SQUARES_M] += r2
         out[SUPPORT] += f * f * f
         # The mean of both views' normals: noise in one of them then counts half.
         jacobian_row(J, 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2), px, py, pz)

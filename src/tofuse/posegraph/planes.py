@@ -17,7 +17,7 @@ from tofuse.posegraph.refinement import (
     Refinement,
     Refiner,
     Refining,
-    followed,
+    moved_to,
     without_losers,
 )
 from tofuse.posegraph.views import Spacing, ViewStore
@@ -99,15 +99,8 @@ class _Planes(Refiner):
             return unchanged
         lost = found.after < found.before - self._options.loss
         after = without_losers(before, found.poses, lost)
-        motion = se3.log(se3.inverse(before) @ after)
-        return replace(
-            unchanged,
-            poses=followed(poses, at, after),
-            kept=True,
-            moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
-            moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
-            edges=tuple(_edges(found, [view.index for view in views], lost)),
-        )
+        edges = tuple(_edges(found, [view.index for view in views], lost))
+        return replace(moved_to(unchanged, at, after), edges=edges)
 
 
 def _edges(found: Aligned, ids: Sequence[int], lost: NDArray[np.bool_]) -> list[Measured]:

@@ -171,13 +171,8 @@ class _Joint(Refiner):
         if not len(refined.pairs) or mean[1] < mean[0]:
             return unchanged
         after = without_losers(before, refined.poses, support[1] < support[0] - options.loss)
-        motion = se3.log(se3.inverse(before) @ after)
         return replace(
-            unchanged,
-            poses=followed(poses, at, after),
-            kept=True,
-            moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
-            moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+            moved_to(unchanged, at, after),
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
             edges=tuple(
                 Measured(views[i].surface.index, views[j].surface.index, T, H / _SHARED_NOISE)
@@ -221,6 +216,26 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
     )
     moved[:, :2] += errors.get("focal", 0.0) * p[:, :2]
     return moved.astype(np.float32)
+
+
+def moved_to(unchanged: Refinement, at: NDArray[np.intp], after: Float64) -> Refinement:
+    """What is kept of a refinement by which the poses at positions `at` (ascending) become `after`.
+
+    Parameters
+    ----------
+    unchanged
+        As it would be told if it were not kept.
+    after
+        (M, 4, 4) T_world_camera.
+    """
+    motion = se3.log(se3.inverse(unchanged.poses[at]) @ after)
+    return replace(
+        unchanged,
+        poses=followed(unchanged.poses, at, after),
+        kept=True,
+        moved_m=float(np.linalg.norm(motion[:, :3], axis=1).max()),
+        moved_rad=float(np.linalg.norm(motion[:, 3:], axis=1).max()),
+    )
 
 
 def followed(poses: Float64, at: NDArray[np.intp], after: Float64) -> Float64:
