@@ -14,13 +14,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import linalg
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.views import KeptView, overlaps
 
 Float64 = NDArray[np.float64]
@@ -32,6 +31,9 @@ _PAIRS_A_CHUNK = 8
 # Few residuals tell no scale.
 _LEAST_COMPARED = 50
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
+# How firmly poses and errors are held where they are, in units of 1 cm and 1 degree, and of 0.01.
+_STILL, _ERROR_UNIT = 1e-3, 0.01
+_DAMPING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,7 @@ class _Pairs:
     scale_g: Float64
     scale_p: Float64
     most: Float64
+    system: PairSystem
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
 
 
@@ -221,8 +224,9 @@ def chosen(pairs: Integers, neighbours: int) -> Integers:
 
 
 def _no_pairs() -> _Pairs:
-    none = np.zeros(0, np.intp)
-    return _Pairs(none, none, *(np.zeros(0) for _ in range(4)))
+    none, nothing = np.zeros(0, np.intp), np.zeros(0)
+    system = PairSystem(1, none.reshape(0, 2))
+    return _Pairs(none, none, nothing, nothing, nothing, nothing, system)
 
 
 def _directed(
@@ -233,7 +237,10 @@ def _directed(
     source = np.concatenate([pairs[:, 1], pairs[:, 0]])
     n = len(target)
     most = np.maximum(3.0, options.most_sigma_m / np.array([v.sigma for v in views]))
-    state = _Pairs(target, source, np.zeros(n), np.ones(n), np.full(n, 0.1), most[source])
+    first = np.arange(len(views)) == 0
+    system = PairSystem(len(views), np.stack([target, source], 1), fixed=first)
+    unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
+    state = _Pairs(target, source, *unknown, most[source], system)
     lit = np.array([v.surface.has_photo for v in views]) & options.photometric
     state.scale_p[~(lit[target] & lit[source])] = 0.0
     row = {ts: k for k, ts in enumerate(zip(before.target, before.source, strict=True))}
@@ -306,7 +313,7 @@ def _alone(poses: Float64, pairs: Integers, state: _Pairs) -> tuple[Float64, Flo
     At = np.swapaxes(A, 1, 2)
     H = H[:half] + At @ H[half:] @ A
     g = g[:half] + (At @ g[half:, :, None])[..., 0]
-    scaled = H * np.outer(UNITS, UNITS) + 1e-3 * np.eye(6)
+    scaled = H * np.outer(UNITS, UNITS) + _STILL * np.eye(6)
     step = -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS
     return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
 
@@ -314,30 +321,36 @@ def _alone(poses: Float64, pairs: Integers, state: _Pairs) -> tuple[Float64, Flo
 def _solve(poses: Float64, state: _Pairs, known: Int64) -> tuple[Float64, Float64]:
     """One Gauss-Newton step: (N, 6) right perturbations of the poses, and that of the errors."""
     H, g = _without_exposure(state)
-    free = np.flatnonzero(known == 0)
+    free = 6 + np.flatnonzero(known == 0)
     n = len(poses)
-    # A relative pose moves with its source, and against its target as the source sees it.
-    A = -se3.adjoint(se3.inverse(poses[state.source]) @ poses[state.target])
-    At = np.swapaxes(A, 1, 2)
-    pose, mixed = H[:, :6, :6], H[:, :6, 6 + free]
-    s, t = 6 * state.source, 6 * state.target
-    calibration = np.broadcast_to(6 * n, len(s))
-    system = _System(6 * n + len(free))
-    system.add(s, s, pose)
-    system.add(t, t, At @ pose @ A)
-    system.add(t, s, At @ pose)
-    system.add(s, t, pose @ A)
-    for rows, block in ((s, mixed), (t, At @ mixed)):
-        system.add(rows, calibration, block)
-        system.add(calibration, rows, np.swapaxes(block, 1, 2))
-    system.add(calibration, calibration, H[:, (6 + free)[:, None], 6 + free])
-    system.add_right(s, g[:, :6])
-    system.add_right(t, (At @ g[:, :6, None])[..., 0])
-    system.add_right(calibration, g[:, 6 + free])
-    x = system.solve(np.append(np.tile(UNITS, n), np.full(len(free), 0.01)), held=6)
+    T_target_source = se3.inverse(poses[state.target]) @ poses[state.source]
+    system = state.system
+    # Just enough that a view which nothing holds stays.
+    still = np.broadcast_to(np.diag(_STILL / UNITS**2), (n, 6, 6)), np.zeros((n, 6))
+    matrix, gradient = system.relative(H[:, :6, :6], g[:, :6], T_target_source, still)
+    factor = system.factor(matrix, gradient, _DAMPING)
+    assert factor is not None, "the poses are held, so the system is not singular"
+    # Poses by themselves, and how they follow each error: then the errors have a small system.
+    columns = [system.gradient(H[:, :6, k], T_target_source) for k in free]
+    step = _finite(factor.step())
+    follow = np.zeros((len(free), n, 6))
+    small, right = H[:, free[:, None], free].sum(0), g[:, free].sum(0)
+    firm = _STILL / _ERROR_UNIT**2 + _DAMPING * small.diagonal()
+    for k, column in enumerate(columns):
+        follow[k] = _finite(factor.solve(column))
+        right[k] += column.ravel() @ step[system.free].ravel()
+    for k, column in enumerate(columns):
+        small[k] += follow[:, system.free].reshape(len(free), -1) @ column.ravel()
+    small[np.diag_indices(len(free))] += firm
+    change = -np.linalg.solve(small, right)
     errors = np.zeros(kernels.ERRORS)
-    errors[free] = x[6 * n :]
-    return x[: 6 * n].reshape(n, 6), errors
+    errors[free - 6] = change
+    return step + np.tensordot(change, follow, 1), errors
+
+
+def _finite(step: Float64 | None) -> Float64:
+    assert step is not None, "what went into the system is finite"
+    return step
 
 
 def _without_exposure(state: _Pairs) -> tuple[Float64, Float64]:
@@ -355,41 +368,6 @@ def _without_exposure(state: _Pairs) -> tuple[Float64, Float64]:
         H[:, rest[:, None], rest] - lever[:, :, None] * H[:, None, e, rest],
         g[:, rest] - lever * g[:, [e]],
     )
-
-
-class _System:
-    """A symmetric sparse system put together from blocks; what is added twice adds up."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._parts: list[tuple[Integers, Integers, Float64]] = []
-        self._right = np.zeros(size)
-
-    def add(self, rows: Integers, columns: Integers, blocks: Float64) -> None:
-        """Add blocks (M, a, b) whose first elements are at (rows[m], columns[m])."""
-        _, a, b = blocks.shape
-        i = np.broadcast_to(rows[:, None, None] + np.arange(a)[:, None], blocks.shape)
-        j = np.broadcast_to(columns[:, None, None] + np.arange(b), blocks.shape)
-        self._parts.append((i.ravel(), j.ravel(), blocks.ravel()))
-
-    def add_right(self, rows: Integers, blocks: Float64) -> None:
-        """Add blocks (M, a) to the gradient."""
-        np.add.at(self._right, rows[:, None] + np.arange(blocks.shape[1]), blocks)
-
-    def solve(self, units: Float64, *, held: int) -> Float64:
-        """Return the step that takes the gradient to 0; the first `held` unknowns stay.
-
-        `units` (size,) says what is a small step of each unknown: what nothing holds stays.
-        """
-        i, j, values = (np.concatenate(part) for part in zip(*self._parts, strict=True))
-        M = sparse.coo_matrix((values, (i, j)), shape=(self._size, self._size)).tocsc()
-        D = sparse.diags(units[held:])
-        M = (D @ M[held:, held:] @ D).tocsc()
-        M = M + sparse.diags(1e-3 + 1e-6 * M.diagonal())
-        solver = linalg.splu(M.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        x = np.zeros(self._size)
-        x[held:] = -units[held:] * solver.solve(units[held:] * self._right[held:])
-        return x
 
 
 def _rescale(state: _Pairs, stage: Round) -> None:

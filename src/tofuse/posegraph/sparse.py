@@ -147,6 +147,12 @@ class PairSystem:
         AtH = At @ H
         return self.assemble(AtH @ A, -AtH, H, -(At @ g[..., None])[..., 0], g, single)
 
+    def gradient(self, g: Float64, T_i_j: Float64) -> Float64:
+        """Gradient (free poses x 6) of (m, 6) g as in `relative`, by itself."""
+        At = np.swapaxes(se3.adjoint(se3.inverse(T_i_j)), 1, 2)
+        g_i = -(At @ g[..., None])[..., 0]
+        return np.asarray(self._sum_i @ g_i + self._sum_j @ g, np.float64)
+
     def blocks(self, matrix: Any) -> tuple[Float64, Float64]:
         """Blocks of an assembled matrix: on the diagonal, and below it at `rows`, `columns`."""
         data = matrix.data
@@ -211,10 +217,14 @@ class Factor:
 
     def step(self) -> Float64 | None:
         """(n, k) solution of ``matrix x = -gradient``; None if it is not finite."""
+        return self.solve(self.gradient)
+
+    def solve(self, gradient: Float64) -> Float64 | None:
+        """The same with another gradient (free poses x k)."""
         system = self.system
         out = np.zeros((system.n, system.size))
         if self._lu is not None:
-            x = self._lu.solve(-self.gradient.ravel())
+            x = self._lu.solve(-gradient.ravel())
             if not np.isfinite(x).all():
                 return None
             out[system.free] = x.reshape(-1, system.size)
