@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint format lock clean
+.PHONY: demo test lint docs format lock clean
 
 .venv/.ready: requirements/dev.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit("tofuse needs Python 3.11 or newer, and $(PYTHON) is %s; try: make PYTHON=python3.12 ..." % sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
@@ -23,6 +23,17 @@ lint: .venv/.ready          ## formatting, style, strict types, and who may impo
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Pictures of the gallery are of results of this code: made again where it changed.
+docs/gallery/index.md: .venv/.ready $(wildcard website/*.py) $(shell find src -name '*.py')
+	$(BIN)/python website/gallery.py
+
+.venv/.docs-ready: requirements/docs.txt .venv/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements/docs.txt
+	@touch $@
+
+docs: .venv/.docs-ready docs/gallery/index.md  ## the documentation site, in build/site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 format: .venv/.ready        ## put the code into its standard form
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
@@ -30,6 +41,7 @@ format: .venv/.ready        ## put the code into its standard form
 lock: .venv/.ready          ## pin the newest versions that pyproject.toml allows
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group dev pyproject.toml requirements/build.in -o requirements/dev.txt --upgrade
+	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group docs -c requirements/dev.txt -o requirements/docs.txt --upgrade
 
 clean:
 	rm -rf .venv build dist

@@ -1,0 +1,183 @@
+"""The gallery of the documentation: what comes out well, and what does not.
+
+    python website/gallery.py [DIR]        default: docs/gallery
+
+Simulates the recordings, reconstructs them, draws the results, and writes the page with the
+verdicts and errors that it just saw. Nothing on that page is written by hand but the captions.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drawing import ESTIMATE, TRUTH, Picture
+from tofuse.evaluation.trajectory import evaluate_trajectory
+from tofuse.files.ply import read_ply
+from tofuse.files.trajectory import read_tum
+from tofuse.geometry import se3
+from tofuse.pipeline.demo import simulate_to
+from tofuse.pipeline.run import Options, run
+from tofuse.results.output import read_run_json
+
+ROOT = Path(__file__).resolve().parents[1]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Made:
+    """A recording to simulate; `camera_file` is what is then changed in its camera.json."""
+
+    scene: str
+    texture: bool = True
+    camera_file: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def simulated(self) -> tuple[str, bool]:
+        return self.scene, self.texture
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A picture of the gallery: a recording, the options of its run, and a caption."""
+
+    name: str
+    title: str
+    made: Made
+    options: dict[str, object]
+    caption: str
+
+
+_ROOM = Made("room")
+RESULTS = (
+    Exhibit(
+        "room", "A room with chairs", _ROOM, {},
+        "An SR4000 turns once in the middle of a room with seven chairs. Walls, doors and chairs"
+        " meet again after the turn, so the loop can be closed.",
+    ),
+    Exhibit(
+        "box", "A box on a turntable", Made("box"), {"object": True, "max_depth": 1.8},
+        "The box turns, the camera stands still: with `--object` the model is of what moves, and"
+        " the camera seems to travel around it.",
+    ),
+    Exhibit(
+        "torso", "A mannequin's torso", Made("torso"), {"object": True, "max_depth": 2.2},
+        "Smooth and round, so that geometry alone lets it spin about its axis: the pattern of its"
+        " surface holds it.",
+    ),
+)  # fmt: skip
+FAILURES = (
+    Exhibit(
+        "uniform", "An empty room without any texture", Made("empty-room", texture=False), {},
+        "Four plain walls look alike from everywhere. What the walls do not hold is"
+        " predicted from the motion before, and the verdict names those frames. Put something"
+        " into the scene, or hang a poster on the wall.",
+    ),
+    Exhibit(
+        "thesis", "The same furnished room by the method of 2010", _ROOM, {"method": "thesis"},
+        "Point-to-point registration of random points slides along flat walls, and closing the loop"
+        " spreads that error over good transformations. This is why it is not the default.",
+    ),
+    Exhibit(
+        "steps", "Too few frames", _ROOM, {"every": 16},
+        "Every 16th frame of the turn: neighbours hardly see the same things. Frames that could"
+        " not be placed carry no pose instead of a wrong one. Move slower, or keep more frames.",
+    ),
+    Exhibit(
+        "range", "Radial range taken for z", Made("room", camera_file={"depth_kind": "z"}), {},
+        "`depth_kind` in `camera.json` says *z*, but the camera measured along the rays: every"
+        " wall bulges towards its edges. `tofuse inspect` measures that.",
+    ),
+    Exhibit(
+        "unit", "A depth unit ten times too large",
+        Made("room", camera_file={"depth_unit_m": 0.01}), {},
+        "The model has the right shape and the wrong size, so nothing in it disagrees: only what"
+        " is known of rooms and cameras speaks against it.",
+    ),
+)  # fmt: skip
+
+
+def draw(result: Path, truth: Path) -> bytes:
+    """Picture of a result folder: its surface or points, its path, and the true path."""
+    stamps, poses = read_tum(result / "trajectory.txt")
+    true_stamps, true_poses = read_tum(truth)
+    cloud = read_ply(result / "cloud.ply")
+    picture = Picture(np.concatenate([cloud.points.astype(float), poses[:, :3, 3]]))
+    mesh = result / "mesh.ply"
+    surface = read_ply(mesh) if mesh.exists() else None
+    if surface is not None and surface.faces is not None and len(surface.faces):
+        picture.surface(surface)
+    else:
+        picture.points(cloud)
+    start = int(np.argmin(abs(true_stamps - stamps[0])))
+    picture.path(poses[0] @ se3.inverse(true_poses[start]) @ true_poses, TRUTH)
+    picture.path(poses, ESTIMATE)
+    return picture.png()
+
+
+def lines(exhibit: Exhibit, result: Path, truth: Path) -> Iterator[str]:
+    """Markdown of one exhibit."""
+    told = read_run_json(result / "run.json")
+    posed = sum(frame["status"] in ("tracked", "predicted") for frame in told["frames"])
+    error = evaluate_trajectory(*read_tum(result / "trajectory.txt"), *read_tum(truth))
+    yield f"### {exhibit.title}\n"
+    yield f"![{exhibit.title}, seen from above]({exhibit.name}.png)\n"
+    yield f"{exhibit.caption}\n"
+    yield (
+        f"Verdict: **{told['verdict']}**; {posed} of {len(told['frames'])} frames have a pose;"
+        f" error against the exact path {1000 * error.ate_rms_m:.1f} mm and"
+        f" {np.degrees(error.rotation_rms_rad):.2f} degrees."
+    )
+    if told["reasons"]:
+        yield "\nWhat the verdict gives as reasons:\n"
+        yield from (f"- `{r['code']}`: {r['text']}" for r in told["reasons"])
+    yield ""
+
+
+def exhibit_lines(exhibit: Exhibit, recordings: Path, out: Path) -> Iterator[str]:
+    recording = recordings / "-".join(map(str, exhibit.made.simulated))
+    if not recording.exists():
+        simulate_to(exhibit.made.scene, recording, texture=exhibit.made.texture)
+    camera = recording / "camera.json"
+    as_made = camera.read_text()
+    result = recordings / f"result-{exhibit.name}"
+    try:
+        camera.write_text(json.dumps({**json.loads(as_made), **exhibit.made.camera_file}))
+        run([recording], Options(out=result, **exhibit.options))  # type: ignore[arg-type]
+    finally:
+        camera.write_text(as_made)
+    (out / f"{exhibit.name}.png").write_bytes(draw(result, recording / "groundtruth.txt"))
+    print(f"drawn: {exhibit.name}", flush=True)
+    return lines(exhibit, result, recording / "groundtruth.txt")
+
+
+def main() -> None:
+    out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "gallery"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    page = [
+        "# Gallery\n",
+        "Made by the build of this page from simulated recordings of an SR4000 with all its errors"
+        " (noise, mixed pixels, multipath, wiggling, scatter, motion). Rooms are seen from above,"
+        " without the surfaces that show their back. Orange: the path found; white: the exact one.",
+        "\n## Results\n",
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        for exhibit in RESULTS:
+            page += exhibit_lines(exhibit, Path(folder), out)
+        page.append("## Failures, and how they are told\n")
+        for exhibit in FAILURES:
+            page += exhibit_lines(exhibit, Path(folder), out)
+    (out / "index.md").write_text("\n".join(page), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

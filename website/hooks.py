@@ -1,0 +1,48 @@
+"""What the documentation site does to the pages that a code hosting site shows as they are."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+# Documents in the root of the project become pages of the site too.
+ROOT_PAGES = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
+_CODE = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.MULTILINE | re.DOTALL)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the documents of the root."""
+    for name in ROOT_PAGES:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        text = re.sub(r"\]\(docs/", "](", text).replace("](README.md", "](index.md")
+        text = re.sub(r"\[([^\]]+)\]\((?:LICENSE|NOTICE)\)", r"`\1`", text)  # no pages
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Point links to the root's documents at their pages; set equations as MathML.
+
+    MathML needs no script, so the site shows its equations offline.
+    """
+    pieces = _CODE.split(markdown)  # code at the odd places is left alone
+    return "".join(piece if k % 2 else _text(piece) for k, piece in enumerate(pieces))
+
+
+def _text(text: str) -> str:
+    text = text.replace("](../README.md", "](index.md").replace("](../", "](")
+    text = re.sub(
+        r"\$\$(.+?)\$\$", lambda m: convert(m[1].strip(), display="block"), text, flags=re.DOTALL
+    )
+    return re.sub(r"\$([^$\s](?:[^$\n]*[^$\s])?)\$", _inline, text)
+
+
+def _inline(found: re.Match[str]) -> str:
+    # In a span, as Markdown takes an element that it does not know for a block.
+    return f"<span>{convert(found[1])}</span>"
