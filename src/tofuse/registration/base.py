@@ -40,6 +40,9 @@ class Registration:
         (k, 6) directions of the right perturbation that the data doesn't hold.
     errors
         E at every iteration.
+    margin
+        By how much the pose leads the best other one, as a share of the points, for methods that
+        look at several; None for those that follow one.
     """
 
     T_target_source: Float64
@@ -52,6 +55,7 @@ class Registration:
     information: Float64
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
     errors: tuple[float, ...] = ()
+    margin: float | None = None
 
     @property
     def share(self) -> float:

@@ -1,0 +1,146 @@
+"""Registration by points that look alike in two images (sections 2.5.1 and 2.5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.agreement import agreement
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.keypoints import Detector, Keypoints, Light, keypoints
+from tofuse.registration.sample_consensus import (
+    ConsensusOptions,
+    Pairs,
+    consensus,
+    registration_of,
+)
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+@part("registration", "features")
+@dataclass(frozen=True)
+class Features(Registrar):
+    """Points that SIFT, ORB or FAST find in the albedo or the colour, matched, placed in space.
+
+    A match counts if it is the best both ways, and better than the second best by a ratio (Lowe
+    2004). Each end has a depth, so three matches give a motion, and RANSAC finds the one that most
+    agree on: a match may miss by some standard deviations of its own noise. Weighted least squares
+    over these give the pose. The guess is not used.
+
+    Attributes
+    ----------
+    detector
+        "sift", "orb" or "fast".
+    light
+        Where points are looked for: the "albedo" (amplitude times squared range), the "color", or
+        "auto": the albedo if there is amplitude.
+    count
+        The strongest so many points of each view.
+    ratio
+        Largest distance of the descriptors of a match, relative to that of the second best.
+    mutual
+        Whether it must be the best both ways.
+    blur_px
+        Standard deviation of where a point is found, pixels.
+    verify
+        Whether what both images saw (`agreement`) counts as much as the matches when one of several
+        motions is chosen; one that they contradict is refused.
+    surface
+        How the depth and its noise are prepared.
+    consensus
+        How the motion is found that most matches agree on.
+    """
+
+    detector: Detector = "sift"
+    light: Light = "auto"
+    count: int = 1000
+    ratio: float = 0.9
+    mutual: bool = True
+    blur_px: float = 0.7
+    verify: bool = True
+    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
+    consensus: ConsensusOptions = ConsensusOptions()  # noqa: RUF009 - immutable
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        for name, choices in (("detector", Detector), ("light", Light)):
+            if getattr(self, name) not in get_args(choices):
+                raise ValueError(f"{name} is {getattr(self, name)!r}, not one of {choices}")
+        if not 3 <= self.count <= 100_000:
+            raise ValueError(f"count is {self.count}, not 3 to 100000")
+        if not 0 < self.ratio <= 1:
+            raise ValueError(f"ratio is {self.ratio}, not above 0 and up to 1")
+        if not 0 < self.blur_px <= 100:
+            raise ValueError(f"blur_px is {self.blur_px}, not above 0")
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; points are the matches, correspondences those that agree.
+
+        Raises
+        ------
+        RegistrationError
+            If a view has no light to look at, or too few matches agree on a motion, or the images
+            contradict it.
+        """
+        (a, s), (b, t) = self._found(source), self._found(target)
+        pairs = self.pairs(a, b)
+        found = consensus(pairs, self.consensus, rng)
+        shares = [c.score / len(pairs) for c in found]
+        if self.verify:
+            said = [agreement(s, t, c.T_target_source).score for c in found]
+            if max(said) <= 0:
+                raise RegistrationError(
+                    f"{found[0].count} of {len(pairs)} pairs of points agree on a motion that "
+                    "what both images saw contradicts"
+                )
+            shares = [a + b for a, b in zip(shares, said, strict=True)]
+        best = max(range(len(found)), key=lambda k: shares[k])
+        rival = max((share for k, share in enumerate(shares) if k != best), default=0.0)
+        return registration_of(pairs, found[best], shares[best] - max(rival, 0.0))
+
+    def _found(self, view: Frame) -> tuple[Keypoints, SurfaceMap]:
+        if not isinstance(view, RangeFrame):
+            raise RegistrationError("is no image", where=f"frame {view.index}")
+        surface = surface_map(view, self.surface)
+        points = keypoints(
+            view,
+            surface,
+            detector=self.detector,
+            light=self.light,
+            count=self.count,
+            blur_px=self.blur_px,
+        )
+        return points, surface
+
+    def pairs(self, source: Keypoints, target: Keypoints) -> Pairs:
+        """Match the points of two views."""
+        i, j = self._matched(source.descriptors, target.descriptors)
+        return Pairs(source.points[i], target.points[j], source.variance[i] + target.variance[j])
+
+    def _matched(self, a: NDArray[Any], b: NDArray[Any]) -> tuple[Int64, Int64]:
+        """Positions of the descriptors that match, in the order of the first."""
+        nothing = np.zeros(0, np.int64)
+        if len(a) < 2 or len(b) < 2:
+            return nothing, nothing
+        matcher = cv2.BFMatcher(cv2.NORM_HAMMING if a.dtype == np.uint8 else cv2.NORM_L2)
+        best = matcher.knnMatch(a, b, k=2)
+        kept = [m for m, second in best if m.distance < self.ratio * second.distance]
+        if self.mutual:
+            back = [m.trainIdx for m in matcher.match(b, a)]
+            kept = [m for m in kept if back[m.trainIdx] == m.queryIdx]
+        return (
+            np.array([m.queryIdx for m in kept], np.int64),
+            np.array([m.trainIdx for m in kept], np.int64),
+        )

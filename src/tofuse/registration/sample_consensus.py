@@ -1,0 +1,354 @@
+"""The rigid motion that most of a list of pairs of points agree on, wrong pairs and all.
+
+Two ways to it. RANSAC (Fischler and Bolles 1981; section 2.5.2 of the thesis) draws three pairs at
+random, again and again, until so many were drawn that one draw without a wrong pair is nearly
+certain. Where one pair in fifty is right that takes for ever; but two right pairs are as far apart
+in one view as in the other, and three right pairs agree about that pairwise. So the pairs that
+have the most agreeing pairs in common are taken together (second-order compatibility: Chen et al.
+2022, "SC2-PCR"), and nothing is random.
+
+A pair counts as an inlier by its own noise: it may miss by a few of its own standard deviations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.registration.base import Registration
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+Way = Literal["samples", "compatible"]
+
+_SAMPLE = 3
+_BATCH = 256
+# Triangles that are this thin fix no rotation: second singular value relative to the first.
+_THINNEST = 0.1
+# A sample's motion is rough: what counts as an inlier in each round of least squares after it, in
+# units of what does in the end.
+_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
+# Distinct motions that are refined before the best is chosen.
+_POLISHED = 20
+# Sides of a triangle of samples, at least, in standard deviations of their length.
+_SHORTEST = 4.0
+# Pairs that grow a motion together from one that leads (SC2-PCR: nearest in compatibility).
+_TOGETHER = 20
+# A direction is held if its sigma is at most 1 cm, or 1 degree.
+_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+
+
+@dataclass(frozen=True)
+class ConsensusOptions:
+    """How the motion is found that most pairs agree on.
+
+    Attributes
+    ----------
+    way
+        "samples": random triples; "compatible": pairs that agree with each other pairwise.
+    sigmas
+        A pair is an inlier if it misses by at most so many of its standard deviations.
+    inliers
+        Fewest inliers of a motion.
+    confidence
+        Samples are drawn until one of inliers alone was among them with this probability.
+    most_samples
+        But no more than so many.
+    leaders
+        Pairs from which compatible ones are gathered, at most.
+    distinct_m, distinct_rad
+        Motions that differ by more are rivals.
+    """
+
+    way: Way = "samples"
+    sigmas: float = 3.0
+    inliers: int = 6
+    confidence: float = 0.999
+    most_samples: int = 5000
+    leaders: int = 100
+    distinct_m: float = 0.1
+    distinct_rad: float = 0.0873
+
+    def __post_init__(self) -> None:
+        if self.way not in get_args(Way):
+            raise ValueError(f"way is {self.way!r}, not one of {', '.join(get_args(Way))}")
+        if not 3 <= self.inliers <= 1_000_000:
+            raise ValueError(f"inliers is {self.inliers}, not 3 or more")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"confidence is {self.confidence}, not between 0 and 1")
+        for name in ("most_samples", "leaders"):
+            if not 1 <= getattr(self, name) <= 1_000_000:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
+        for name in ("sigmas", "distinct_m", "distinct_rad"):
+            if not 0 < getattr(self, name) <= 1e3:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """m pairs of points that may be the same point of the world.
+
+    Attributes
+    ----------
+    source, target
+        (m, 3) m, each in the frame of its view.
+    variance
+        (m,) of their distance along each axis once they are aligned, m^2.
+    """
+
+    source: Float64
+    target: Float64
+    variance: Float64
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def some(self, which: Int64 | Bool) -> Pairs:
+        """Return the pairs of a mask, or at positions."""
+        return Pairs(self.source[which], self.target[which], self.variance[which])
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """What most pairs agree on.
+
+    Attributes
+    ----------
+    T_target_source
+        (4, 4) by weighted least squares over the inliers.
+    inliers
+        (m,) whether a pair agrees.
+    score
+        Pairs that agree, each counted the more the better it does, at most 1.
+    tried
+        Motions that were tried.
+    """
+
+    T_target_source: Float64
+    inliers: Bool
+    score: float
+    tried: int
+
+    @property
+    def count(self) -> int:
+        """Number of inliers."""
+        return int(np.count_nonzero(self.inliers))
+
+
+def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) -> list[Consensus]:
+    """Find the rigid motions that most pairs agree on: the best first, then its distinct rivals.
+
+    Raises RegistrationError where too few pairs agree on any.
+    """
+    found: list[Consensus] = []
+    if len(pairs) >= options.inliers:
+        motions = (_sampled if options.way == "samples" else _compatible)(pairs, options, rng)
+        found = [c for c in _ranked(pairs, motions, options) if c.count >= options.inliers]
+    if not found:
+        raise RegistrationError(
+            f"of {len(pairs)} pairs of points not even {options.inliers} agree on a motion"
+        )
+    return found
+
+
+def motion_of(pairs: Pairs) -> Float64:
+    """(4, 4) the motion with the least weighted squares (Arun et al. 1987, Umeyama 1991).
+
+    Pairs weigh by the inverse of their variance.
+    """
+    weight = 1 / pairs.variance
+    return _motions(pairs.source[None], pairs.target[None], weight[None])[0]
+
+
+def information_of(pairs: Pairs, T_target_source: Float64) -> Float64:
+    """(6, 6) ``sum J^T J / v``, ``J = [I, -hat(p)]``: of the right perturbation, source frame.
+
+    The variance is that of the pairs, or what they miss by where that is more.
+    """
+    p = pairs.source
+    missed = se3.transform(T_target_source, p) - pairs.target
+    freedom = max(3 * len(p) - 6, 1)
+    scale = max(1.0, float((missed**2 / pairs.variance[:, None]).sum()) / freedom)
+    J = np.zeros((len(p), 3, 6))
+    J[:, :, :3] = np.eye(3)
+    J[:, 0, 4], J[:, 0, 5] = p[:, 2], -p[:, 1]
+    J[:, 1, 3], J[:, 1, 5] = -p[:, 2], p[:, 0]
+    J[:, 2, 3], J[:, 2, 4] = p[:, 1], -p[:, 0]
+    weight = 1 / (scale * pairs.variance)
+    return np.asarray(np.einsum("kai,kaj,k->ij", J, J, weight), np.float64)
+
+
+def loose_directions(information: Float64) -> Float64:
+    """(k, 6) directions that are known worse than to 1 cm and 1 degree, of unit length."""
+    values, vectors = np.linalg.eigh(information * _UNITS[:, None] * _UNITS)
+    loose = vectors[:, values < 1].T * _UNITS
+    return np.asarray(loose / np.linalg.norm(loose, axis=1, keepdims=True), np.float64)
+
+
+def registration_of(pairs: Pairs, found: Consensus, margin: float) -> Registration:
+    """The outcome as a registration; its points are the pairs, its correspondences the inliers."""
+    mine = pairs.some(found.inliers)
+    T = found.T_target_source
+    distance = np.linalg.norm(se3.transform(T, mine.source) - mine.target, axis=1)
+    information = information_of(mine, T)
+    typical = float(np.sqrt(np.median(pairs.variance)))
+    return Registration(
+        T_target_source=T,
+        converged=True,
+        iterations=found.tried,
+        correspondences=found.count,
+        points=len(pairs),
+        error=float(distance.sum() / (len(pairs) * typical)),
+        rms_m=float(np.sqrt((distance**2).mean())),
+        information=information,
+        unobservable=loose_directions(information),
+        margin=margin,
+    )
+
+
+def _sampled(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator) -> Float64:
+    """Motions (k, 4, 4) of triples that are alike in both views, until the best is certain."""
+    n = len(pairs)
+    needed, drawn, most = float(options.most_samples), 0, 0
+    motions = []
+    while drawn < min(needed, options.most_samples):
+        drawn += _BATCH
+        triples = rng.integers(0, n, (_BATCH, _SAMPLE))
+        a, b, c = triples.T
+        triples = triples[(a != b) & (b != c) & (a != c)]
+        triples = triples[_alike(pairs, triples, options.sigmas)]
+        if not len(triples):
+            continue
+        p, q = pairs.source[triples], pairs.target[triples]
+        found = _motions(p, q, 1 / pairs.variance[triples])
+        motions.append(found)
+        most = max(most, int((_missed(pairs, found) < options.sigmas**2).sum(1).max()))
+        clean = (most / n) ** _SAMPLE
+        if clean > 0:
+            needed = math.log(1 - options.confidence) / math.log(max(1 - clean, 1e-12))
+    return np.concatenate(motions) if motions else np.zeros((0, 4, 4))
+
+
+def _alike(pairs: Pairs, triples: Int64, sigmas: float) -> Bool:
+    """(k,) whether triangles (k, 3) have the same sides in both views, and are not too thin."""
+    ok = np.ones(len(triples), bool)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        i, j = triples[:, a], triples[:, b]
+        one = np.linalg.norm(pairs.source[i] - pairs.source[j], axis=1)
+        other = np.linalg.norm(pairs.target[i] - pairs.target[j], axis=1)
+        sigma = np.sqrt(pairs.variance[i] + pairs.variance[j])
+        ok &= (np.abs(one - other) < sigmas * sigma) & (np.minimum(one, other) > _SHORTEST * sigma)
+    p = pairs.source[triples]
+    sides = p[:, 1:] - p[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    longest = np.maximum((sides**2).sum(2).max(1), 1e-12)
+    return ok & (area > _THINNEST * longest)
+
+
+def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generator) -> Float64:
+    """Motions (k, 4, 4) of pairs that agree with each other about their distances."""
+    p, q = pairs.source, pairs.target
+    one, other = (np.linalg.norm(x[:, None] - x, axis=2) for x in (p, q))
+    sigma = np.sqrt(pairs.variance[:, None] + pairs.variance)
+    # Points at one place agree with all that one of them agrees with, and fix no rotation.
+    apart = np.minimum(one, other) > 2 * options.sigmas * sigma
+    alike = ((np.abs(one - other) < options.sigmas * sigma) & apart).astype(np.float32)
+    common = alike * (alike @ alike)
+    leaders = np.argsort(-common.sum(1), kind="stable")[: options.leaders]
+    few = min(_TOGETHER, len(pairs))
+    motions = []
+    for leader in leaders:
+        row = common[leader]
+        together = np.argsort(-row, kind="stable")[: few - 1]
+        mine = np.concatenate([[leader], together[row[together] > 0]])
+        if len(mine) < _SAMPLE:
+            continue
+        motions.append(motion_of(pairs.some(mine)))
+    return np.stack(motions) if motions else np.zeros((0, 4, 4))
+
+
+def _motions(p: Float64, q: Float64, weight: Float64) -> Float64:
+    """(k, 4, 4) least squares motions of k lists of n pairs (k, n, 3), weights (k, n)."""
+    share = (weight / weight.sum(1, keepdims=True))[..., None]
+    p0, q0 = (share * p).sum(1), (share * q).sum(1)
+    H = np.einsum("kni,knj->kij", share * (p - p0[:, None]), q - q0[:, None])
+    U, _, Vt = np.linalg.svd(H)
+    mirrored = np.linalg.det(U) * np.linalg.det(Vt) < 0
+    Vt[mirrored, 2] *= -1
+    R = np.einsum("kji,klj->kil", Vt, U)
+    T = np.tile(np.eye(4), (len(p), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = q0 - np.einsum("kij,kj->ki", R, p0)
+    return T
+
+
+def _missed(pairs: Pairs, motions: Float64) -> Float64:
+    """(k, m) by how much motions (k, 4, 4) miss: squared distances over variances."""
+    moved = np.einsum("kij,mj->kmi", motions[:, :3, :3], pairs.source) + motions[:, None, :3, 3]
+    return np.asarray(((moved - pairs.target) ** 2).sum(2) / pairs.variance, np.float64)
+
+
+def _score(missed: Float64, sigmas: float) -> Float64:
+    """(k,) pairs that agree, each the more the better it does (MSAC: Torr and Zisserman 2000)."""
+    return np.asarray(np.maximum(1 - missed / sigmas**2, 0).sum(-1), np.float64)
+
+
+def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[Consensus]:
+    """Distinct motions, the best first, each refined by its own inliers."""
+    free = np.ones(len(motions), bool)
+    score = _score(_missed(pairs, motions), options.sigmas) if len(motions) else np.zeros(0)
+    found: list[Consensus] = []
+    order = np.argsort(-score, kind="stable")
+    for k in order:
+        if not free[k]:
+            continue
+        free &= _differ(motions, motions[k], pairs, options)
+        T, inliers = _polished(pairs, motions[k], options.sigmas)
+        mine = float(_score(_missed(pairs, T[None]), options.sigmas)[0])
+        found.append(Consensus(T, inliers, mine, len(motions)))
+        if len(found) == _POLISHED:
+            break
+    distinct: list[Consensus] = []
+    for one in sorted(found, key=lambda c: -c.score):
+        others = (
+            np.stack([o.T_target_source for o in distinct]) if distinct else np.zeros((0, 4, 4))
+        )
+        if _differ(others, one.T_target_source, pairs, options).all():
+            distinct.append(one)
+    return distinct
+
+
+def _polished(pairs: Pairs, T: Float64, sigmas: float) -> tuple[Float64, Bool]:
+    """The best of several least squares, each over the inliers of the last, widely at first."""
+    best, most = T, -1.0
+    for gate in _GATES:
+        missed = _missed(pairs, T[None])[0]
+        score = float(_score(missed, sigmas))
+        if score > most:
+            best, most = T, score
+        near = missed < (gate * sigmas) ** 2
+        if np.count_nonzero(near) < _SAMPLE:
+            break
+        T = motion_of(pairs.some(near))
+    if float(_score(_missed(pairs, T[None])[0], sigmas)) > most:
+        best = T
+    return best, _missed(pairs, best[None])[0] < sigmas**2
+
+
+def _differ(motions: Float64, T: Float64, pairs: Pairs, options: ConsensusOptions) -> Bool:
+    """(k,) whether motions take the middle of the source elsewhere than T, or turn it otherwise."""
+    middle = np.median(pairs.source, 0)
+    ends = motions[:, :3, :3] @ middle + motions[:, :3, 3]
+    end = T[:3, :3] @ middle + T[:3, 3]
+    turned = (np.einsum("kij,ij->k", motions[:, :3, :3], T[:3, :3]) - 1) / 2
+    angle = np.arccos(np.clip(turned, -1, 1))
+    return (np.linalg.norm(ends - end, axis=1) > options.distinct_m) | (
+        angle > options.distinct_rad
+    )

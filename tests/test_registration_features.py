@@ -1,0 +1,279 @@
+"""Registration without a guess by points that look alike: what agrees on a motion, and images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.registration.features import Features
+from tofuse.registration.keypoints import keypoints, light_image
+from tofuse.registration.sample_consensus import (
+    ConsensusOptions,
+    Pairs,
+    consensus,
+    information_of,
+    loose_directions,
+    motion_of,
+)
+
+CAMERA = Pinhole(176, 132, 200.0, 200.0, 87.5, 65.5)
+WAYS = ("samples", "compatible")
+
+
+def poster(T_world_camera, *, seed=0, noise=0.004, plain=False):
+    """A corner of two walls and a floor with round spots of any brightness, and noise."""
+    rays = np.dstack([CAMERA.rays(), np.ones((132, 176))]).reshape(-1, 3)
+    d, o = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    depth, light = np.full(len(d), 9.0), np.ones(len(d))
+    walls = [((0.5, 0, 0.866), 2.6), ((-0.6, 0, 0.8), 2.8), ((0, 0.9, 0.436), 1.9)]
+    for k, (normal, distance) in enumerate(walls):
+        n = np.array(normal)
+        z = (distance - o @ n) / (d @ n)
+        hit = (z > 0) & (z < depth)
+        p = (o + z[:, None] * d)[hit]
+        u = np.cross(n, [0.3, 0.9, 0.1])
+        u /= np.linalg.norm(u)
+        spots = np.random.default_rng([5, k])
+        at, size = spots.uniform(-2.5, 2.5, (150, 2)), spots.uniform(0.04, 0.16, 150)
+        level = spots.uniform(0.3, 2.0, 150)
+        flat = np.column_stack([p @ u, p @ np.cross(n, u)])
+        inside = np.linalg.norm(flat[:, None] - at, axis=2) < size
+        depth[hit] = z[hit]
+        light[hit] = np.where(inside.any(1), level[np.argmax(inside, 1)], 1.0)
+    rng = np.random.default_rng([6, seed])
+    depth = depth * (1 + noise * rng.standard_normal(len(depth)) / np.linalg.norm(rays, axis=1))
+    light = light * (1 + 0.02 * rng.standard_normal(len(depth)))
+    r2 = (depth * np.linalg.norm(rays, axis=1)) ** 2
+    amplitude = 4000 * (np.ones_like(light) if plain else light) / r2
+    depth, amplitude = (x.reshape(132, 176).astype(np.float32) for x in (depth, amplitude))
+    return RangeFrame(seed, float(seed), CAMERA, depth, "z", amplitude_image=amplitude)
+
+
+FIRST = np.eye(4)
+# 25 degrees and 0.45 m away.
+SECOND = se3.exp(np.array([0.4, 0.1, 0.2, -0.05, -0.42, 0.08]))
+TRUE = se3.inverse(FIRST) @ SECOND
+
+
+def off(found, true=TRUE):
+    gap = se3.inverse(true) @ found
+    return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(se3.angle(gap)))
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Source and target."""
+    return poster(SECOND, seed=1), poster(FIRST, seed=2)
+
+
+def made_pairs(right, wrong, *, seed=0, sigma=0.01, spread=1.0):
+    """Pairs of which some are right; the others are of points taken at random."""
+    rng = np.random.default_rng([8, seed])
+    T = se3.exp(rng.normal(0, 0.8, 6))
+    p = rng.uniform(-spread, spread, (right + wrong, 3)) + np.array([0, 0, 3])
+    q = se3.transform(T, p)
+    q[right:] = rng.permutation(rng.uniform(-spread, spread, (wrong, 3)) + q.mean(0))
+    s = np.full(right + wrong, sigma) if np.isscalar(sigma) else sigma
+    q += s[:, None] * rng.standard_normal(q.shape)
+    return Pairs(p, q, s**2), T
+
+
+# What pairs agree on
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(("right", "wrong"), [(60, 0), (40, 60), (30, 120)])
+def test_the_right_pairs_are_told_from_the_wrong(way, right, wrong):
+    for seed in range(3):
+        pairs, T = made_pairs(right, wrong, seed=seed)
+        missed = np.linalg.norm(se3.transform(T, pairs.source) - pairs.target, axis=1)
+        most = np.count_nonzero(missed < 0.03)  # three standard deviations
+        found = consensus(pairs, ConsensusOptions(way), np.random.default_rng(seed))
+        shift, turn = off(found[0].T_target_source, T)
+        assert shift < 0.03
+        assert turn < 0.6
+        assert np.count_nonzero(found[0].inliers[:right]) >= 0.95 * most
+        assert np.count_nonzero(found[0].inliers[right:]) <= 0.05 * wrong
+        # Nothing else comes near.
+        assert all(rival.count < 0.5 * right for rival in found[1:])
+
+
+def test_compatible_pairs_are_found_among_forty_times_as_many():
+    pairs, T = made_pairs(20, 780, sigma=0.005, spread=1.5)
+    found = consensus(pairs, ConsensusOptions("compatible"), np.random.default_rng(0))[0]
+    assert off(found.T_target_source, T)[0] < 0.02
+    assert np.count_nonzero(found.inliers[:20]) >= 18
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_each_pair_is_judged_by_its_own_noise(way):
+    """Half of the points are ten times as noisy: they are inliers too, and hardly weigh."""
+    sigma = np.where(np.arange(80) % 2, 0.003, 0.05)
+    errors = []
+    for seed in range(5):
+        pairs, T = made_pairs(80, 0, seed=seed, sigma=sigma)
+        found = consensus(pairs, ConsensusOptions(way), np.random.default_rng(0))[0]
+        assert found.inliers.mean() > 0.85
+        assert found.inliers[sigma > 0.01].mean() > 0.8
+        weighted = se3.transform(se3.inverse(T) @ found.T_target_source, pairs.source)
+        same = Pairs(pairs.source, pairs.target, np.full(80, 1e-4))
+        alike = se3.transform(se3.inverse(T) @ motion_of(same), pairs.source)
+        errors.append([np.linalg.norm(x - pairs.source, axis=1).mean() for x in (weighted, alike)])
+    mine, plain = np.mean(errors, axis=0)
+    assert mine < 0.4 * plain
+
+
+def test_the_least_squares_are_those_of_a_slow_search():
+    """No small motion makes the weighted sum smaller."""
+    pairs, _ = made_pairs(12, 0, sigma=np.linspace(0.01, 0.1, 12))
+    T = motion_of(pairs)
+
+    def cost(T):
+        r = se3.transform(T, pairs.source) - pairs.target
+        return float(((r**2).sum(1) / pairs.variance).sum())
+
+    for axis in range(6):
+        for step in (-1e-4, 1e-4):
+            assert cost(T @ se3.exp(step * np.eye(6)[axis])) > cost(T)
+
+
+def test_information_is_the_inverse_of_the_scatter():
+    pairs, T = made_pairs(40, 0, sigma=np.linspace(0.002, 0.03, 40))
+    rng = np.random.default_rng(4)
+    exact = se3.transform(T, pairs.source)
+    xi = []
+    for _ in range(300):
+        noisy = exact + np.sqrt(pairs.variance)[:, None] * rng.standard_normal(exact.shape)
+        xi.append(se3.log(se3.inverse(T) @ motion_of(replace(pairs, target=noisy))))
+    stated = np.linalg.inv(information_of(replace(pairs, target=exact), T))
+    seen = np.cov(np.array(xi).T)
+    whitened = np.linalg.inv(np.linalg.cholesky(stated))
+    assert np.abs(np.linalg.eigvalsh(whitened @ seen @ whitened.T) - 1).max() < 0.4
+
+
+def test_points_on_a_line_leave_the_turn_about_it_loose():
+    along = np.linspace(-1, 1, 30)[:, None] * [1.0, 0, 0] + [0, 0, 2.0]
+    pairs = Pairs(along, along, np.full(30, 1e-4))
+    (loose,) = loose_directions(information_of(pairs, np.eye(4)))
+    # About the line through z = 2: the camera swings round it.
+    expected = np.array([0, 2.0, 0, 1.0, 0, 0])
+    assert abs(loose @ expected) / np.linalg.norm(expected) > 0.999
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_pairs_that_agree_on_nothing_are_refused(way):
+    pairs, _ = made_pairs(0, 40)
+    with pytest.raises(RegistrationError, match="of 40 pairs of points not even 10 agree"):
+        consensus(pairs, ConsensusOptions(way, inliers=10), np.random.default_rng(0))
+
+
+def test_one_seed_gives_one_result():
+    pairs, _ = made_pairs(40, 60)
+    a, b = (consensus(pairs, ConsensusOptions(), np.random.default_rng(3))[0] for _ in range(2))
+    np.testing.assert_array_equal(a.T_target_source, b.T_target_source)
+
+
+# Images
+
+
+@pytest.mark.parametrize("detector", ["sift", "orb", "fast"])
+def test_two_images_far_apart_are_registered_without_a_guess(images, detector):
+    found = tofuse.register(*images, method=Features(detector))
+    shift, turn = off(found.T_target_source)
+    assert shift < (0.08 if detector == "orb" else 0.05)  # places it to a pixel of a coarse image
+    assert turn < 1.5
+    assert found.margin > 0.2
+    assert found.correspondences >= 10
+    assert np.linalg.eigvalsh(found.information).min() > 0
+
+
+def test_the_pose_is_as_good_as_it_says(images):
+    found = tofuse.register(*images, method=Features("sift"))
+    xi = se3.log(se3.inverse(found.T_target_source) @ TRUE)
+    # Six degrees of freedom; points of one surface share errors, which widens it.
+    assert xi @ found.information @ xi < 60
+
+
+def test_colour_serves_as_well(images):
+    colored = []
+    for k, frame in enumerate(images):
+        r2 = frame.radial_range**2
+        level = np.clip(frame.amplitude_image * r2 / 4000 * 110, 0, 255).astype(np.uint8)
+        image = np.dstack([level] * 3)
+        colored.append(replace(frame, amplitude_image=None, color_image=image, index=k))
+    found = tofuse.register(*colored, method=Features(light="color"))
+    assert off(found.T_target_source)[0] < 0.05
+    np.testing.assert_array_equal(
+        found.T_target_source, tofuse.register(*colored, method=Features()).T_target_source
+    )
+    with pytest.raises(RegistrationError, match="has no amplitude"):
+        tofuse.register(*colored, method=Features(light="albedo"))
+
+
+def test_the_light_does_not_fall_with_the_distance():
+    """One wall, oblique: raw amplitude falls along it, what is looked at does not."""
+    frame = poster(FIRST, seed=1, plain=True)
+    assert np.corrcoef(frame.amplitude_image.ravel(), frame.depth.ravel())[0, 1] < -0.8
+    image = light_image(frame, "albedo").astype(float)
+    assert abs(np.corrcoef(image.ravel(), frame.depth.ravel())[0, 1]) < 0.2
+
+
+def test_points_lie_where_the_pixels_see_them(images):
+    frame = images[1]
+    surface = surface_map(frame, SurfaceOptions())
+    found = keypoints(frame, surface, detector="sift", light="auto", count=300, blur_px=0.7)
+    assert len(found) > 50
+    np.testing.assert_allclose(CAMERA.project(found.points), found.pixels, atol=0.05)
+    clean = poster(FIRST, noise=0.0)
+    u, v = np.rint(found.pixels).astype(int).T
+    error = np.abs(found.points[:, 2] - clean.depth[v, u])
+    assert np.median(error) < 0.004
+    assert np.mean(error < 3 * np.sqrt(3 * found.variance)) > 0.95
+
+
+@pytest.mark.parametrize("detector", ["sift", "orb", "fast"])
+def test_images_of_nothing_are_refused(detector):
+    blank = [poster(T, seed=k, plain=True) for k, T in enumerate((SECOND, FIRST))]
+    blank = [replace(b, amplitude_image=np.full_like(b.depth, 100)) for b in blank]
+    blank = [replace(b, amplitude_kind="range_compensated") for b in blank]
+    with pytest.raises(RegistrationError, match="pairs of points"):
+        tofuse.register(*blank, method=Features(detector))
+
+
+def test_what_both_images_contradict_is_refused(images):
+    """The light is that of the first view, the surfaces are elsewhere."""
+    source, target = images
+    deeper = replace(target, depth=target.depth[:, ::-1] * np.float32(1.0))
+    with pytest.raises(RegistrationError, match="agree"):
+        tofuse.register(source, deeper, method=Features())
+
+
+def test_clouds_have_no_image(images):
+    cloud = CloudFrame(0, 0.0, images[0].points)
+    with pytest.raises(RegistrationError, match="is no image"):
+        tofuse.register(cloud, cloud, method=Features())
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (Features, {"detector": "surf"}),
+        (Features, {"light": "infrared"}),
+        (Features, {"ratio": 0.0}),
+        (Features, {"count": 2}),
+        (ConsensusOptions, {"way": "chance"}),
+        (ConsensusOptions, {"inliers": 2}),
+        (ConsensusOptions, {"confidence": 1.0}),
+    ],
+)
+def test_options_are_checked(kind, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        kind(**options)
