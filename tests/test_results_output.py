@@ -168,6 +168,42 @@ def test_a_failure_while_moving_puts_everything_back(tmp_path, monkeypatch, when
     assert {p.name for p in tmp_path.iterdir()} == FILES
 
 
+@pytest.mark.parametrize(
+    ("moved", "back"), [(k, None) for k in range(9)] + [(8, k) for k in range(8)]
+)
+def test_moves_that_were_cut_off_are_finished_by_the_next(tmp_path, monkeypatch, moved, back):
+    """Of nine moves some were done when the run was killed; or one failed, and it was undoing."""
+    write_result(result(), OutputFolder(tmp_path))
+    (tmp_path / "mesh.glb").write_text("an earlier run had a surface")
+    before = contents(tmp_path)
+    folder = OutputFolder(tmp_path, overwrite=True)
+    moves, move = [], os.replace
+
+    def cut_off(source, target) -> None:
+        place = tmp_path in (Path(target).parent, Path(source).parent)
+        undoing = back is not None and len(moves) > moved
+        if place:
+            moves.append(target)
+        gone = len(moves) > moved + 1 + (back or 0) if undoing else len(moves) > moved
+        if gone and (place or back is None):
+            raise OSError(errno.EIO, "gone")
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", cut_off)
+    with pytest.raises(OutputError):
+        write_result(result(seed=1), folder)
+    monkeypatch.undo()
+    assert len(moves) == moved + 1 + (0 if back is None else back + 1)
+    assert (tmp_path / "run.json").exists() == (moved == 0)
+    for _ in range(2):  # what has been finished stays so
+        OutputFolder(tmp_path, overwrite=True).discard()
+        if back is None:
+            assert {p.name for p in tmp_path.iterdir()} == FILES
+            assert read_run_json(tmp_path / "run.json")["seed"] == 1
+        else:
+            assert contents(tmp_path) == before
+
+
 def test_run_json_is_what_the_contract_says(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     data = json.loads((tmp_path / "run.json").read_text(), parse_constant=lambda c: pytest.fail(c))

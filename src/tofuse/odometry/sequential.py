@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -88,11 +87,6 @@ class _SequentialTracker(Tracker):
         self._seed = seed
         self._last: _Tracked | None = None
         self._motion = np.eye(4)
-        self._guesses: dict[str, Callable[[_Tracked, Float64 | None], Float64]] = {
-            "identity": lambda _last, _T: np.eye(4),
-            "previous": lambda _last, _T: self._motion,
-            "odometry": _odometry_motion,
-        }
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
@@ -107,7 +101,7 @@ class _SequentialTracker(Tracker):
             self._last = _Tracked(frame, np.eye(4), T_odometry)
             return Step("tracked", "", np.eye(4))
 
-        guess = self._guesses[options.guess](last, T_odometry)
+        guess = self._guess(last, T_odometry)
         rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, last.frame.index])
         try:
             found = options.registration.register(frame, last.frame, guess, rng)
@@ -124,6 +118,11 @@ class _SequentialTracker(Tracker):
         T_world_camera = se3.orthonormalise(last.T_world_camera @ found.T_target_source)
         self._last = _Tracked(frame, T_world_camera, T_odometry)
         return Step("tracked", "", T_world_camera, last.frame.index, found)
+
+    def _guess(self, last: _Tracked, T_odometry: Float64 | None) -> Float64:
+        if self._options.guess == "odometry":
+            return _odometry_motion(last, T_odometry)
+        return self._motion if self._options.guess == "previous" else np.eye(4)
 
 
 def _lost(reason: str, last: _Tracked | None = None) -> Step:

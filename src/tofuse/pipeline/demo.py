@@ -14,7 +14,7 @@ from tofuse.errors import OutputError
 from tofuse.files.atomic import write_text
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.run import Options, resolve, run
-from tofuse.results.output import RECORDING, UNFINISHED, OutputFolder
+from tofuse.results.output import CHECKPOINT, RECORDING, UNFINISHED, OutputFolder
 from tofuse.results.types import Reconstruction
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate
@@ -55,6 +55,7 @@ def demo(
     # Whatever is wrong with the options or the folder is said before the work begins.
     resolve(options)
     folder = OutputFolder(out, overwrite=overwrite)
+    shutil.rmtree(out / CHECKPOINT, ignore_errors=True)  # of a recording that is made anew
     try:
         with _replacing_recording(out / RECORDING) as fresh:
             simulate_to(scene, fresh, seed=seed, progress=progress)

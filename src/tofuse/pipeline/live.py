@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 from tofuse.posegraph.loops import ClosedLoop, Loops
 
@@ -44,6 +45,23 @@ class LiveLoops:
                 self._job = self._pool.submit(work)
                 self._due = self._frames + DELAY
         return bool(found)
+
+    def wait(self) -> None:
+        """Wait for the job that is under way; what it found counts when it is due."""
+        if self._job is not None:
+            self._job.result()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the thread, with what the job found."""
+        found = None if self._job is None else self._job.result()
+        return {**self.__dict__, "_pool": None, "_job": found}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        found = state["_job"]
+        self.__dict__.update(state)
+        if found is not None:
+            self._job = Future()
+            self._job.set_result(found)
 
     def finish(self) -> None:
         """Wait for the job that is under way, and let the thread go."""

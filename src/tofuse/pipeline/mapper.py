@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,14 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.evaluation.sightings import Sightings, sightings, whole
 from tofuse.filters.base import apply_filters
-from tofuse.fusion.cloud import as_cloud
+from tofuse.fusion.cloud import Cloud, as_cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count, threads
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Motion
 from tofuse.odometry.prediction import prediction_sigma, with_prediction
+from tofuse.pipeline.checkpoint import NotKept, Stages
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.live import LiveLoops
@@ -30,6 +32,8 @@ from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
+
+T = TypeVar("T")
 
 Float64 = NDArray[np.float64]
 
@@ -45,6 +49,32 @@ class _Place:
     position: int
     frame: Frame
     clean: Frame
+
+
+@dataclass(frozen=True, eq=False)
+class _Closed:
+    """What there is once loops are closed."""
+
+    loops: list[ClosedLoop]
+    sequential: Float64
+    optimisation: Optimisation
+    covariances: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class _Refined:
+    """What there is once all views are refined."""
+
+    graph: PoseGraph
+    refinement: Refinement
+
+
+@dataclass(frozen=True, eq=False)
+class _Fused:
+    """The model, and how it looked before poses moved; None where none did."""
+
+    model: Model
+    before: Cloud | None
 
 
 class Mapper:
@@ -295,8 +325,28 @@ class Mapper:
             # Only who looks at surfaces states errors that hold; ICP's are too small.
             self._knows_errors = True
 
-    def finish(self) -> Reconstruction:
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but who hears of it, so that a copy can go on elsewhere."""
+        self._live.wait()  # it changes what is kept here
+        return {name: value for name, value in self.__dict__.items() if name != "_progress"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _progress=Silent())
+
+    def go_on(self, threads: int | None, progress: Progress) -> None:
+        """Go on as a copy: with so many threads (None: all cores), and telling `progress`."""
+        self.threads = threads if threads is not None else thread_count()
+        self._progress = progress
+        for record in self._records:
+            progress.advance(record)
+
+    def finish(self, stages: Stages | None = None) -> Reconstruction:
         """Close the loops, optimise, fuse and judge.
+
+        Parameters
+        ----------
+        stages
+            Keeps what there is after each of these stages, and knows what a stopped job had.
 
         Raises
         ------
@@ -314,10 +364,25 @@ class Mapper:
                 remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
             )
         self._live.finish()
+        stages = stages or NotKept()
         with threads(self.threads):
-            return self._finish()
+            closed = self._staged(stages, "loops", self._close)
+            refined = self._staged(stages, "refinement", lambda: self._refine(closed))
+            fused = self._staged(stages, "fusion", lambda: self._fuse(closed, refined))
+            return self._check_all(closed, refined, fused)
 
-    def _finish(self) -> Reconstruction:
+    def _staged(self, stages: Stages, name: str, work: Callable[[], T]) -> T:
+        """Do the work of a stage, unless a stopped job has done it; its time counts either way."""
+        kept = stages.load(name)
+        if kept is not None:
+            found: T = kept[0]
+            self._watch.seconds.update(kept[1])
+            return found
+        found = work()
+        stages.save(name, (found, dict(self._watch.seconds)))
+        return found
+
+    def _close(self) -> _Closed:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
             loops = self._loops.finish()
@@ -330,13 +395,20 @@ class Mapper:
                 optimisation = self.config.optimiser.optimise(graph)
             loops = _decided(loops, optimisation)
             optimisation = without_left_out(optimisation)
-        graph = optimisation.graph
-        covariances = pose_covariances(graph)
+        covariances = pose_covariances(optimisation.graph)
+        return _Closed(loops, sequential, optimisation, covariances)
+
+    def _refine(self, closed: _Closed) -> _Refined:
+        graph = closed.optimisation.graph
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
             refinement = self._refiner.finish(graph.ids.tolist(), graph.poses)
             if refinement.kept:
-                graph = self._graph(loops, refinement)
+                graph = self._graph(closed.loops, refinement)
+        return _Refined(graph, refinement)
+
+    def _fuse(self, closed: _Closed, refined: _Refined) -> _Fused:
+        graph, refinement = refined.graph, refined.refinement
         moved = bool(graph.loop.any()) or refinement.kept
         self._progress.stage("fusing", self._model.views)
         with self._watch.timing("fusion"):
@@ -346,8 +418,13 @@ class Mapper:
                 self._progress.advance,
                 refinement.errors,
             )
-            started = dict(zip(ids, sequential, strict=True))
-            before = self._model.sketch(started) if moved else None
+            started = dict(zip(ids, closed.sequential, strict=True))
+            return _Fused(model, self._model.sketch(started) if moved else None)
+
+    def _check_all(self, closed: _Closed, refined: _Refined, fused: _Fused) -> Reconstruction:
+        loops, optimisation, covariances = closed.loops, closed.optimisation, closed.covariances
+        graph, refinement, model = refined.graph, refined.refinement, fused.model
+        sequential = closed.sequential
         self._progress.stage("checking")
         records = self._finished_records(covariances)
         with self._watch.timing("checking"):
@@ -383,7 +460,7 @@ class Mapper:
                 optimisation.objective,
                 {n: self._removed[n] / max(self._seen[n], 1) for n in self._seen},
                 dict(self._watch.seconds),
-                before,
+                fused.before,
                 refinement,
                 optimisation.parts,
             ),

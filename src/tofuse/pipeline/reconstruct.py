@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
@@ -18,6 +18,7 @@ from tofuse.files.ply import read_ply
 from tofuse.filters.confidence import Confidence
 from tofuse.filters.noise import Noise
 from tofuse.geometry import se3
+from tofuse.pipeline.checkpoint import NotKept, Stages
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.mapper import Mapper
@@ -31,6 +32,8 @@ from tofuse.sensor.noise import NOISE, NoiseModel
 
 Float64 = NDArray[np.float64]
 
+_TRACKING = "tracking"
+
 
 def reconstruct(
     recording: Recording,
@@ -40,6 +43,7 @@ def reconstruct(
     threads: int | None = None,
     loops: Sequence[GivenLoop] = (),
     progress: Progress | None = None,
+    stages: Stages | None = None,
 ) -> Reconstruction:
     """Reconstruct a recording: trajectory, pose graph, fused cloud, diagnostics.
 
@@ -57,6 +61,9 @@ def reconstruct(
         How many threads to use; None: all cores. The result does not depend on it.
     loops
         Loops known beforehand, in frame indices.
+    stages
+        Keeps what there is after each stage, and knows what a stopped job had: of the same
+        recording, configuration and seed.
 
     Raises
     ------
@@ -67,35 +74,61 @@ def reconstruct(
     progress = progress or Silent()
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
     config = learnt(fitted(config, recording), recording, threads)
-    mapper = Mapper(config, seed=seed, threads=threads, loops=loops, progress=progress)
+    stages = stages or NotKept()
     progress.stage("tracking", len(recording))
-    odometry = recording.odometry
-    recent: dict[int, Frame] = {}
-    unreadable: list[UnreadableFrameError] = []
     # BLAS sums differ with its number of threads; ours don't.
     with threadpool_limits(1):
-        for k, item in enumerate(recording.read_all()):
-            index, time = int(recording.indices[k]), float(recording.timestamps[k])
-            if k and part_start(recording, index) != part_start(
-                recording, int(recording.indices[k - 1])
-            ):
-                mapper.interrupt()
-            if isinstance(item, UnreadableFrameError):
-                unreadable.append(item)
-                mapper.skip(index, time, str(item))
-                continue
-            T = None if odometry is None or not np.isfinite(odometry[k]).all() else odometry[k]
-            past = past_frames(recording, index, config.window - 1, recent)
-            recent = {f.index: f for f in [*past, item]}
-            mapper.push(item, T_odometry=T, history=past)
-        if len(unreadable) == len(recording):
+        tracked = stages.load(_TRACKING)
+        if tracked is None:
+            tracked = _Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
+        elif tracked.done:
+            progress.note(f"goes on after frame {tracked.done} of a run that was stopped")
+        tracked.mapper.go_on(threads, progress)
+        _track(tracked, recording, config.window, stages)
+        if len(tracked.unreadable) == len(recording):
             raise InputError(
-                f"none of the {len(recording)} frames can be read (first: {unreadable[0]})",
+                f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
                 where=recording.path,
                 remedy="check that the files are complete, or give --format",
             )
-        result = mapper.finish()
+        result = tracked.mapper.finish(stages)
     return replace(result, recording=describe(recording))
+
+
+@dataclass(eq=False)
+class _Tracked:
+    """How far tracking has come: the mapper, how many frames it saw, and why some can't be read."""
+
+    mapper: Mapper
+    done: int = 0
+    unreadable: list[str] = field(default_factory=list)
+
+
+def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages) -> None:
+    """Give the mapper the frames that it has not seen."""
+    if tracked.done == len(recording):
+        return
+    mapper, odometry = tracked.mapper, recording.odometry
+    recent: dict[int, Frame] = {}
+    first = tracked.done
+    for k, item in enumerate(recording.read_all(first=first), first):
+        index, time = int(recording.indices[k]), float(recording.timestamps[k])
+        if k and part_start(recording, index) != part_start(
+            recording, int(recording.indices[k - 1])
+        ):
+            mapper.interrupt()
+        if isinstance(item, UnreadableFrameError):
+            tracked.unreadable.append(str(item))
+            mapper.skip(index, time, str(item))
+        else:
+            T = None if odometry is None or not np.isfinite(odometry[k]).all() else odometry[k]
+            past = past_frames(recording, index, window - 1, recent)
+            recent = {f.index: f for f in [*past, item]}
+            mapper.push(item, T_odometry=T, history=past)
+        tracked.done = k + 1
+        if tracked.done < len(recording) and stages.due():
+            stages.save(_TRACKING, tracked)
+    stages.save(_TRACKING, tracked)
 
 
 def fitted(config: Config, recording: Recording) -> Config:

@@ -12,6 +12,7 @@ import numpy as np
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
 from tofuse.parts import name_of
+from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.progress import Progress, Silent
@@ -28,7 +29,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import average_still
-from tofuse.results.output import OutputFolder, read_run_json, write_result
+from tofuse.results.output import OutputFolder, is_result, plain, read_run_json, write_result
 from tofuse.results.types import Reconstruction
 
 _THUMBNAILS = 12
@@ -81,7 +82,9 @@ def run(
     )
     for warning in recording.warnings:
         progress.note(warning)
-    folder = OutputFolder(options.out, overwrite=options.overwrite)
+    kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
+    folder = OutputFolder(options.out, overwrite=options.overwrite or bool(kept.fresh))
+    kept.begin(not is_result(options.out))
     try:
         result = reconstruct(
             recording,
@@ -90,12 +93,38 @@ def run(
             threads=options.threads,
             loops=loops,
             progress=progress,
+            stages=kept,
         )
         progress.stage("writing")
         write_result(result, folder, lambda r, f: _report(recording, config, r, f))
+    except BaseException as error:
+        kept.give_up(error)
+        raise
+    else:
+        kept.discard()
     finally:
         folder.discard()
     return result
+
+
+def _key(
+    inputs: Sequence[str | Path],
+    options: Options,
+    recording: Recording,
+    config: Config,
+    seed: int,
+) -> str:
+    """Digest of all that decides the result: what is read and how, and the program."""
+    facts = {
+        "config": plain(config.to_dict()),
+        "seed": seed,
+        "format": recording.format,
+        "frames": recording.indices.tolist(),
+        "average_still": options.average_still,
+    }
+    beside = (options.camera, options.loops)
+    files = [Path(path) for path in (*inputs, *beside) if path is not None]
+    return digest(facts, files, without=options.out)
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:

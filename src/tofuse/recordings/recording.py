@@ -164,8 +164,8 @@ class Recording:
                 items.append(error)
         return items
 
-    def read_all(self, ahead: int = 8) -> Iterator[Frame | UnreadableFrameError]:
-        """Iterate over the frames, with the error in place of each that can't be read.
+    def read_all(self, ahead: int = 8, *, first: int = 0) -> Iterator[Frame | UnreadableFrameError]:
+        """Iterate over the frames from the `first`, with the error in place of unreadable ones.
 
         Reads up to `ahead` frames in advance on another thread.
         """
@@ -183,7 +183,7 @@ class Recording:
 
         def work() -> None:
             try:
-                for index in self.indices:
+                for index in self.indices[first:]:
                     try:
                         item: Frame | BaseException = self.source.read(int(index))
                     except UnreadableFrameError as error:

@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from tofuse._version import __version__
 from tofuse.errors import InputError, OutputError
+from tofuse.files.atomic import write_text
 from tofuse.files.glb import write_glb
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
@@ -26,7 +28,20 @@ from tofuse.results.types import Reconstruction
 
 UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
 STAGING = f"{UNFINISHED}unfinished"
+CHECKPOINT = f"{UNFINISHED}checkpoint"  # what a run has so far
+_ASIDE, _FORWARD, _BACK = "replaced", "plan.json", "undo.json"  # in the staging folder
 RECORDING = "recording"  # what `tofuse demo` puts beside its result
+
+# What a run may write; of an earlier result nothing of it stays.
+FILES = (
+    "trajectory.txt",
+    "pose_graph.g2o",
+    "cloud.ply",
+    "mesh.ply",
+    "mesh.glb",
+    "report.html",
+    "run.json",
+)
 
 
 class OutputFolder:
@@ -66,6 +81,7 @@ class OutputFolder:
         self._ours = ours or is_result
         self._made: list[Path] = []
         try:
+            _recover(self.path)
             self._check(overwrite)
             self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
@@ -96,12 +112,18 @@ class OutputFolder:
             )
 
     @contextmanager
-    def staging(self) -> Iterator[Path]:
-        """Give a folder to write files into; on success all are moved into place, else none."""
+    def staging(self, *, instead_of: Sequence[str] = ()) -> Iterator[Path]:
+        """Give a folder to write files into; on success all are moved into place, else none.
+
+        What has the names `instead_of` is gone afterwards, written anew or not.
+        """
         try:
             yield self._staging
-            files = sorted(self._staging.iterdir(), key=lambda p: (p.name == self._marker, p.name))
-            _move_all(files, self.path, self._staging / "replaced")
+            files = sorted(p.name for p in self._staging.iterdir())
+            files.sort(key=lambda name: name == self._marker)
+            gone = {name for name in (*files, *instead_of) if (self.path / name).exists()}
+            old = sorted(gone, key=lambda name: (name != self._marker, name))
+            _move_all(_Plan(tuple(files), tuple(old)), self._staging, self.path)
         except OutputError as error:
             # Named as it would have been called in the end.
             where = self.path / Path(error.where or "").name
@@ -113,28 +135,68 @@ class OutputFolder:
 
     def discard(self) -> None:
         """Remove what is unfinished, and the folders made for it if nothing else is in them."""
-        shutil.rmtree(self._staging, ignore_errors=True)
+        if not any((self._staging / name).exists() for name in (_FORWARD, _BACK)):
+            shutil.rmtree(self._staging, ignore_errors=True)
         with contextlib.suppress(OSError):
             for folder in self._made:
                 folder.rmdir()
 
 
-def _move_all(files: Sequence[Path], folder: Path, aside: Path) -> None:
+@dataclass(frozen=True)
+class _Plan:
+    """Which files of a staging folder are moved into place, and which are moved away before.
+
+    It lies in the staging folder meanwhile, so that the next run can finish what a killed one
+    began. The marker goes away first and comes last: where it is, everything is of one run.
+    """
+
+    files: tuple[str, ...]
+    old: tuple[str, ...]
+
+    def carry_out(self, staging: Path, folder: Path) -> None:
+        """Move, or go on with it."""
+        for name in self.old:
+            if not (staging / _ASIDE / name).exists():
+                os.replace(folder / name, staging / _ASIDE / name)
+        for name in self.files:
+            if (staging / name).exists():
+                os.replace(staging / name, folder / name)
+
+    def undo(self, staging: Path, folder: Path) -> None:
+        """Move back, or go on with it."""
+        for name in reversed(self.files):
+            if not (staging / name).exists():
+                os.replace(folder / name, staging / name)
+        for name in reversed(self.old):
+            if (staging / _ASIDE / name).exists():
+                os.replace(staging / _ASIDE / name, folder / name)
+
+
+def _move_all(plan: _Plan, staging: Path, folder: Path) -> None:
     """Move files into a folder: all of them, or none, with what was there put back."""
-    aside.mkdir()
-    undo: list[tuple[Path, Path]] = []
+    (staging / _ASIDE).mkdir()
+    write_text(staging / _FORWARD, json.dumps(asdict(plan)))
     try:
-        for file in files:
-            target = folder / file.name
-            if target.exists():
-                os.replace(target, aside / file.name)
-                undo.append((aside / file.name, target))
-            os.replace(file, target)
-            undo.append((target, file))
+        plan.carry_out(staging, folder)
     except BaseException:
-        for now, before in reversed(undo):
-            os.replace(now, before)
+        os.replace(staging / _FORWARD, staging / _BACK)
+        plan.undo(staging, folder)
+        (staging / _BACK).unlink()
         raise
+    (staging / _FORWARD).unlink()
+
+
+def _recover(folder: Path) -> None:
+    """Finish the moves of a run that was killed at them."""
+    staging = folder / STAGING
+    for name, way in ((_FORWARD, _Plan.carry_out), (_BACK, _Plan.undo)):
+        try:
+            found = json.loads((staging / name).read_text(encoding="utf-8"))
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        names = {key: tuple(Path(each).name for each in found[key]) for key in ("files", "old")}
+        way(_Plan(**names), staging, folder)
+        (staging / name).unlink()
 
 
 def _output_error(path: Path, error: OSError) -> OutputError:
@@ -166,7 +228,7 @@ def write_result(
     OutputError
         If a file can't be written; then nothing that was there before has changed.
     """
-    with folder.staging() as staging:
+    with folder.staging(instead_of=FILES) as staging:
         posed = result.has_pose
         write_tum(staging / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
         write_g2o(staging / "pose_graph.g2o", result.graph)

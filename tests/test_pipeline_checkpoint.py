@@ -1,0 +1,321 @@
+"""Runs that were stopped go on, and give what they would have given."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.cli import main
+from tofuse.errors import InputError, OutputError
+from tofuse.pipeline import checkpoint, reconstruct, run
+from tofuse.pipeline.checkpoint import Checkpoints, Stages, digest
+from tofuse.pipeline.config import changed, from_method
+from tofuse.results.output import CHECKPOINT, STAGING, run_json
+from tofuse.simulation.record import simulate
+
+SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
+
+
+class Stopped(BaseException):
+    pass
+
+
+class Kept(Stages):
+    """Keeps states as bytes after every frame, and stops when told."""
+
+    def __init__(self, stop_at: int) -> None:
+        self.states: dict[str, bytes] = {}
+        self.saved: list[str] = []
+        self.stop_at = stop_at
+
+    def load(self, stage: str) -> object:
+        data = self.states.get(stage)
+        return None if data is None else checkpoint._OwnTypes(io.BytesIO(data)).load()
+
+    def save(self, stage: str, state: object) -> None:
+        self.states[stage] = pickle.dumps(state, 5)
+        self.saved.append(stage)
+        if len(self.saved) == self.stop_at:
+            raise Stopped
+
+    def due(self) -> bool:
+        return True
+
+
+def told(result: tofuse.Reconstruction) -> list[object]:
+    """All that must be the same."""
+    data = run_json(result)
+    del data["seconds"]
+    cloud, mesh, graph = result.cloud, result.mesh, result.graph
+    arrays = [result.trajectory, result.diagnostics.sequential, graph.poses, graph.information]
+    arrays += [cloud.points, cloud.normals, cloud.color, cloud.views, cloud.sigma]
+    arrays += [] if mesh is None else [mesh.vertices, mesh.faces, mesh.normals, mesh.views]
+    return [json.dumps(data), *(None if a is None else a.tobytes() for a in arrays)]
+
+
+@pytest.fixture(scope="module")
+def turned_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Clouds without a camera, around the peaks."""
+    return simulate("peaks", tmp_path_factory.mktemp("clouds") / "peaks", frames=3)
+
+
+def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> None:
+    recording = tofuse.open(room_recording).select(every=2)
+    config = from_method("default")
+    never = Kept(0)
+    whole = reconstruct.reconstruct(recording, config, seed=3, stages=never)
+    assert never.saved == ["tracking"] * 4 + ["loops", "refinement", "fusion"]
+    assert told(reconstruct.reconstruct(recording, config, seed=3)) == told(whole)
+    read = recording.source.read
+    for stop_at in (2, 4, 6):
+        kept = Kept(stop_at)
+        with pytest.raises(Stopped):
+            reconstruct.reconstruct(recording, config, seed=3, stages=kept)
+        kept.stop_at, before = 0, len(kept.saved)
+        seen: list[int] = []
+        monkeypatch.setattr(
+            recording.source, "read", lambda i, seen=seen: seen.append(i) or read(i)
+        )
+        again = reconstruct.reconstruct(recording, config, seed=3, stages=kept, threads=1)
+        monkeypatch.undo()
+        assert kept.saved[before:] == never.saved[before:]
+        rest = list(range(2 * stop_at, 8, 2))  # nothing is tracked twice
+        assert seen[3:] == rest  # after a look ahead at three
+        again = tofuse.Reconstruction(**{**vars(again), "threads": whole.threads})
+        assert told(again) == told(whole)
+        assert set(again.diagnostics.seconds) == set(whole.diagnostics.seconds)
+
+
+@pytest.mark.parametrize("method", ["default", "thesis"])
+def test_clouds_go_on_too(method: str, turned_box: Path) -> None:
+    recording = tofuse.open(turned_box)
+    config = changed(from_method(method, "cloud"), {"filters": []}, where="test")
+    whole = reconstruct.reconstruct(recording, config)
+    kept = Kept(2)
+    with pytest.raises(Stopped):
+        reconstruct.reconstruct(recording, config, stages=kept)
+    kept.stop_at = 0
+    assert told(reconstruct.reconstruct(recording, config, stages=kept)) == told(whole)
+
+
+def test_states_are_kept_for_one_key_and_until_damaged(tmp_path: Path) -> None:
+    notes: list[str] = []
+    one = Checkpoints(tmp_path, "a", notes.append)
+    assert (one.fresh, one.load("loops")) == (None, None)
+    one.begin(fresh=True)
+    state = {"a": np.arange(5.0), "b": [1, "x", None]}
+    one.save("loops", state)
+    assert os.listdir(tmp_path) == [CHECKPOINT]
+
+    again = Checkpoints(tmp_path, "a", notes.append)
+    assert again.fresh
+    found = again.load("loops")
+    assert found["b"] == state["b"]
+    np.testing.assert_array_equal(found["a"], state["a"])
+    assert notes == []
+
+    other = Checkpoints(tmp_path, "b", notes.append)
+    assert other.fresh is None
+    assert other.load("fusion") is None
+    assert Checkpoints(tmp_path, "a", notes.append).fresh  # until another run really begins
+    other.begin(fresh=False)
+    assert len(notes) == 1
+    assert "is not used" in notes[0]
+    assert os.listdir(tmp_path / CHECKPOINT) == []
+    other.save("loops", state)
+    assert Checkpoints(tmp_path, "b", notes.append).fresh is False
+    other.discard()
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("damage", ["short", "flipped", "empty", "other"])
+def test_damage_is_noticed(damage: str, tmp_path: Path) -> None:
+    notes: list[str] = []
+    kept = Checkpoints(tmp_path, "a", notes.append)
+    kept.save("fusion", [np.arange(1000)])
+    (path,) = (tmp_path / CHECKPOINT).iterdir()
+    data = bytearray(path.read_bytes())
+    if damage == "flipped":
+        data[len(data) // 2] ^= 1
+    made = {"short": data[:-100], "flipped": data, "empty": b"", "other": b"tofuse check\n{}"}
+    path.write_bytes(made[damage])
+    assert kept.load("fusion") is None
+    assert "damaged, and not used" in notes[0]
+    assert not path.exists()
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.system, ("touch harmed",)
+
+
+@pytest.mark.parametrize(
+    "state", [Harmful(), Path("x"), np.array([Harmful()], object), main, Checkpoints]
+)
+def test_a_state_runs_no_code_of_others(state: object, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    notes: list[str] = []
+    kept = Checkpoints(tmp_path / "out", "a", notes.append)
+    kept.save("fusion", state)
+    assert kept.load("fusion") is None
+    assert "is no part of a state" in notes[0]
+    assert not Path("harmed").exists()
+
+
+def test_what_can_not_be_kept_stops_no_run(tmp_path: Path, monkeypatch) -> None:
+    notes: list[str] = []
+    kept = Checkpoints(tmp_path, "a", notes.append)
+    kept.save("tracking", [1])
+    kept.save("loops", [lambda: 1])
+    assert "can't keep" in notes[0]
+    assert os.listdir(tmp_path) == []
+    kept.save("fusion", [1])
+    assert os.listdir(tmp_path) == []
+    assert not kept.due()
+
+    def full(*_args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    other = Checkpoints(tmp_path, "a", notes.append)
+    monkeypatch.setattr(os, "fsync", full)
+    other.save("fusion", [1])
+    assert "no space left" in notes[1]
+    assert os.listdir(tmp_path) == []
+
+
+def test_much_work_is_not_thrown_away_with_a_full_disk(tmp_path: Path, monkeypatch) -> None:
+    for error, seconds, stays in (
+        (OutputError("is full"), 0.0, True),
+        (OutputError("is full"), 60.0, False),
+        (InputError("is bad"), 0.0, False),
+        (KeyboardInterrupt(), 0.0, False),
+    ):
+        monkeypatch.setattr(checkpoint, "_WORTH_KEEPING_S", seconds)
+        kept = Checkpoints(tmp_path, "a", lambda _text: None)
+        kept.save("tracking", [1])
+        kept.give_up(error)
+        assert (tmp_path / CHECKPOINT).exists() == stays
+        kept.discard()
+
+
+def test_digest_tells_what_decides(tmp_path: Path) -> None:
+    folder, out = tmp_path / "rec", tmp_path / "rec" / "out"
+    (folder / "depth").mkdir(parents=True)
+    image = folder / "depth" / "0.png"
+    image.write_bytes(b"one")
+    out.mkdir()
+    before = digest({"seed": 0}, [folder], without=out)
+    (out / "run.json").write_text("{}")
+    assert digest({"seed": 0}, [folder], without=out) == before
+    assert digest({"seed": 1}, [folder], without=out) != before
+    status = image.stat()
+    image.write_bytes(b"two")
+    os.utime(image, ns=(status.st_atime_ns, status.st_mtime_ns + 1))
+    assert digest({"seed": 0}, [folder], without=out) != before
+    alone = digest({}, [image], without=out)
+    (folder / "depth" / "camera.json").write_text("{}")
+    assert digest({}, [image], without=out) != alone
+
+
+# Keeps a state after every frame, and kills itself at the n-th event (a stage, a frame, a file that
+# is moved or a state that is kept), or at the n-th file that is moved to its place.
+_KILLED = """
+import os, pathlib, signal, sys
+from tofuse.cli import main
+from tofuse.cli.progress import QuietProgress
+from tofuse.pipeline import checkpoint, run
+run._report = lambda *a: (a[-1] / "report.html").write_text("report")
+checkpoint._EVERY_S, checkpoint._SHARE = 0.0, 1e9
+out, last_event, last_move = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+events = moves = 0
+def counted(function):
+    def call(*arguments, **options):
+        global events, moves
+        events += 1
+        moves += pathlib.Path(str(arguments[-1])).parent == out
+        if events == last_event or moves == last_move:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments, **options)
+    return call
+QuietProgress.stage = counted(QuietProgress.stage)
+QuietProgress.advance = counted(QuietProgress.advance)
+os.replace = counted(os.replace)
+os.fsync = counted(os.fsync)
+sys.exit(main(sys.argv[4:]))
+"""
+
+
+def killed(out: Path, *words: object, event: int = -1, move: int = -1) -> tuple[int, str]:
+    """Exit status and what was said of a run that is killed on its way."""
+    job = ["run", "--out", out, *words]
+    command = [sys.executable, "-c", _KILLED, out, event, move, *job]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
+def test_killed_again_and_again_gives_the_same_bytes(
+    room_recording: Path, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(run, "_report", lambda *a: (a[-1] / "report.html").write_text("report"))
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    words = (room_recording, "--every", 2, "--seed", 2)
+    assert main(["run", "--out", str(whole), *map(str, words)]) == 0
+    assert {p.name for p in whole.iterdir()} == {*SAME, "report.html", "run.json"}
+    rng = np.random.default_rng(5)
+    # In tracking or after it, and at the moves of files.
+    for how in ({"event": int(rng.integers(3, 20))}, {"move": int(rng.integers(1, 8))}):
+        status, said = killed(out, *words, **how)
+        assert status == -signal.SIGKILL, said
+        assert not (out / "run.json").exists()
+    assert (out / STAGING).is_dir()
+    status, said = killed(out, *words)
+    assert status == 0
+    assert "goes on after frame 4" in said
+    assert {p.name for p in out.iterdir()} == {p.name for p in whole.iterdir()}
+    for name in SAME:
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    one, other = (json.loads((f / "run.json").read_text()) for f in (whole, out))
+    assert {**one, "seconds": 0} == {**other, "seconds": 0}
+
+
+# No file may grow beyond some kilobytes: what a full disk is, for a test.
+_FULL = """
+import resource, sys
+from tofuse.cli import main
+from tofuse.kernels import jit
+from tofuse.pipeline import run
+run._report = lambda *a: (a[-1] / "report.html").write_text("report")
+jit.cache_folder()
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of other systems")
+def test_a_full_disk_leaves_what_was_there(room_recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text('{"schema": 1, "version": "0", "verdict": "good"}')
+    words = [str(room_recording), "--out", str(out), "--every", "4", "--overwrite"]
+    done = subprocess.run(
+        [sys.executable, "-c", _FULL, "20000", "run", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"tofuse: {out}")
+    assert "can't be written (file too large)" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert os.listdir(out) == ["run.json"]
