@@ -145,20 +145,29 @@ def test_overlap_counts_what_both_see_from_the_same_side(pair):
     surface = surface_map(target, SurfaceOptions(radii=(2,)))
     points = points_of(surface_map(source, SurfaceOptions(radii=(2,))), 2)
 
-    def share(pose, cosine=0.5):
-        return kernels.overlap(
+    def share(pose, cosine=0.5, least=0.0):
+        out = np.empty(1)
+        kernels.overlaps(
             points,
+            np.array([0, len(points)]),
+            np.array([0]),
             surface.target,
             surface.projection.lookup,
             surface.projection.frame,
             np.ascontiguousarray(pose),
+            np.eye(4)[None],
             0.1,
             cosine,
+            least,
+            out,
         )
+        return out[0]
 
     assert share(T) > 0.8
     assert share(T @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))) == 0
     aside = T @ se3.exp(np.array([0, 0, 0, 0, 0.4, 0]))
     assert 0 < share(aside) < share(T)
+    assert share(aside, least=share(aside) - 0.01) == share(aside)
+    assert share(aside, least=share(aside) + 0.01) == 0
     # All of it is behind what the target sees, so nothing is seen by both.
     assert share(T @ se3.exp(np.array([0, 0, 1.5, 0, 0, 0]))) < 0.05

@@ -243,48 +243,74 @@ def _add(A: Float64, g: Float64, J: Float64, r: float, weight: float, unknowns: 
 
 
 @kernel
-def overlap(
+def overlaps(
     points: Float32,
+    starts: Int64,
+    sources: Int64,
     target: Float32,
     lookup: Float32,
     lookup_frame: Float64,
-    T: Float64,
+    T_target_world: Float64,
+    T_world_source: Float64,
     tolerance: float,
     min_cosine: float,
-) -> float:
-    """Share of a view's points that another view sees too, if T (4, 4) T_target_source is right.
+    least: float,
+    out: Float64,
+) -> None:
+    """Share of other views' points that a target sees too, into `out` (S,); 0 if below `least`.
 
     Such points land where the target has a surface, lie within a share `tolerance` of its
     distance from it, and face the same way.
 
     Parameters
     ----------
-    points, target, lookup, lookup_frame
+    points, starts
+        (M, POINT_SIZE) points of all views, those of view k from starts[k] to starts[k + 1].
+    sources
+        (S,) the views to look at.
+    target, lookup, lookup_frame
         As in `pair_equations`.
+    T_target_world, T_world_source
+        (4, 4) of the target, and (N, 4, 4) of all views.
     """
-    seen = 0
-    for k in range(points.shape[0]):
-        px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if z <= 0.02:
-            continue
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
-        if iu < 0:
-            continue
-        if not (u > -0.5 and v > -0.5 and u < target.shape[1] - 0.5 and v < target.shape[0] - 0.5):
-            continue
-        pixel = target[int(v + 0.5), int(u + 0.5)]
-        n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
-        if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
-            continue
-        nx, ny, nz = points[k, NORMAL], points[k, NORMAL + 1], points[k, NORMAL + 2]
-        cosine = (
-            n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
-            + n1 * (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz)
-            + n2 * (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz)
-        )
-        if cosine >= min_cosine:
-            seen += 1
-    return seen / max(points.shape[0], 1)
+    rows, columns = target.shape[0], target.shape[1]
+    T = np.empty((3, 4))
+    for s in range(len(sources)):
+        pose = T_world_source[sources[s]]
+        for a in range(3):
+            for b in range(4):
+                T[a, b] = T_target_world[a, 3] if b == 3 else 0.0
+                for c in range(3):
+                    T[a, b] += T_target_world[a, c] * pose[c, b]
+        start, stop = starts[sources[s]], starts[sources[s] + 1]
+        # So many that are not seen, and it is too few, whatever follows.
+        spare = (stop - start) - least * (stop - start) + 1e-9
+        seen = 0
+        for k in range(start, stop):
+            if k - start - seen > spare:
+                break
+            px, py, pz = points[k, POINT], points[k, POINT + 1], points[k, POINT + 2]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if z <= 0.02:
+                continue
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
+            if iu < 0:
+                continue
+            if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+                continue
+            pixel = target[int(v + 0.5), int(u + 0.5)]
+            n0, n1, n2, distance = pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2], pixel[DISTANCE]
+            if distance == 0 or abs(n0 * x + n1 * y + n2 * z - distance) > tolerance * z:
+                continue
+            nx, ny, nz = points[k, NORMAL], points[k, NORMAL + 1], points[k, NORMAL + 2]
+            cosine = (
+                n0 * (T[0, 0] * nx + T[0, 1] * ny + T[0, 2] * nz)
+                + n1 * (T[1, 0] * nx + T[1, 1] * ny + T[1, 2] * nz)
+                + n2 * (T[2, 0] * nx + T[2, 1] * ny + T[2, 2] * nz)
+            )
+            if cosine >= min_cosine:
+                seen += 1
+        share = seen / max(stop - start, 1)
+        out[s] = share if share >= least else 0.0

@@ -123,6 +123,7 @@ class Projection:
     rays: Float32
     lookup: Float32
     frame: Float64
+    _thinned: dict[int, Projection] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def unknown(self) -> NDArray[np.bool_] | None:
@@ -152,6 +153,15 @@ class Projection:
         lookup = np.where(np.isfinite(pixels), pixels, -1e6).astype(np.float32)
         scale = np.array([x[0], y[0], 1 / (x[1] - x[0]), 1 / (y[1] - y[0])])
         return cls(_halved_rays(rays, step), lookup, scale)
+
+    def thinned(self, step: int) -> Projection:
+        """Every `step`-th pixel; one object for all views, which is soon found in the caches."""
+        if step not in self._thinned:
+            first = step // 2
+            rays = np.ascontiguousarray(self.rays[first::step, first::step])
+            lookup = (self.lookup - np.float32(first)) / np.float32(step)
+            self._thinned[step] = Projection(rays, lookup, self.frame)
+        return self._thinned[step]
 
 
 def _halved_rays(rays: Float32, step: int) -> Float32:
@@ -224,19 +234,12 @@ class SurfaceMap:
             return self
         first = step // 2
         kept = (slice(first, None, step),) * 2
-        rays, z, sigma, planes, variance, photo = (
+        z, sigma, planes, variance, photo = (
             np.ascontiguousarray(image[kept])
-            for image in (
-                self.rays,
-                self.z,
-                self.sigma,
-                self.planes,
-                self.plane_variance,
-                self.photo,
-            )
+            for image in (self.z, self.sigma, self.planes, self.plane_variance, self.photo)
         )
-        lookup = (self.projection.lookup - np.float32(first)) / np.float32(step)
-        projection = Projection(rays, lookup, self.projection.frame)
+        projection = self.projection.thinned(step)
+        rays = projection.rays
         return SurfaceMap(
             self.index, rays, z, sigma, planes, variance, photo, projection, self.has_photo
         )

@@ -264,8 +264,11 @@ def _evaluate(
     rows = np.empty((len(state.target), kernels.SIZE))
     cosine = float(np.cos(options.max_angle))
 
+    # All pairs of a target in turn: then the target need not be fetched again.
+    order = np.argsort(state.target, kind="stable")
+
     def work(a: int, b: int) -> None:
-        for k in range(a, b):
+        for k in order[a:b]:
             target = views[state.target[k]].surface
             kernels.pair_equations(
                 views[state.source[k]].points,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframes import Acceptance, Recovery
 from tofuse.parts import part
@@ -32,8 +33,9 @@ Integers = NDArray[np.intp]
 
 _COLUMNS = 200
 _POINTS = 600
-# The trajectory has drifted when a loop closes: little, or much.
-_NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 4, 0.0, 0.0))
+# The trajectory has drifted when a loop closes: little, or much. Neighbouring pixels share their
+# noise, so that all of them would say hardly more than every second one.
+_NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
 _FAR = (Level(4, 20, 0.15, 0.3), *_NEAR)
 _ALIGNMENT = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 # Sigma, in units of 1 cm and 1 degree, above which a direction keeps the prediction: never.
@@ -176,10 +178,11 @@ class _RevisitLoops(Loops):
     def finish(self) -> list[ClosedLoop]:
         """See `Loops.finish`. What a person gives takes the place of what was found."""
         surfaces = self._store.views
-        closed = {
-            (surfaces[i].index, surfaces[j].index): self._confirm(surfaces[i], surfaces[j])
-            for i, j in self._options.candidates(self._views(), self._poses_of(surfaces))
-        }
+        pairs = self._options.candidates(self._views(), self._poses_of(surfaces))
+        found = run_chunks(
+            lambda a, _: self._confirm(*(surfaces[k] for k in pairs[a])), len(pairs), len(pairs)
+        )
+        closed = {(loop.record.i, loop.record.j): loop for loop in found}
         by_index = {s.index: s for s in surfaces}
         refused = sorted(
             (pair for pair, loop in closed.items() if not loop.record.accepted),

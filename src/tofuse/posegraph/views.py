@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels.alignment import POINT, SIGMA
+from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import points_of
@@ -21,8 +21,9 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-# Of every view, to tell which views overlap.
+# Of every view, to tell which views overlap: so many points, and an image of this width.
 _OVERLAP_POINTS = 150
+_OVERLAP_COLUMNS = 40
 # Points see a surface if they are as near to it, as a share of their z, and face it like this.
 _NEAR = 0.1
 _FACING = 0.5
@@ -40,6 +41,11 @@ class KeptView:
         """Take about so many points of a view."""
         every = max(1, round(np.sqrt(surface.z.size / points)))
         return cls(surface, points_of(surface, every))
+
+    @cached_property
+    def coarse(self) -> SurfaceMap:
+        """The surface at few pixels, which is enough to tell what overlaps."""
+        return self.surface.thinned(_OVERLAP_COLUMNS)
 
     @cached_property
     def sigma(self) -> float:
@@ -142,37 +148,53 @@ def overlaps(
     -------
     pairs (M, 2), i < j, in the order of j, then i; shares (M,).
     """
-    some = [
-        np.ascontiguousarray(v.points[:: max(1, len(v.points) // _OVERLAP_POINTS)]) for v in views
-    ]
     axes = poses[:, :3, 2]
-    inverse = se3.inverse(poses)
+    target, source = np.nonzero(np.triu(axes @ axes.T > 0, 1))
+    late = source >= first
+    target, source = target[late], source[late]
+    share = _shares(views, poses, target, source, least)
+    near = share >= least
+    target, source = target[near], source[near]
+    share = np.minimum(share[near], _shares(views, poses, source, target, least))
+    order = np.lexsort((target, source))
+    order = order[share[order] >= least]
+    return np.stack([target[order], source[order]], 1), share[order]
 
-    def seen(target: int, source: int) -> float:
-        surface = views[target].surface
-        return float(
-            kernels.overlap(
-                some[source],
-                surface.target,
-                surface.projection.lookup,
-                surface.projection.frame,
-                np.ascontiguousarray(inverse[target] @ poses[source]),
+
+def _shares(
+    views: Sequence[KeptView], poses: Float64, target: Integers, source: Integers, least: float
+) -> Float64:
+    """Share of each source's points that its target sees; 0 where that is below `least`."""
+    some = [v.points[:: max(1, len(v.points) // _OVERLAP_POINTS)] for v in views]
+    starts = np.concatenate([[0], np.cumsum([len(points) for points in some])])
+    points = np.concatenate(some) if some else np.zeros((0, POINT_SIZE), np.float32)
+    inverse = se3.inverse(poses)
+    # All sources of a target in turn: then the target need not be fetched again.
+    order = np.argsort(target, kind="stable")
+    different, begin = np.unique(target[order], return_index=True)
+    end = np.append(begin[1:], len(order))
+    out = np.zeros(len(target))
+
+    def work(a: int, b: int) -> None:
+        for k in range(a, b):
+            rows = order[begin[k] : end[k]]
+            view = views[different[k]].coarse
+            found = np.empty(len(rows))
+            kernels.overlaps(
+                points,
+                starts,
+                source[rows],
+                view.target,
+                view.projection.lookup,
+                view.projection.frame,
+                inverse[different[k]],
+                poses,
                 _NEAR,
                 _FACING,
+                least,
+                found,
             )
-        )
+            out[rows] = found
 
-    def rows(a: int, b: int) -> list[tuple[int, int, float]]:
-        found = []
-        for j in range(first + a, first + b):
-            for i in np.flatnonzero(axes[:j] @ axes[j] > 0):
-                share = seen(int(i), j)
-                if share >= least:
-                    share = min(share, seen(j, int(i)))
-                if share >= least:
-                    found.append((int(i), j, share))
-        return found
-
-    found = [pair for chunk in run_chunks(rows, len(views) - first, 32) for pair in chunk]
-    pairs = np.array([pair[:2] for pair in found], np.intp).reshape(-1, 2)
-    return pairs, np.array([pair[2] for pair in found])
+    run_chunks(work, len(different), 32)
+    return out
