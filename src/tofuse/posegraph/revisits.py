@@ -13,6 +13,7 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframes import Acceptance, Recovery
 from tofuse.parts import part
+from tofuse.posegraph.appearance import ALIKE, Appearance, look_of
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import (
     ClosedLoop,
@@ -40,6 +41,7 @@ _FAR = (Level(4, 20, 0.15, 0.3), *_NEAR)
 _ALIGNMENT = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 # Sigma, in units of 1 cm and 1 degree, above which a direction keeps the prediction: never.
 _NOT_HELD = 1e6
+_TOO_FAR = "looks alike, but the trajectory can't have drifted so far"
 _RECOVERY = Recovery()
 _ACCEPTANCE = Acceptance(0.8, 0.3, 0.05, 200, 0.02, 0.6)
 
@@ -81,6 +83,9 @@ class Revisits(LoopDetector):
         How, and what is believed of what is found.
     same_m, same_rad
         How far apart two loops may put a camera that say the same.
+    appearance
+        Views that look alike are candidates too, wherever the trajectory has them; they are
+        searched.
     """
 
     spacing: Spacing = Spacing(angle=0.15, distance=0.08, most=200)  # noqa: RUF009 - immutable
@@ -98,6 +103,7 @@ class Revisits(LoopDetector):
     recovery: Recovery = _RECOVERY
     same_m: float = 0.15
     same_rad: float = 0.1
+    appearance: Appearance = Appearance()  # noqa: RUF009 - immutable
 
     def __post_init__(self) -> None:
         if not 0 <= self.apart < self.overlap <= 1:
@@ -188,7 +194,10 @@ class _RevisitLoops(Loops):
             (pair for pair, loop in closed.items() if not loop.record.accepted),
             key=lambda pair: -(closed[pair].record.overlap or 0.0),
         )
-        closed.update(self._searched(refused[: self._options.searches], by_index, closed))
+        alike, impossible = self._alike(closed)
+        closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
+        asked = [*refused[: self._options.searches], *alike]
+        closed.update(self._searched(asked, by_index, closed, alike))
         known = self._given_surfaces
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
@@ -214,30 +223,78 @@ class _RevisitLoops(Loops):
                 there, objection = again, ""
         return self._decided(target, source, there, objection)
 
+    def _alike(
+        self, closed: Mapping[tuple[int, int], ClosedLoop]
+    ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """Frames (i, j) that look alike and are no candidates yet: possible ones, and others."""
+        surfaces = self._store.views
+        place = {s.index: k for k, s in enumerate(surfaces)}
+        known = [(place[i], place[j]) for (i, j), loop in closed.items() if loop.record.accepted]
+        both = self._options.appearance.candidates(
+            [look_of(s) for s in surfaces],
+            lambda i, j: self._plausible(surfaces[i], surfaces[j], np.eye(4), ALIKE),
+            known,
+        )
+        indices = [[(surfaces[i].index, surfaces[j].index) for i, j in pairs] for pairs in both]
+        return (
+            [pair for pair in indices[0] if pair not in closed],
+            [pair for pair in indices[1] if pair not in closed],
+        )
+
     def _searched(
         self,
         pairs: Sequence[tuple[int, int]],
         surfaces: Mapping[int, SurfaceMap],
         closed: Mapping[tuple[int, int], ClosedLoop],
+        alike: Sequence[tuple[int, int]],
     ) -> dict[tuple[int, int], ClosedLoop]:
-        """Search views in each other without a guess; what is found and believed."""
+        """Search views in each other without a guess.
+
+        Returns what is found and believed, and of those that only look alike also why not.
+        """
         recovery = self._options.recovery
         found = {}
+        refused = dict.fromkeys(alike, "looks alike, but a search finds no pose that leads")
         for i, j in pairs:
             match = search(surfaces[j], surfaces[i], recovery.search)
-            if match is not None and recovery.believes(match):
-                found[i, j] = match
+            if match is None or not recovery.believes(match):
+                continue
+            if (i, j) in refused and not self._plausible(
+                surfaces[i], surfaces[j], match.T_target_source
+            ):
+                refused[i, j] = _TOO_FAR
+                continue
+            found[i, j] = match
         said = {pair: loop.T_i_j for pair, loop in closed.items() if loop.T_i_j is not None}
         said |= {pair: match.T_target_source for pair, match in found.items()}
         believed = {}
         for (i, j), match in found.items():
             alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
             if alone and not recovery.believes(match, lost=True):
+                if (i, j) in refused:
+                    refused[i, j] = (
+                        f"looks alike, but the pose found leads by {match.margin:.0%} of the "
+                        "points only, and no other loop says the same"
+                    )
                 continue
             lead = f"found by a search, leading by {match.margin:.0%} of the points"
             how = lead if alone else f"{lead}; another loop says the same"
+            if (i, j) in refused:
+                how = f"looks alike, {how}"
             believed[i, j] = self._measured(surfaces[i], surfaces[j], match, how)
-        return believed
+        no = {p: ClosedLoop(LoopRecord(*p, False, refused[p])) for p in alike}
+        return no | believed
+
+    def _plausible(
+        self, target: SurfaceMap, source: SurfaceMap, T: Float64, unsure: float = 0.0
+    ) -> bool:
+        """Whether the trajectory may have drifted so far as T_target_source says."""
+        path = np.stack(
+            [pose for k, pose in self._poses.items() if target.index <= k <= source.index]
+        )
+        off = se3.inverse(se3.inverse(path[0]) @ path[-1]) @ T
+        depth = 0.5 * (target.depth + source.depth)
+        return self._options.appearance.plausible(off, path, depth, unsure)
 
     def _same(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
         """Whether the loop k, m, beside the loop i, j, puts the camera of j where that does."""

@@ -1,0 +1,200 @@
+"""Places known again by how they look, wherever the trajectory has them.
+
+Of each view a small image is kept of how far the surfaces are and how they reflect, both as
+logarithms. Two views look alike if their images differ little at some shift of one against the
+other, as a camera that is turned a little sees the same, moved. No pose takes part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels.threads import run_chunks
+from tofuse.maps.surface_map import SurfaceMap
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+_ROWS, _COLUMNS = 9, 12
+_CHUNKS = 16
+# Of pairs of nearly the same views (this many positions off either way) so many are taken: two can
+# confirm each other, and more would take the place of other loops.
+_BESIDE, _TOGETHER = 3, 2
+# How far apart views that look alike may stand: rad, and share of the depth.
+ALIKE = 0.35
+# Logarithms that differ by more are as good as unknown.
+_MOST_DEPTH, _MOST_LIGHT = 0.3, 0.5
+# Share of the cells of which both views know the albedo, below which it is not compared.
+_LIT = 0.2
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Which views look alike, and how far the trajectory may be off.
+
+    Attributes
+    ----------
+    most
+        Pairs of a recording at most, those most alike; 0 takes no notice of how views look.
+    unlike, left
+        How much the two views of a pair may differ at most, and a view in between from either at
+        least: 0 for the same image, 1 for nothing in common.
+    shift
+        How far the images may be moved against each other, as a share of their width.
+    drift
+        Share of the path, and of the turns on it, by which the trajectory may be off at most. What
+        would need more drift is taken for another place that looks the same.
+    """
+
+    most: int = 6
+    unlike: float = 0.3
+    left: float = 0.4
+    shift: float = 0.25
+    drift: float = 0.2
+
+    def __post_init__(self) -> None:
+        if self.most < 0:
+            raise ValueError(f"most is {self.most}, not 0 or more")
+        for name in ("unlike", "left", "drift"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
+        if not 0 <= self.shift <= 0.5:
+            raise ValueError(f"shift is {self.shift}, not 0 to 0.5")
+
+    def candidates(
+        self,
+        looks: Sequence[Float32],
+        possible: Callable[[int, int], bool],
+        known: Collection[tuple[int, int]] = (),
+    ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """Views that look alike though the camera left in between.
+
+        Parameters
+        ----------
+        looks
+            Of all views in the order of time, see `look_of`.
+        possible
+            Whether the trajectory allows that two views show the same place.
+        known
+            Pairs that are loops for certain: near them nothing is looked for.
+
+        Returns
+        -------
+        Positions (i, j), i < j, of those that are possible and of those that are not, at most
+        `most` of each, the most alike first.
+        """
+        chosen: list[tuple[int, int]] = []
+        refused: list[tuple[int, int]] = []
+        if self.most == 0 or len(looks) < 3:
+            return chosen, refused
+        far = unlikeness(looks, self.shift)
+        away = far >= self.left
+        found = [
+            (float(far[i, j]), int(i), int(j))
+            for j in range(2, len(looks))
+            for i in np.flatnonzero(far[: j - 1, j] <= self.unlike)
+            if (away[i, i + 1 : j] & away[i + 1 : j, j]).any()
+        ]
+        for _, i, j in sorted(found):
+            mine = chosen if possible(i, j) else refused
+            full = len(mine) >= self.most or _beside(i, j, mine) >= _TOGETHER
+            if not full and not _beside(i, j, known):
+                mine.append((i, j))
+        return chosen, refused
+
+    def plausible(self, between: Float64, path: Float64, depth: float, unsure: float = 0.0) -> bool:
+        """Whether the trajectory may be off by so much.
+
+        Parameters
+        ----------
+        between
+            (4, 4) from where it has the later view to where it was found.
+        path
+            (N, 4, 4) T_world_camera from the earlier view to the later one.
+        depth
+            Of what they see, m: a view that turns is off to the side as well, by about that.
+        unsure
+            Added to what it may be off, in rad and as a share of the depth.
+        """
+        steps = se3.inverse(path[:-1]) @ path[1:]
+        length = float(np.linalg.norm(steps[:, :3, 3], axis=1).sum())
+        turned = float(np.sum(se3.angle(steps)))
+        return bool(
+            np.linalg.norm(between[:3, 3])
+            <= self.drift * (length + depth * turned) + unsure * depth
+            and se3.angle(between) <= self.drift * (turned + length / depth) + unsure
+        )
+
+
+def _beside(i: int, j: int, pairs: Collection[tuple[int, int]]) -> int:
+    """Number of the pairs that are of nearly the same views."""
+    return sum(abs(i - k) <= _BESIDE and abs(j - m) <= _BESIDE for k, m in pairs)
+
+
+def look_of(view: SurfaceMap) -> Float32:
+    """(2, 9, 12) mean log depth and log albedo of each cell, NaN where little is known."""
+    rows, columns = view.z.shape
+    i = np.arange(rows) * _ROWS // rows
+    j = np.arange(columns) * _COLUMNS // columns
+    cell = (i[:, None] * _COLUMNS + j).ravel()
+    size = _ROWS * _COLUMNS
+    third = np.bincount(cell, minlength=size) / 3
+    look = np.full((2, size), np.nan, np.float32)
+    depth = np.log(np.where(view.z > 0, view.z, np.float32(np.nan)))
+    for image, out in ((depth, look[0]), (view.photo[..., 0], look[1])):
+        known = np.isfinite(image).ravel()
+        count = np.bincount(cell[known], minlength=size)
+        total = np.bincount(cell[known], image.ravel()[known].astype(float), minlength=size)
+        enough = (count > third) & (count > 0)
+        out[enough] = total[enough] / count[enough]
+    return look.reshape(2, _ROWS, _COLUMNS)
+
+
+def unlikeness(looks: Sequence[Float32], shift: float) -> Float64:
+    """(N, N) how much views (2, 9, 12) differ from each other, at the best shift of each pair.
+
+    0 for the same image, 1 for nothing in common. Exposure is what the albedo differs by on
+    average, and does not count. Pairs without light on both sides are compared by depth alone.
+
+    Parameters
+    ----------
+    shift
+        Largest one, as a share of the width.
+    """
+    stack = np.stack(looks)
+    across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
+    far = np.ones((len(stack), len(stack)))
+
+    def rows(a: int, b: int) -> None:
+        for k in range(a, b):
+            best = far[k, k:]
+            for v in range(-down, down + 1):
+                for u in range(-across, across + 1):
+                    here = stack[k, :, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
+                    there = stack[k:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
+                    np.minimum(best, _differ(here, there), out=best)
+
+    run_chunks(rows, len(stack), _CHUNKS)
+    return np.minimum(far, far.T)
+
+
+def _differ(here: Float32, there: Float32) -> Float64:
+    """(N,) mean of what cells differ by, of the most that counts."""
+    apart = there - here
+    known = np.isfinite(apart)
+    count = known.sum((2, 3))
+    apart = np.where(known, apart, 0)
+    exposure = apart[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
+    depth = np.minimum(np.abs(apart[:, 0]) / _MOST_DEPTH, 1)
+    light = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MOST_LIGHT, 1)
+    cells = here[0].size
+    far = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
+    # Albedo is known of smooth surfaces alone: where it is not, nothing is told.
+    shade = np.where(known[:, 1], light, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
+    lit = count[:, 1] > _LIT * cells
+    return np.asarray(np.where(lit, 0.5 * (far + shade), far), np.float64)

@@ -1,0 +1,230 @@
+"""Loops found by how views look, where the trajectory has drifted too far to tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.odometry.keyframes import Recovery
+from tofuse.posegraph.appearance import Appearance, look_of, unlikeness
+from tofuse.posegraph.revisits import Revisits
+from tofuse.posegraph.views import Spacing
+from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.search import SearchOptions
+
+CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
+ALL = Spacing(angle=0, distance=0)
+QUICK = Recovery(search=SearchOptions("full", full_candidates=15, photo_candidates=5))
+# Boxes (centre, half size, turned about y by rad) in a room of 5 x 2.4 x 4 m, y down.
+BOXES = [
+    ((1.3, 0.9, 1.2), (0.3, 0.5, 0.25), 0.3),
+    ((-1.5, 0.6, 1.3), (0.2, 0.8, 0.3), 0.9),
+    ((-1.2, 0.9, -1.3), (0.5, 0.4, 0.2), 1.2),
+    ((1.6, 0.7, -0.9), (0.2, 0.6, 0.4), 0.1),
+]
+
+
+def room(yaw, index, *, half=(2.5, 1.2, 2.0), boxes=BOXES, spots=60, noise=0.004):
+    """What a camera in the middle of a room sees when it has turned by `yaw`."""
+    rays = np.dstack([CAMERA.rays(), np.ones((72, 96))]).reshape(-1, 3)
+    d = rays @ se3.so3_exp([0, yaw, 0]).T
+    z = (np.array(half) / np.abs(d)).min(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for centre, size, turn in boxes:
+            R = se3.so3_exp([0, turn, 0])
+            o, e = (-np.array(centre)) @ R, d @ R
+            a, b = (-np.array(size) - o) / e, (np.array(size) - o) / e
+            near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+            z = np.where((near < far) & (near > 0) & (near < z), near, z)
+    p = z[:, None] * d
+    rng = np.random.default_rng(3)
+    albedo = np.ones(len(p))
+    for at, size, level in zip(
+        rng.uniform(-1, 1, (spots, 3)) * half,
+        rng.uniform(0.1, 0.35, spots),
+        rng.uniform(0.4, 1.6, spots),
+        strict=True,
+    ):
+        albedo[((p - at) ** 2).sum(1) < size**2] = level
+    rng = np.random.default_rng([4, index])
+    z = z * (1 + noise * rng.standard_normal(len(z)))
+    light = 1000 * albedo * (1 + 0.02 * rng.standard_normal(len(z)))
+    depth, light = (x.reshape(72, 96).astype(np.float32) for x in (z, light))
+    return RangeFrame(
+        index,
+        index / 10,
+        CAMERA,
+        depth,
+        "z",
+        amplitude_image=light,
+        amplitude_kind="range_compensated",
+    )
+
+
+def turning(count, step, **options):
+    """Surfaces and true poses of a camera that turns on the spot by `step` at a time."""
+    xi = np.zeros((count, 6))
+    xi[:, 4] = step * np.arange(count)
+    views = [
+        surface_map(room(a, k, **options), SurfaceOptions(radii=(2,)))
+        for k, a in enumerate(xi[:, 4])
+    ]
+    return views, se3.exp(xi)
+
+
+def drifted(truth, degrees):
+    """The same path, with a turn added evenly: more than any covariance of it would say."""
+    T = [truth[0]]
+    wrong = se3.exp(np.array([0, 0, 0, 0, np.radians(degrees) / (len(truth) - 1), 0]))
+    for k in range(1, len(truth)):
+        T.append(T[-1] @ se3.inverse(truth[k - 1]) @ truth[k] @ wrong)
+    return np.stack(T)
+
+
+def found_in(views, poses, **options):
+    loops = Revisits(spacing=ALL, recovery=QUICK, **options).start(0)
+    frame = room(0.0, 0)
+    for view, T in zip(views, poses, strict=True):
+        loops.push(replace(frame, index=view.index), T, view)
+    return loops.finish()
+
+
+@pytest.fixture(scope="module")
+def once_round():
+    """A furnished room, 20 degrees at a time, all round and a little further."""
+    return turning(20, np.radians(20.0))
+
+
+def test_a_loop_is_closed_where_the_trajectory_is_45_degrees_off(once_round):
+    views, truth = once_round
+    poses = drifted(truth, 45)
+    blind = found_in(views, poses, appearance=Appearance(most=0))
+    assert not any(c.record.accepted for c in blind)
+    found = found_in(views, poses, appearance=Appearance(most=2))
+    closed = [c for c in found if c.record.accepted]
+    assert closed
+    for c in closed:
+        assert c.record.j - c.record.i >= 16
+        true = se3.inverse(truth[c.record.i]) @ truth[c.record.j]
+        gap = se3.inverse(true) @ c.T_i_j
+        assert np.linalg.norm(gap[:3, 3]) < 0.04
+        assert np.degrees(se3.angle(gap)) < 1.5
+        assert "looks alike" in c.record.reason
+        assert np.linalg.eigvalsh(c.information).min() > 0
+
+
+def test_a_room_that_looks_the_same_four_times_gives_no_false_loop():
+    """Square, bare: each wall looks like the one before, and a pose that fits is found."""
+    views, truth = turning(12, np.radians(22.5), half=(2.0, 1.2, 2.0), boxes=[], spots=0)
+    asked = found_in(views, truth, appearance=Appearance(most=2, left=0.02))
+    alike = [c for c in asked if "looks alike" in c.record.reason]
+    assert len(alike) >= 2  # they do look alike
+    assert sum("can't have drifted so far" in c.record.reason for c in alike) >= 2
+    assert not any(c.record.accepted for c in asked)
+    assert all(c.T_i_j is None for c in asked)
+
+
+def test_what_would_need_too_much_drift_is_another_place(once_round):
+    """The same views, but the trajectory says that the camera hardly turned at all."""
+    views, truth = once_round
+    still = truth.copy()
+    still[:] = se3.exp(np.linspace(0, 1, len(truth))[:, None] * np.array([0.1, 0, 0, 0, 3.0, 0]))
+    options = {"appearance": Appearance(most=2)}
+    reasons = [c.record.reason for c in found_in(views, still, **options) if not c.record.accepted]
+    assert any("can't have drifted so far" in reason for reason in reasons)
+
+
+# How alike
+
+
+def test_unlikeness_against_a_slow_twin(once_round):
+    views, _ = once_round
+    looks = [look_of(view) for view in views[:7]]
+    looks[3][1] = np.nan  # a view without light
+
+    def slow(a, b, shift=0.25):
+        best = 1.0
+        for v in range(-round(shift * 9 / 2), round(shift * 9 / 2) + 1):
+            for u in range(-round(shift * 12), round(shift * 12) + 1):
+                pairs = [
+                    (a[:, i, j], b[:, i - v, j - u])
+                    for i in range(9)
+                    for j in range(12)
+                    if 0 <= i - v < 9 and 0 <= j - u < 12
+                ]
+                depth = [abs(y[0] - x[0]) / 0.3 for x, y in pairs]
+                far = np.mean([min(d, 1) if np.isfinite(d) else 1 for d in depth])
+                light = [y[1] - x[1] for x, y in pairs if np.isfinite(y[1] - x[1])]
+                if len(light) > 0.2 * len(pairs):
+                    off = np.abs(np.array(light) - np.mean(light)) / 0.5
+                    far = 0.5 * (far + np.minimum(off, 1).mean())
+                best = min(best, far)
+        return best
+
+    expected = [[min(slow(a, b), slow(b, a)) for b in looks] for a in looks]
+    with threads(2):
+        np.testing.assert_allclose(unlikeness(looks, 0.25), expected, atol=1e-5)
+
+
+def test_the_same_place_is_more_alike_than_any_other(once_round):
+    views, _truth = once_round
+    far = unlikeness([look_of(view) for view in views], 0.25)
+    # The last two views show again what the first two did.
+    assert far[0, 18] < 0.1
+    assert far[1, 19] < 0.1
+    others = far[0, 3:16]
+    assert far[0, 18] < 0.4 * others.min()
+
+
+def test_exposure_does_not_count():
+    frame = room(0.3, 0)
+    brighter = replace(frame, amplitude_image=3 * frame.amplitude_image)
+    looks = [look_of(surface_map(f, SurfaceOptions(radii=(2,)))) for f in (frame, brighter)]
+    assert unlikeness(looks, 0.25)[0, 1] < 0.01
+
+
+def test_candidates_left_and_came_back(once_round):
+    views, _truth = once_round
+    looks = [look_of(view) for view in views]
+
+    def candidates(looks, possible=lambda i, j: True, known=(), **options):
+        return Appearance(**options).candidates(looks, possible, known)
+
+    pairs, refused = candidates(looks, most=10)
+    assert (0, 18) in pairs
+    assert (1, 19) in pairs
+    assert all(j - i > 3 for i, j in pairs)
+    assert refused == []
+    assert candidates(looks, most=0) == ([], [])
+    assert candidates(looks[:2]) == ([], [])
+    # Standing still is no coming back, and where a loop is known none is looked for.
+    assert candidates([looks[0]] * 8) == ([], [])
+    assert all(j < 16 or i > 3 for i, j in candidates(looks, known=[(0, 18)], most=10)[0])
+    assert len(candidates(looks, most=1)[0]) == 1
+    # What the trajectory forbids takes nobody's place.
+    kept, refused = candidates(looks, lambda i, j: i > 0, most=1)
+    assert kept == [(1, 19)]
+    assert refused == [(0, 18)]
+
+
+def test_drift_grows_with_the_path():
+    options = Appearance(drift=0.1)
+    path = se3.exp(np.linspace(0, 1, 50)[:, None] * np.array([4.0, 0, 0, 0, 0, 0]))
+    assert options.plausible(se3.exp(np.array([0.3, 0, 0, 0, 0, 0])), path, 2.0)
+    assert not options.plausible(se3.exp(np.array([0.5, 0, 0, 0, 0, 0])), path, 2.0)
+    assert options.plausible(se3.exp(np.array([0, 0, 0, 0, 0.15, 0])), path, 2.0)
+    off = se3.exp(np.array([0, 0, 0, 0, 0.25, 0]))
+    assert not options.plausible(off, path, 2.0)
+    assert options.plausible(off, path, 2.0, unsure=0.1)
+
+
+@pytest.mark.parametrize("options", [{"most": -1}, {"unlike": 0.0}, {"drift": 2}, {"shift": 0.6}])
+def test_options_are_checked(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Appearance(**options)
