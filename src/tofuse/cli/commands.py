@@ -288,6 +288,17 @@ def optimize(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def export(arguments: argparse.Namespace) -> int:
+    """``tofuse export``."""
+    from tofuse.results.export import export as export_result
+
+    for path in export_result(
+        arguments.result, arguments.formats, arguments.out, overwrite=arguments.overwrite
+    ):
+        print(path)
+    return 0
+
+
 def experiments(arguments: argparse.Namespace) -> int:
     """``tofuse experiments``."""
     from tofuse.experiments.page import run_experiments

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from tofuse._version import __version__
 
 DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
+EXPORTS = ("pcd", "las", "e57", "obj", "gltf", "kitti", "log")
 
 _EXIT = """\
 exit status:
@@ -47,6 +48,7 @@ def make_parser() -> Parser:
     _noise(commands)
     _evaluate(commands)
     _optimize(commands)
+    _export(commands)
     _experiments(commands)
     return parser
 
@@ -209,6 +211,16 @@ def _optimize(commands: Any) -> None:
         "--optimiser", metavar="NAME", help="how (default: levenberg-marquardt; castellani, ...)"
     )
     p.add_argument("--overwrite", action="store_true", help="replace OUT.g2o if it is there")
+
+
+def _export(commands: Any) -> None:
+    p = _command(commands, "export", "write a result in other formats")
+    p.add_argument("result", type=Path, metavar="DIR", help="the --out of `tofuse run`")
+    p.add_argument("formats", nargs="+", metavar="FORMAT", help=", ".join(EXPORTS))
+    p.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the files (beside the result)"
+    )
+    p.add_argument("--overwrite", action="store_true", help="replace files that are there")
 
 
 def _experiments(commands: Any) -> None:

@@ -1,7 +1,8 @@
-"""glTF 2.0 in one binary file (Khronos Group, 2021): a mesh with normals and vertex colours."""
+"""glTF 2.0 in one file (Khronos Group, 2021): a mesh with normals and colours or a texture."""
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from pathlib import Path
@@ -11,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.atomic import write_bytes
+from tofuse.files.atomic import write_bytes, write_text
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
+_LINEAR, _CLAMP = 9729, 33071
 
 
 def write_glb(
@@ -24,6 +26,8 @@ def write_glb(
     *,
     normals: ArrayLike | None = None,
     color: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
+    texture: bytes | None = None,
     name: str = "model",
     generator: str = "tofuse",
 ) -> None:
@@ -41,18 +45,65 @@ def write_glb(
         (N, 3) unit normals.
     color
         (N, 3) uint8 RGB as shown on a screen (sRGB); the file holds linear light.
+    uv
+        (N, 2) places in the texture, from its upper left corner, 0 to 1.
+    texture
+        A PNG or JPEG file.
 
     Raises
     ------
     InputError
         If the shapes disagree.
     """
+    document, body = _document(path, points, faces, normals, color, uv, texture, name, generator)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    if body:
+        chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
+    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def write_gltf(
+    path: str | Path,
+    points: ArrayLike,
+    faces: ArrayLike,
+    *,
+    normals: ArrayLike | None = None,
+    color: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
+    texture: bytes | None = None,
+    name: str = "model",
+    generator: str = "tofuse",
+) -> None:
+    """Write a mesh as `write_glb` does, as one file of JSON with all data inside as base64."""
+    document, body = _document(path, points, faces, normals, color, uv, texture, name, generator)
+    for buffer in document.get("buffers", ()):
+        text = base64.b64encode(body).decode()
+        buffer["uri"] = f"data:application/octet-stream;base64,{text}"
+    write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def _document(
+    path: str | Path,
+    points: ArrayLike,
+    faces: ArrayLike,
+    normals: ArrayLike | None,
+    color: ArrayLike | None,
+    uv: ArrayLike | None,
+    texture: bytes | None,
+    name: str,
+    generator: str,
+) -> tuple[dict[str, Any], bytes]:
+    """What glTF says of a mesh, and its buffer."""
     points, faces = np.asarray(points, np.float32), np.asarray(faces)
     columns: dict[str, NDArray[np.generic]] = {"POSITION": points}
     if normals is not None:
         columns["NORMAL"] = np.asarray(normals, np.float32)
     if color is not None:
         columns["COLOR_0"] = _linear(np.asarray(color, np.uint8))
+    if uv is not None:
+        columns["TEXCOORD_0"] = np.asarray(uv, np.float32)
     for what, values in columns.items():
         if values.shape[:1] != points.shape[:1] or values.ndim != 2 or points.shape[1:] != (3,):
             raise InputError(
@@ -67,59 +118,49 @@ def write_glb(
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": generator},
         "scene": 0,
-        "scenes": [{"nodes": []}],
+        "scenes": [{}],
     }
-    body = bytearray()
     if len(faces) == 0:
-        del document["scenes"][0]["nodes"]
-    else:
-        document["scenes"] = [{"nodes": [0]}]
-        document["nodes"] = [{"mesh": 0, "name": name}]
-        parts = [*columns.values(), faces.astype("<u4").reshape(-1, 1)]
-        views, accessors = [], []
-        for k, values in enumerate(parts):
-            data = np.ascontiguousarray(values).tobytes()
-            is_index = k == len(columns)
-            target = _INDICES if is_index else _VERTICES
-            views.append(
-                {"buffer": 0, "byteOffset": len(body), "byteLength": len(data), "target": target}
-            )
-            body += data
-            accessors.append(_accessor(k, values))
-        # Asked for by the standard, for positions.
-        accessors[0] |= {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
-        document["materials"] = [
-            {
-                "name": "surface",
-                "doubleSided": True,
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-            }
+        return document, b""
+    body = bytearray()
+    views: list[dict[str, Any]] = []
+    accessors = []
+
+    def keep(data: bytes, **more: int) -> None:
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data), **more})
+        body.extend(data + b"\0" * (-len(data) % 4))
+
+    parts = [*columns.values(), faces.astype("<u4").reshape(-1, 1)]
+    for k, values in enumerate(parts):
+        keep(
+            np.ascontiguousarray(values).tobytes(),
+            target=_INDICES if k == len(columns) else _VERTICES,
+        )
+        accessors.append(_accessor(k, values))
+    # Asked for by the standard, for positions.
+    accessors[0] |= {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    if texture is not None:
+        keep(texture)
+        kind = "image/png" if texture.startswith(b"\x89PNG") else "image/jpeg"
+        document["images"] = [{"bufferView": len(views) - 1, "mimeType": kind}]
+        document["samplers"] = [
+            {"magFilter": _LINEAR, "minFilter": _LINEAR, "wrapS": _CLAMP, "wrapT": _CLAMP}
         ]
-        attributes = {what: k for k, what in enumerate(columns)}
-        document["meshes"] = [
-            {
-                "name": name,
-                "primitives": [
-                    {
-                        "attributes": attributes,
-                        "indices": len(columns),
-                        "material": 0,
-                        "mode": 4,
-                    }
-                ],
-            }
-        ]
-        document |= {
-            "accessors": accessors,
-            "bufferViews": views,
-            "buffers": [{"byteLength": len(body)}],
-        }
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    if body:
-        chunks += struct.pack("<I4s", len(body), b"BIN\0") + bytes(body)
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        document["textures"] = [{"source": 0, "sampler": 0}]
+        surface["baseColorTexture"] = {"index": 0}
+    attributes = {what: k for k, what in enumerate(columns)}
+    primitive = {"attributes": attributes, "indices": len(columns), "material": 0, "mode": 4}
+    document |= {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": name}],
+        "materials": [{"name": "surface", "doubleSided": True, "pbrMetallicRoughness": surface}],
+        "meshes": [{"name": name, "primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }
+    return document, bytes(body)
 
 
 def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
@@ -129,7 +170,7 @@ def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
         "bufferView": view,
         "componentType": component[code],
         "count": len(values),
-        "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+        "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
     }
     if code == "u2":
         accessor["normalized"] = True

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
+from tofuse.files.atomic import write_bytes
 from tofuse.files.reading import read_bytes
 
 Float32 = NDArray[np.float32]
@@ -19,6 +21,7 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 MAX_POINTS = 1 << 28
+_NORMALS = ("normal_x", "normal_y", "normal_z")
 _HEADER_LIMIT = 1 << 16
 _COPY_AGAIN = "copy or export the file again"
 _TYPES = {
@@ -60,10 +63,9 @@ class Pcd:
     @property
     def normals(self) -> Float32 | None:
         """(N, 3) float32, or None."""
-        names = ("normal_x", "normal_y", "normal_z")
-        if not all(name in self.fields for name in names):
+        if not all(name in self.fields for name in _NORMALS):
             return None
-        return np.stack([self.fields[name] for name in names], -1).astype(np.float32)
+        return np.stack([self.fields[name] for name in _NORMALS], -1).astype(np.float32)
 
     @property
     def color(self) -> UInt8 | None:
@@ -246,3 +248,58 @@ def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[
             columns.append(column if count > 1 else column[:, 0])
             at += count
     return columns
+
+
+def write_pcd(
+    path: str | Path,
+    points: ArrayLike,
+    *,
+    normals: ArrayLike | None = None,
+    color: ArrayLike | None = None,
+    scalars: Mapping[str, ArrayLike] | None = None,
+) -> None:
+    """Write an unordered cloud, version 0.7, binary.
+
+    Parameters
+    ----------
+    path
+        The file; see `replacing` for errors.
+    points
+        (N, 3), written as float32.
+    normals
+        (N, 3), written as normal_x normal_y normal_z.
+    color
+        (N, 3) uint8 RGB, written as PCL does: packed into the bits of a float called rgb.
+    scalars
+        More (N,) columns by name; whole numbers are written as 32 bits, others as float32.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    for names, values in ((("x", "y", "z"), points), (_NORMALS, normals)):
+        if values is not None:
+            table = np.asarray(values, "<f4")
+            columns |= {name: table[:, k] for k, name in enumerate(names)}
+    if color is not None:
+        r, g, b = np.asarray(color, np.uint32).T
+        columns["rgb"] = (r << 16 | g << 8 | b).astype("<u4").view("<f4")
+    for name, values in (scalars or {}).items():
+        column = np.asarray(values)
+        columns[name] = column.astype({"i": "<i4", "u": "<u4"}.get(column.dtype.kind, "<f4"))
+    count = len(columns["x"])
+    rows = np.empty(count, [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    kinds = [column.dtype.kind.upper() for column in columns.values()]
+    header = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(columns)}",
+        f"SIZE {' '.join('4' for _ in columns)}",
+        f"TYPE {' '.join(kinds)}",
+        f"COUNT {' '.join('1' for _ in columns)}",
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        "DATA binary\n",
+    ]
+    write_bytes(path, "\n".join(header).encode() + rows.tobytes())

@@ -86,6 +86,36 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
     return "".join(" ".join(exact(v) for v in row) + "\n" for row in table)
 
 
+def write_kitti(path: str | Path, poses: ArrayLike) -> None:
+    """Write (N, 4, 4) T_world_camera as KITTI's odometry has them: the upper 3 x 4, row by row.
+
+    The format has no times and no gaps: poses that are NaN are left out.
+    """
+    T = _known(poses)
+    rows = T[:, :3].reshape(-1, 12).tolist()
+    write_text(path, "".join(" ".join(exact(v) for v in row) + "\n" for row in rows))
+
+
+def write_log(path: str | Path, poses: ArrayLike, numbers: ArrayLike) -> None:
+    """Write (N, 4, 4) T_world_camera as a trajectory of Open3D; poses that are NaN are left out.
+
+    Parameters
+    ----------
+    numbers
+        (N,) of the frames: each pose has a line `n n n+1` before its matrix.
+    """
+    known = np.isfinite(np.asarray(poses, float)).all((1, 2))
+    lines = []
+    for n, T in zip(np.asarray(numbers)[known].tolist(), _known(poses).tolist(), strict=True):
+        lines += [f"{n} {n} {n + 1}", *(" ".join(exact(v) for v in row) for row in T)]
+    write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+def _known(poses: ArrayLike) -> Float64:
+    T = np.asarray(poses, float)
+    return np.asarray(T[np.isfinite(T).all((1, 2))], np.float64)
+
+
 def associate(
     timestamps: ArrayLike,
     others: ArrayLike,

@@ -32,15 +32,24 @@ CHECKPOINT = f"{UNFINISHED}checkpoint"  # what a run has so far
 _ASIDE, _FORWARD, _BACK = "replaced", "plan.json", "undo.json"  # in the staging folder
 RECORDING = "recording"  # what `tofuse demo` puts beside its result
 
-# What a run may write; of an earlier result nothing of it stays.
+# What `tofuse run` and `tofuse export` may write; of an earlier result nothing of it stays.
 FILES = (
     "trajectory.txt",
     "pose_graph.g2o",
     "cloud.ply",
     "mesh.ply",
     "mesh.glb",
+    "mesh.obj",
+    "mesh.mtl",
+    "mesh.png",
     "report.html",
     "run.json",
+    "cloud.pcd",
+    "cloud.las",
+    "cloud.e57",
+    "mesh.gltf",
+    "trajectory.kitti.txt",
+    "trajectory.log",
 )
 
 
