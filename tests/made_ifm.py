@@ -39,16 +39,20 @@ def chunk(kind: int, content: bytes, size: tuple[int, int], format_: int, k: int
     return struct.pack("<12I", *words) + about + content
 
 
+def head_info(unit: float = UNIT, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes:
+    """Chunk 420: what the head says of a frame."""
+    info = struct.pack("<I2f3f6fI32f", 1, unit, 1e-8, 1, 1, 1, *([0.0] * 6), model,
+                       *numbers, *([0.0] * 22))  # fmt: skip
+    return info + bytes(4 + 128)  # the lens the other way round, which isn't used
+
+
 def frame(k: int, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes:
     size = (WIDTH, HEIGHT)
-    info = struct.pack("<I2f3f6fI32f", 1, UNIT, 1e-8, 1, 1, 1, *([0.0] * 6), model,
-                       *numbers, *([0.0] * 22))  # fmt: skip
-    info += bytes(4 + 128)  # the lens the other way round, which isn't used
     data = chunk(100, COUNTS[k].astype("<u2").tobytes(), size, 2, k)
     data += chunk(105, NOISE[k].astype("<u2").tobytes(), size, 2, k)
     data += chunk(101, AMPLITUDE[k].astype("<u2").tobytes(), size, 2, k)
     data += chunk(300, FLAGS[k].tobytes(), size, 0, k)
-    data += chunk(420, info, size, 0, k)
+    data += chunk(420, head_info(model=model, numbers=numbers), size, 0, k)
     length = len(data) + 14
     return b"0000L%09d\r\n0000star" % length + data + b"stop\r\n"
 

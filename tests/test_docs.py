@@ -38,6 +38,7 @@ PART_ROOMS = (
     "tofuse.odometry",
     "tofuse.posegraph",
     "tofuse.recordings.readers",
+    "tofuse.live.devices",
 )
 
 

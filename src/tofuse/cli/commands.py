@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +164,61 @@ def convert(arguments: argparse.Namespace) -> int:
     for warning in (*recording.warnings, *done.warnings):
         console.print(f"[yellow]warning:[/] {_escape(warning)}")
     return 0
+
+
+def record(arguments: argparse.Namespace) -> int:
+    """``tofuse record``."""
+    from tofuse.errors import InputError
+    from tofuse.live.device import device, devices, is_installed
+    from tofuse.live.recorder import record as record_stream
+
+    console = _Output(highlight=False, soft_wrap=True)
+    if arguments.device is None:
+        table = Table("camera", "needs", "")
+        for name, kind in devices().items():
+            installed = "installed" if is_installed(kind) else "not installed"
+            table.add_row(name, f"pip install {kind.package[0]}", installed)
+        console.print(table)
+        return 0
+    if arguments.out is None:
+        raise InputError("is missing", where="--out", remedy="give a new folder")
+    options = dict(part.partition("=")[::2] for part in arguments.set)
+    with (
+        device(arguments.device, options).open() as stream,
+        _interrupted() as asked,
+        progress_for(as_json=False) as progress,
+    ):
+        progress.stage("recording, Ctrl-C ends", arguments.frames)
+        done = record_stream(
+            stream,
+            arguments.out,
+            seconds=arguments.seconds,
+            frames=arguments.frames,
+            stopped=asked.is_set,
+            progress=lambda _: progress.advance(),
+        )
+    console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
+    if done.dropped:
+        console.print(f"[yellow]warning:[/] {done.dropped} frames dropped: the disk was too slow")
+    if done.ended_by != "asked":
+        console.print(f"[yellow]warning:[/] {_escape(done.ended_by)}")
+    return 0
+
+
+@contextmanager
+def _interrupted() -> Iterator[threading.Event]:
+    """Give an event that Ctrl-C sets: what was recorded is kept. A second one ends at once."""
+    event = threading.Event()
+
+    def ask(number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, before)
+        event.set()
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def noise(arguments: argparse.Namespace) -> int:

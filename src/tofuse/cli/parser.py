@@ -45,6 +45,7 @@ def make_parser() -> Parser:
     _simulate(commands)
     _inspect(commands)
     _convert(commands)
+    _record(commands)
     _noise(commands)
     _evaluate(commands)
     _optimize(commands)
@@ -182,6 +183,23 @@ def _convert(commands: Any) -> None:
     p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
 
 
+def _record(commands: Any) -> None:
+    p = _command(commands, "record", "record from a camera that is plugged in")
+    p.add_argument(
+        "device", nargs="?", metavar="CAMERA", help="which; without, those that can be used"
+    )
+    p.add_argument("--out", type=Path, metavar="DIR", help="a new folder for the recording")
+    p.add_argument("--seconds", type=_seconds, metavar="S", help="stop after this time")
+    p.add_argument("--frames", type=_count, metavar="N", help="stop after so many frames")
+    p.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="an option of the camera, such as serial=1234; may be repeated",
+    )
+
+
 def _noise(commands: Any) -> None:
     p = _command(commands, "noise", "estimate a camera's noise from a recording that stands still")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
@@ -251,6 +269,16 @@ def _seed_number(text: str) -> int:
     value = _whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
     return value
 
 

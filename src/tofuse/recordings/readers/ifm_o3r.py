@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,10 +12,9 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.files.pcic import BEGIN, Chunk, chunk_image, pcic_frames
 from tofuse.files.reading import read_bytes, read_head
-from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
-from tofuse.recordings.camera_file import MAX_SLOPE
 from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FileSource
@@ -25,12 +22,9 @@ from tofuse.recordings.sources import FileSource
 Float64 = NDArray[np.float64]
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
-BOUGUET, FISHEYE = 0, 2
 INVALID = 1  # bit of the confidence
 
 _MAX_BYTES = 2 << 30
-# version, units of distance and amplitude, 3 factors, 6 of the mounting, then model and numbers.
-_INFO = struct.Struct("<I2f3f6fI32f")
 
 
 @part("reader", "ifm-o3r", label="validated")
@@ -117,7 +111,7 @@ class IfmO3rSource(FileSource):
         return RangeFrame(
             index,
             float(self.timestamps[index]),
-            _camera(info.model, info.numbers, counts.shape[1], counts.shape[0], where),
+            head_camera(info, counts.shape[1], counts.shape[0], str(self.path)),
             distance,
             "range",
             amplitude,
@@ -135,66 +129,8 @@ class IfmO3rSource(FileSource):
         return image
 
 
-@dataclass(frozen=True)
-class _Info:
-    distance_unit_m: float
-    model: int
-    numbers: tuple[float, ...]
-
-
-def _info(data: bytes, chunk: Chunk, where: str) -> _Info:
-    """Read what the head says of a frame: the unit of its distances, and its lens."""
-    if chunk.end - chunk.start < _INFO.size:
-        raise InputError(f"chunk {INFO} is cut off", where=where, remedy="copy the file again")
-    _, unit, *rest = _INFO.unpack_from(data, chunk.start)
-    model, numbers = rest[10], tuple(rest[11:21])
-    if not 1e-6 < unit < 1 or not np.isfinite(numbers).all():
-        raise InputError(f"chunk {INFO} makes no sense", where=where, remedy="copy it again")
-    return _Info(float(unit), int(model), numbers)
-
-
-@lru_cache(maxsize=16)
-def _camera(
-    model: int, numbers: tuple[float, ...], width: int, height: int, where: str
-) -> RayTable:
-    """Return the rays (H, W) of a lens, by the maker's model for image to space.
-
-    The polynomials work from pixel to ray, unlike OpenCV's, and count pixels from their corner.
-    """
-    if model not in (BOUGUET, FISHEYE):
-        raise InputError(f"has the lens model {model}, not 0 or 2", where=where)
-    fx, fy, mx, my, skew, *k = numbers
-    if not (1 < fx < 1e5 and 1 < fy < 1e5):
-        raise InputError(f"has focal lengths of {fx:g} and {fy:g} pixels", where=where)
-    v, u = np.mgrid[:height, :width] + 0.5
-    y = (v - my) / fy
-    x = (u - mx) / fx - skew * y
-    with np.errstate(all="ignore"):
-        rays = _bouguet(x, y, k) if model == BOUGUET else _fisheye(x, y, k)
-        rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
-    return RayTable(rays.astype(np.float32))
-
-
-def _bouguet(x: Float64, y: Float64, k: list[float]) -> Float64:
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-    return np.stack(
-        [
-            radial * x + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
-            radial * y + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
-        ],
-        -1,
-    )
-
-
-def _fisheye(x: Float64, y: Float64, k: list[float]) -> Float64:
-    """Angle by a polynomial in the distance from the centre, which k[4] limits."""
-    radius = np.hypot(x, y)
-    s = np.minimum(radius, k[4]) ** 2
-    theta = radius * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
-    scale = np.where(radius > 0, np.tan(theta) / np.where(radius > 0, radius, 1), 1.0)
-    scale[~((theta >= 0) & (theta < np.pi / 2))] = np.nan
-    return np.stack([x * scale, y * scale], -1)
+def _info(data: bytes, chunk: Chunk, where: str) -> HeadInfo:
+    return read_info(data[chunk.start : chunk.end], f"{where}: chunk {INFO}")
 
 
 def _times(frames: list[dict[int, Chunk] | InputError]) -> Float64:

@@ -1,0 +1,151 @@
+"""Orbbec's cameras (Femto, Gemini, Astra) by pyorbbecsdk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
+from tofuse.live.device import (
+    TIMEOUT_S,
+    DeviceError,
+    Settings,
+    Stream,
+    no_frame,
+    not_started,
+    vendor,
+)
+from tofuse.parts import part
+from tofuse.recordings.frames import RangeFrame
+
+_POLL_MS = 100
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+@part("device", "orbbec")
+@dataclass(frozen=True)
+class Orbbec:
+    """A camera of Orbbec: depth, and the infrared image of the same sensor where there is one.
+
+    Attributes
+    ----------
+    infrared
+        Whether to take that image too.
+    """
+
+    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk", "pyorbbecsdk")
+    infrared: bool = True
+
+    def open(self) -> OrbbecStream:
+        """See `Device.open`."""
+        return OrbbecStream(self)
+
+
+class OrbbecStream(Stream):
+    """See `Stream`."""
+
+    def __init__(self, options: Orbbec) -> None:
+        ob: Any = vendor(options.package)
+        try:
+            self._pipeline = ob.Pipeline()
+            config = ob.Config()
+            profile = _default(self._pipeline, ob.OBSensorType.DEPTH_SENSOR)
+            config.enable_stream(profile)
+            size = (int(profile.get_width()), int(profile.get_height()))
+            self._infrared = options.infrared and _add_infrared(ob, self._pipeline, config, size)
+            self._pipeline.start(config)
+        except ob.OBError as error:
+            raise not_started("Orbbec", error) from error
+        try:
+            depth = self._frames().get_depth_frame()
+            name = self._pipeline.get_device().get_device_info().get_name()
+            self.settings = Settings(
+                str(name),
+                _camera(profile.get_intrinsic(), profile.get_distortion(), size),
+                float(depth.get_depth_scale()) / 1000.0,
+                "z",
+                float(profile.get_fps()),
+                "ir" if self._infrared else None,
+            )
+        except BaseException:
+            self._pipeline.stop()
+            raise
+
+    def read(self, index: int) -> RangeFrame:
+        """See `Stream.read`."""
+        frames = self._frames()
+        depth = frames.get_depth_frame()
+        amplitude = None
+        if self._infrared:
+            infrared = frames.get_ir_frame()
+            amplitude = (
+                np.zeros((self.settings.camera.height, self.settings.camera.width), np.float32)
+                if infrared is None
+                else _image(infrared)
+            )
+        return RangeFrame(
+            index,
+            depth.get_timestamp() / 1000.0,
+            self.settings.camera,
+            _image(depth) * np.float32(self.settings.depth_unit_m),
+            "z",
+            amplitude,
+            amplitude_kind="ir",
+        )
+
+    def close(self) -> None:
+        """See `Stream.close`."""
+        self._pipeline.stop()
+
+    def _frames(self) -> Any:
+        """Wait for frames with depth: a camera that warms up, or a lost one, gives None."""
+        end = monotonic() + TIMEOUT_S
+        while monotonic() < end:
+            frames = self._pipeline.wait_for_frames(_POLL_MS)
+            if frames is not None and frames.get_depth_frame() is not None:
+                return frames
+        raise no_frame("Orbbec")
+
+
+def _default(pipeline: Any, sensor: Any) -> Any:
+    return pipeline.get_stream_profile_list(sensor).get_default_video_stream_profile()
+
+
+def _add_infrared(ob: Any, pipeline: Any, config: Any, size: tuple[int, int]) -> bool:
+    """Ask for the infrared image, if the camera has one whose pixels are those of depth."""
+    try:
+        profile = _default(pipeline, ob.OBSensorType.IR_SENSOR)
+    except ob.OBError:
+        return False
+    if (profile.get_width(), profile.get_height()) != size:
+        return False
+    config.enable_stream(profile)
+    return True
+
+
+def _image(frame: Any) -> NDArray[np.float32]:
+    height, width = int(frame.get_height()), int(frame.get_width())
+    data = np.frombuffer(frame.get_data(), np.uint8)
+    if data.size == 2 * height * width:
+        data = data.view(np.uint16)
+    if data.size != height * width:
+        raise DeviceError(
+            f"sent {data.size} bytes for {width} x {height} pixels",
+            where="Orbbec",
+            remedy="choose an uncompressed format (Y16, Y8) in the camera's settings",
+        )
+    return data.reshape(height, width).astype(np.float32)
+
+
+def _camera(lens: Any, distortion: Any, size: tuple[int, int]) -> Camera:
+    focal = (float(lens.fx), float(lens.fy), float(lens.cx), float(lens.cy))
+    k = [float(getattr(distortion, name)) for name in _DISTORTION]
+    if any(k[5:]):
+        return Rational(*size, *focal, *k)
+    if any(k):
+        return BrownConrady(*size, *focal, *k[:5])
+    return Pinhole(*size, *focal)

@@ -1,0 +1,148 @@
+"""Cameras of Intel RealSense by pyrealsense2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, RayTable
+from tofuse.live.device import (
+    TIMEOUT_S,
+    DeviceError,
+    Settings,
+    Stream,
+    no_frame,
+    not_started,
+    vendor,
+)
+from tofuse.parts import part
+from tofuse.recordings.frames import RangeFrame
+
+
+@part("device", "realsense")
+@dataclass(frozen=True)
+class RealSense:
+    """A RealSense: depth, and the infrared image where it is a time-of-flight camera (L515).
+
+    Attributes
+    ----------
+    serial
+        Of the camera, where several are plugged in.
+    width, height
+        Of the depth image; 0 leaves the choice to the camera.
+    frame_rate_hz
+        Whole number; as the camera offers it.
+    """
+
+    package: ClassVar[tuple[str, str]] = ("pyrealsense2", "pyrealsense2")
+    serial: str = ""
+    width: int = 0
+    height: int = 0
+    frame_rate_hz: int = 30
+
+    def open(self) -> RealSenseStream:
+        """See `Device.open`."""
+        return RealSenseStream(self)
+
+
+class RealSenseStream(Stream):
+    """See `Stream`."""
+
+    def __init__(self, options: RealSense) -> None:
+        rs: Any = vendor(options.package)
+        self._pipeline = rs.pipeline()
+        config = rs.config()
+        if options.serial:
+            config.enable_device(options.serial)
+        size = (options.width, options.height)
+        try:
+            self._infrared = _is_tof(rs, options.serial)
+            config.enable_stream(rs.stream.depth, *size, rs.format.z16, options.frame_rate_hz)
+            if self._infrared:
+                config.enable_stream(rs.stream.infrared, *size, rs.format.y8, options.frame_rate_hz)
+            profile = self._pipeline.start(config)
+        except RuntimeError as error:
+            raise not_started("RealSense", error) from error
+        try:
+            device = profile.get_device()
+            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile()
+            self.settings = Settings(
+                str(device.get_info(rs.camera_info.name)),
+                _camera(rs, stream.get_intrinsics()),
+                float(device.first_depth_sensor().get_depth_scale()),
+                "z",
+                float(stream.fps()),
+                "ir" if self._infrared else None,
+            )
+        except BaseException:
+            self._pipeline.stop()
+            raise
+
+    def read(self, index: int) -> RangeFrame:
+        """See `Stream.read`."""
+        try:
+            frames = self._pipeline.wait_for_frames(int(TIMEOUT_S * 1000))
+        except RuntimeError as error:
+            raise no_frame(self.settings.sensor) from error
+        depth = frames.get_depth_frame()
+        counts = np.asanyarray(depth.get_data()).astype(np.float32)
+        amplitude = None
+        if self._infrared:
+            amplitude = np.asanyarray(frames.get_infrared_frame().get_data()).astype(np.float32)
+        return RangeFrame(
+            index,
+            depth.get_timestamp() / 1000.0,
+            self.settings.camera,
+            counts * np.float32(self.settings.depth_unit_m),
+            "z",
+            amplitude,
+            amplitude_kind="ir",
+        )
+
+    def close(self) -> None:
+        """See `Stream.close`."""
+        self._pipeline.stop()
+
+
+def _is_tof(rs: Any, serial: str) -> bool:
+    """Return whether the camera is of the L500 line: only there does infrared fit the depth."""
+    cameras = [
+        camera
+        for camera in rs.context().query_devices()
+        if serial in ("", camera.get_info(rs.camera_info.serial_number))
+    ]
+    if not cameras:
+        raise DeviceError(
+            f"no camera {serial} is plugged in" if serial else "no camera is plugged in",
+            where="RealSense",
+            remedy="plug it in, or give its --serial",
+        )
+    return str(cameras[0].get_info(rs.camera_info.product_line)) == "L500"
+
+
+def _camera(rs: Any, lens: Any) -> Camera:
+    size = (int(lens.width), int(lens.height))
+    focal = (float(lens.fx), float(lens.fy), float(lens.ppx), float(lens.ppy))
+    k = [float(c) for c in lens.coeffs]
+    if lens.model == rs.distortion.none or not any(k):
+        return Pinhole(*size, *focal)
+    if lens.model == rs.distortion.brown_conrady:
+        return BrownConrady(*size, *focal, *k)
+    if lens.model == rs.distortion.inverse_brown_conrady:
+        return _inverse_brown(BrownConrady(*size, *focal, *k))
+    raise DeviceError(
+        f"has a lens of the model {lens.model}",
+        where="RealSense",
+        remedy="record the stream that is not distorted, or give a camera.json with rays",
+    )
+
+
+def _inverse_brown(lens: BrownConrady) -> RayTable:
+    """Return the camera whose polynomial leads from the pixel to the ray, not the other way."""
+    focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
+    v, u = np.mgrid[: lens.height, : lens.width]
+    slopes = (np.stack([u, v], axis=-1) - centre) / focal
+    points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    return RayTable(((lens.project(points) - centre) / focal).astype(np.float32))

@@ -1,0 +1,71 @@
+"""A recording played as if its camera were plugged in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.recording import Recording
+
+
+@dataclass
+class Player:
+    """Gives each frame when its time has come, and drops those that nobody asked for in time.
+
+    A camera does not wait: whoever comes back late gets the newest frame. Iterate over it, and push
+    the frames into a `Mapper`.
+
+    Attributes
+    ----------
+    recording
+        What to play. Its timestamps must not go back.
+    speed
+        How many times faster than it was recorded.
+    dropped
+        Indices (in the source) of the frames dropped so far, those that can't be read among them.
+
+    Raises
+    ------
+    InputError
+        If the timestamps or the speed can't be played by.
+    """
+
+    recording: Recording
+    speed: float = 1.0
+    clock: Callable[[], float] = time.perf_counter
+    sleep: Callable[[float], None] = time.sleep
+    dropped: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if not self.speed > 0:
+            raise InputError(f"is {self.speed}", where="speed", remedy="give more than 0")
+        if (np.diff(self.recording.timestamps) < 0).any():
+            raise InputError(
+                "has timestamps that go back, so it can't be played",
+                where=self.recording.path,
+                remedy="sort its frames by time",
+            )
+
+    def __iter__(self) -> Iterator[Frame]:
+        due = (self.recording.timestamps - self.recording.timestamps[0]) / self.speed
+        start = self.clock()
+        k = 0
+        while k < len(due):
+            now = self.clock() - start
+            # The newest frame that has come by now; if none is new, the next one is waited for.
+            newest = max(int(np.searchsorted(due, now, side="right")) - 1, k)
+            self.dropped += self.recording.indices[k:newest].tolist()
+            if due[newest] > now:
+                self.sleep(due[newest] - now)
+            try:
+                frame = self.recording[newest]
+            except UnreadableFrameError:
+                self.dropped.append(int(self.recording.indices[newest]))
+            else:
+                yield frame
+            k = newest + 1

@@ -1,0 +1,179 @@
+"""From a camera into a native recording."""
+
+from __future__ import annotations
+
+import queue
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.errors import InputError, OutputError
+from tofuse.files.atomic import make_folder
+from tofuse.live.device import DeviceError, Stream
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import RecordingWriter
+
+WAITING = 64  # frames that may wait for the disk
+FINEST_SIGMA_M = 1e-5
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What came of it.
+
+    Attributes
+    ----------
+    folder
+        The recording.
+    frames
+        Written.
+    dropped
+        That the disk was too slow for.
+    ended_by
+        Why it ended: "asked", or what the camera's error says.
+    """
+
+    folder: Path
+    frames: int
+    dropped: int
+    ended_by: str
+
+
+def record(
+    stream: Stream,
+    folder: str | Path,
+    *,
+    seconds: float | None = None,
+    frames: int | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], None] | None = None,
+) -> Recorded:
+    """Write what a camera sends as a native recording.
+
+    The camera is read on a thread of its own, so that a slow disk costs frames and not time.
+    What was recorded until the camera failed is kept. The folder appears when all is written.
+
+    Parameters
+    ----------
+    stream
+        A camera that is sending.
+    folder
+        Must not be there, or be empty.
+    seconds, frames
+        When to end: by the camera's clock, and by count; None: no limit.
+    stopped
+        Asked after each frame.
+    progress
+        Called with the number of frames written so far.
+
+    Raises
+    ------
+    DeviceError
+        If the camera sent no frame at all.
+    OutputError
+        If the folder isn't empty, or can't be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError("isn't empty", where=folder, remedy="choose a new folder")
+    if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
+        raise InputError("nothing is to be recorded", remedy="give more seconds, or frames")
+    make_folder(folder.absolute().parent)
+    beside = Path(tempfile.mkdtemp(prefix=".tofuse-", dir=folder.absolute().parent))
+    reader = _Reader(stream)
+    try:
+        first = reader.next()
+        if first is None:
+            raise reader.error or DeviceError("sent no frame", where=stream.settings.sensor)
+        made = beside / "recording"
+        writer = _writer(stream, first, made)
+        frame: RangeFrame | None = first
+        while frame is not None:
+            if seconds is not None and frame.timestamp - first.timestamp >= seconds:
+                break
+            writer.add(frame)
+            if progress is not None:
+                progress(len(writer))
+            if len(writer) == frames or stopped():
+                break
+            frame = reader.next()
+        ended = str(reader.error) if frame is None and reader.error else "asked"
+        writer.finish()
+        if folder.exists():
+            folder.rmdir()
+        made.replace(folder)
+    except OSError as error:
+        raise OutputError(f"can't be written ({error})", where=folder) from error
+    finally:
+        reader.end()
+        shutil.rmtree(beside, ignore_errors=True)
+    return Recorded(folder, len(writer), reader.dropped, ended)
+
+
+class _Reader:
+    """Reads a camera on a thread, into a queue that forgets the newest when it is full."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.dropped = 0
+        self.error: DeviceError | None = None
+        self._stream = stream
+        self._queue: queue.Queue[RangeFrame | None] = queue.Queue(WAITING)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="tofuse-camera", daemon=True)
+        self._thread.start()
+
+    def next(self) -> RangeFrame | None:
+        """Wait for the next frame; None when the camera has failed."""
+        return self._queue.get()
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        index = 0
+        try:
+            while not self._stop.is_set():
+                frame = self._stream.read(index)
+                index += 1
+                try:
+                    self._queue.put_nowait(frame)
+                except queue.Full:
+                    self.dropped += 1
+        except DeviceError as error:
+            self.error = error
+        except Exception as error:  # the maker's package may raise anything
+            self.error = DeviceError(
+                f"failed ({type(error).__name__}: {error})", where=self._stream.settings.sensor
+            )
+        while not self._stop.is_set():
+            try:
+                self._queue.put(None, timeout=0.1)
+                return
+            except queue.Full:
+                time.sleep(0)
+
+
+def _writer(stream: Stream, first: RangeFrame, folder: Path) -> RecordingWriter:
+    about = stream.settings
+    sigma_unit = None
+    if first.sigma_image is not None:
+        largest = float(np.nanmax(first.sigma_image, initial=0.0))
+        # Later frames may be noisier than the first.
+        sigma_unit = max(FINEST_SIGMA_M, 4 * largest / 65535)
+    return RecordingWriter(
+        folder,
+        about.camera,
+        depth_unit_m=about.depth_unit_m,
+        depth_kind=about.depth_kind,
+        frame_rate_hz=about.frame_rate_hz,
+        amplitude_kind=about.amplitude_kind,
+        sensor=about.sensor,
+        sigma_unit_m=sigma_unit,
+    )

@@ -1,0 +1,89 @@
+"""The lens of ifm's O3R heads, as each frame brings it."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import RayTable
+from tofuse.recordings.camera_file import MAX_SLOPE
+
+Float64 = NDArray[np.float64]
+
+BOUGUET, FISHEYE = 0, 2
+# version, units of distance and amplitude, 3 factors, 6 of the mounting, then model and numbers.
+_INFO = struct.Struct("<I2f3f6fI32f")
+
+
+@dataclass(frozen=True)
+class HeadInfo:
+    """Unit of the distances in m, and model and numbers of the lens."""
+
+    distance_unit_m: float
+    model: int
+    numbers: tuple[float, ...]
+
+
+def read_info(data: bytes, where: str) -> HeadInfo:
+    """Read what the head says of a frame (chunk 420): the unit of its distances, and its lens.
+
+    Raises
+    ------
+    InputError
+        If it is cut off or makes no sense.
+    """
+    if len(data) < _INFO.size:
+        raise InputError("is cut off", where=where, remedy="copy the file again")
+    _, unit, *rest = _INFO.unpack_from(data)
+    model, numbers = rest[10], tuple(rest[11:21])
+    if not 1e-6 < unit < 1 or not np.isfinite(numbers).all():
+        raise InputError("makes no sense", where=where, remedy="copy it again")
+    return HeadInfo(float(unit), int(model), numbers)
+
+
+@lru_cache(maxsize=16)
+def head_camera(info: HeadInfo, width: int, height: int, where: str) -> RayTable:
+    """Return the rays (H, W) of a lens, by the maker's model for image to space.
+
+    The polynomials work from pixel to ray, unlike OpenCV's, and count pixels from their corner.
+    """
+    model = info.model
+    if model not in (BOUGUET, FISHEYE):
+        raise InputError(f"has the lens model {model}, not 0 or 2", where=where)
+    fx, fy, mx, my, skew, *k = info.numbers
+    if not (1 < fx < 1e5 and 1 < fy < 1e5):
+        raise InputError(f"has focal lengths of {fx:g} and {fy:g} pixels", where=where)
+    v, u = np.mgrid[:height, :width] + 0.5
+    y = (v - my) / fy
+    x = (u - mx) / fx - skew * y
+    with np.errstate(all="ignore"):
+        rays = _bouguet(x, y, k) if model == BOUGUET else _fisheye(x, y, k)
+        rays[~(np.abs(rays) < MAX_SLOPE).all(-1)] = np.nan
+    return RayTable(rays.astype(np.float32))
+
+
+def _bouguet(x: Float64, y: Float64, k: list[float]) -> Float64:
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    return np.stack(
+        [
+            radial * x + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
+            radial * y + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
+        ],
+        -1,
+    )
+
+
+def _fisheye(x: Float64, y: Float64, k: list[float]) -> Float64:
+    """Angle by a polynomial in the distance from the centre, which k[4] limits."""
+    radius = np.hypot(x, y)
+    s = np.minimum(radius, k[4]) ** 2
+    theta = radius * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
+    scale = np.where(radius > 0, np.tan(theta) / np.where(radius > 0, radius, 1), 1.0)
+    scale[~((theta >= 0) & (theta < np.pi / 2))] = np.nan
+    return np.stack([x * scale, y * scale], -1)

@@ -1,0 +1,350 @@
+"""Cameras by their makers' packages (stand-ins), recording from them, and playing recordings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tofuse
+from fake_cameras import (
+    HEIGHT,
+    WIDTH,
+    FakeK4A,
+    FakeOrbbec,
+    FakeRealSense,
+    depth_counts,
+    fake_ifm3d,
+    infrared_counts,
+)
+from tofuse.cli import main
+from tofuse.errors import InputError, OutputError
+from tofuse.geometry.cameras import BrownConrady, Pinhole, Rational
+from tofuse.live.device import DeviceError, Stream, device, devices, is_installed
+from tofuse.live.player import Player
+from tofuse.live.recorder import record
+from tofuse.pipeline.mapper import Mapper
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import ArraySource, Recording
+
+Install = Callable[..., None]
+
+
+@pytest.fixture
+def install(monkeypatch: pytest.MonkeyPatch) -> Install:
+    def put(*modules: ModuleType) -> None:
+        for module in modules:
+            module.__spec__ = ModuleSpec(module.__name__, None)
+            monkeypatch.setitem(sys.modules, module.__name__, module)
+
+    monkeypatch.setattr("tofuse.live.devices.orbbec.TIMEOUT_S", 0.05)
+    return put
+
+
+def check_depth(frame: RangeFrame, k: int, unit_m: float) -> None:
+    assert np.allclose(frame.depth, depth_counts(k) * unit_m, atol=1e-6)
+    assert frame.depth[3, 4] == 0
+
+
+def test_realsense(install: Install) -> None:
+    package = FakeRealSense()
+    install(package)
+    with device("realsense", {}).open() as stream:
+        frames = [stream.read(k) for k in range(3)]
+        with pytest.raises(DeviceError, match="sent no frame"):
+            list(stream)
+    assert package.stopped == 1
+    assert package.enabled == ["depth", "infrared"]
+    assert stream.settings.sensor == "Intel RealSense L515"
+    assert stream.settings.camera == Pinhole(WIDTH, HEIGHT, 30.0, 31.0, 15.2, 11.9)
+    check_depth(frames[2], 2, 0.00025)
+    assert np.array_equal(frames[2].amplitude_image, infrared_counts(2))
+    assert frames[1].timestamp - frames[0].timestamp == pytest.approx(1 / 30)
+    assert frames[0].depth_kind == "z"
+
+
+def test_realsense_stereo_has_no_amplitude(install: Install) -> None:
+    """The infrared image of a stereo camera is of another viewpoint."""
+    package = FakeRealSense(line="D400", model="brown_conrady")
+    install(package)
+    with device("realsense", {}).open() as stream:
+        frame = stream.read(0)
+    assert package.enabled == ["depth"]
+    assert frame.amplitude_image is None
+    assert isinstance(stream.settings.camera, BrownConrady)
+    assert stream.settings.camera.k2 == -0.05
+
+
+def test_realsense_inverse_lens_leads_from_pixel_to_ray(install: Install) -> None:
+    install(FakeRealSense(model="inverse_brown_conrady"))
+    with device("realsense", {}).open() as stream:
+        rays = stream.settings.camera.rays()
+    x, y = (20 - 15.2) / 30.0, (5 - 11.9) / 31.0
+    r2 = x * x + y * y
+    radial = 1 + 0.1 * r2 - 0.05 * r2**2 + 0.01 * r2**3
+    expected = (
+        x * radial + 2 * 0.001 * x * y - 0.002 * (r2 + 2 * x * x),
+        y * radial - 2 * 0.002 * x * y + 0.001 * (r2 + 2 * y * y),
+    )
+    assert np.allclose(rays[5, 20], expected, atol=1e-6)
+
+
+def test_realsense_refusals(install: Install) -> None:
+    package = FakeRealSense(model="ftheta")
+    install(package)
+    with pytest.raises(DeviceError, match="lens of the model ftheta"):
+        device("realsense", {}).open()
+    assert package.stopped == 1  # not left running
+    package.plugged_in = False
+    with pytest.raises(DeviceError, match="no camera is plugged in"):
+        device("realsense", {}).open()
+    with pytest.raises(DeviceError, match="no camera f999 is plugged in"):
+        device("realsense", {"serial": "f999"}).open()
+
+
+def test_azure_kinect(install: Install) -> None:
+    package = FakeK4A()
+    install(package)
+    with device("azure-kinect", {"mode": "WFOV_2X2BINNED", "frame_rate_hz": "30"}).open() as stream:
+        assert package.config.depth_mode.name == "WFOV_2X2BINNED"
+        assert package.config.camera_fps.name == "FPS_30"
+        frame = stream.read(7)  # frame 0 told the size, and frame 1 has no depth
+    assert frame.index == 7
+    check_depth(frame, 2, 0.001)
+    assert frame.timestamp == pytest.approx(0.1 + 2 * 0.066667)
+    camera = stream.settings.camera
+    assert isinstance(camera, Rational)
+    assert (camera.fx, camera.cy, camera.k1, camera.p2, camera.k3, camera.k6) == (
+        30.0, 12.0, 0.5, -0.0002, 1.4, 1.4,
+    )  # fmt: skip
+    assert package.stopped == 1
+    with pytest.raises(DeviceError, match="does not start"):
+        device("azure-kinect", {"device": "1"}).open()
+    with pytest.raises(DeviceError, match="give 5, 15 or 30"):
+        device("azure-kinect", {"frame_rate_hz": "20"}).open()
+
+
+def test_orbbec(install: Install) -> None:
+    package = FakeOrbbec()
+    install(package)
+    with device("orbbec", {}).open() as stream:
+        frame = stream.read(0)
+        with pytest.raises(DeviceError, match="sent no frame"):
+            list(stream)
+    check_depth(frame, 2, 0.0005)
+    assert np.array_equal(frame.amplitude_image, infrared_counts(2))
+    camera = stream.settings.camera
+    assert isinstance(camera, Rational)
+    assert (camera.k1, camera.p1, camera.k3, camera.k4) == (0.5, 0.0001, 1.4, 0.4)
+    assert package.stopped == 1
+
+
+def test_orbbec_without_infrared(install: Install) -> None:
+    install(FakeOrbbec(infrared=False, rational=False))
+    with device("orbbec", {}).open() as stream:
+        assert stream.read(0).amplitude_image is None
+    assert type(stream.settings.camera) is Pinhole
+    assert stream.settings.amplitude_kind is None
+
+
+@pytest.mark.parametrize("converted", [True, False])
+def test_ifm(install: Install, converted: bool) -> None:
+    install(*fake_ifm3d(converted=converted).values())
+    with device("ifm-o3r", {}).open() as stream:
+        frame = stream.read(0)
+    assert frame.depth_kind == "range"
+    assert frame.depth[0, 0] == 0  # flagged
+    assert np.allclose(frame.depth[1:], depth_counts(1)[1:] * 0.0005, atol=1e-6)
+    assert np.allclose(frame.sigma_image, 0.004)
+    assert stream.settings.frame_rate_hz == 20
+    assert stream.settings.camera.rays().shape == (HEIGHT, WIDTH, 2)
+    with pytest.raises(DeviceError, match="does not start"):
+        device("ifm-o3r", {"address": "0.0.0.0"}).open()
+
+
+def test_options_and_packages_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert set(devices()) == {"azure-kinect", "ifm-o3r", "orbbec", "realsense"}
+    with pytest.raises(InputError, match="no camera 'webcam'"):
+        device("webcam", {})
+    with pytest.raises(InputError, match="unknown option 'serail'"):
+        device("realsense", {"serail": "1"})
+    with pytest.raises(InputError, match="give a whole number"):
+        device("realsense", {"width": "wide"})
+    with pytest.raises(InputError, match="give true or false"):
+        device("orbbec", {"infrared": "1"})
+    for name, kind in devices().items():
+        monkeypatch.setitem(sys.modules, kind.package[1], None)  # as if it weren't there
+        with pytest.raises(DeviceError, match=f"pip install {kind.package[0]}"):
+            device(name, {}).open()
+
+
+def test_record_keeps_what_the_camera_sent(install: Install, tmp_path: Path) -> None:
+    install(*fake_ifm3d(frames=5).values())
+    told: list[int] = []
+    with device("ifm-o3r", {}).open() as stream:
+        done = record(stream, tmp_path / "a", frames=3, progress=told.append)
+    assert (done.frames, done.dropped, done.ended_by) == (3, 0, "asked")
+    assert told == [1, 2, 3]
+    recording = tofuse.open(tmp_path / "a")
+    assert recording.metadata["sensor"] == "ifm O3R (ToF)"
+    assert np.diff(recording.timestamps) == pytest.approx(1 / 20, abs=1e-6)
+    frame = recording[2]
+    assert isinstance(frame, RangeFrame)
+    assert frame.depth_kind == "range"
+    assert np.allclose(frame.depth[1:], depth_counts(3)[1:] * 0.0005, atol=1e-5)
+    assert np.allclose(frame.sigma_image, 0.004, atol=1e-4)
+    assert np.allclose(frame.camera.rays(), stream.settings.camera.rays())
+
+
+def test_a_camera_that_fails_leaves_what_it_sent(install: Install, tmp_path: Path) -> None:
+    install(FakeRealSense(frames=4))
+    with device("realsense", {}).open() as stream:
+        done = record(stream, tmp_path / "a", seconds=60)
+    assert done.frames == 4
+    assert "sent no frame" in done.ended_by
+    assert len(tofuse.open(tmp_path / "a")) == 4
+
+
+def test_record_ends_by_the_cameras_clock(install: Install, tmp_path: Path) -> None:
+    install(FakeRealSense(frames=5))
+    with device("realsense", {}).open() as stream:
+        assert record(stream, tmp_path / "a", seconds=0.05).frames == 2
+
+
+def test_a_camera_that_sends_nothing_leaves_nothing(install: Install, tmp_path: Path) -> None:
+    install(FakeRealSense(frames=0))
+    with device("realsense", {}).open() as stream, pytest.raises(DeviceError, match="no frame"):
+        record(stream, tmp_path / "a")
+    assert not list(tmp_path.iterdir())
+
+
+def test_record_refuses_a_folder_that_holds_something(install: Install, tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("mine")
+    install(FakeRealSense())
+    with device("realsense", {}).open() as stream, pytest.raises(OutputError, match="isn't empty"):
+        record(stream, tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+class Endless(Stream):
+    """Sends at once whatever is asked for."""
+
+    def __init__(self, settings: Any, frames: int) -> None:
+        self.settings, self.left = settings, frames
+
+    def read(self, index: int) -> RangeFrame:
+        if index >= self.left:
+            raise DeviceError("was pulled out")
+        return RangeFrame(
+            index, index / 30, self.settings.camera, depth_counts(0) * np.float32(0.001)
+        )
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_slow_disk_costs_frames_and_says_how_many(install: Install, tmp_path: Path) -> None:
+    install(FakeRealSense())
+    with device("realsense", {}).open() as camera:
+        stream = Endless(camera.settings, 5000)
+    done = record(stream, tmp_path / "a", frames=100)
+    assert done.frames == 100
+    assert done.dropped > 0
+    indices = np.rint(tofuse.open(tmp_path / "a").timestamps * 30)
+    assert (np.diff(indices) >= 1).all()
+    assert indices[-1] > 99  # what was dropped is a gap in time, not hidden
+
+
+def test_record_command(
+    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install(FakeK4A())
+    out = tmp_path / "rec"
+    assert main(["record", "azure-kinect", "--out", str(out), "--frames", "2"]) == 0
+    assert "2 frames in" in capsys.readouterr().out
+    assert main(["inspect", str(out)]) == 0
+    assert "Azure Kinect" in capsys.readouterr().out
+    assert main(["record"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in devices())
+    assert ("not installed" in listed) == any(not is_installed(kind) for kind in devices().values())
+    assert main(["record", "azure-kinect"]) == 2
+    assert "--out: is missing" in capsys.readouterr().err
+
+
+class Clock:
+    """Time that passes only when someone sleeps or works."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+def ten_frames(times: Any = None) -> Recording:
+    camera = Pinhole(4, 3, 4.0, 4.0, 1.5, 1.0)
+    times = np.arange(10) / 10 if times is None else times
+    frames = [
+        RangeFrame(k, float(t), camera, np.ones((3, 4), np.float32)) for k, t in enumerate(times)
+    ]
+    return Recording.of(ArraySource(frames), "made", "made")
+
+
+def test_player_keeps_time() -> None:
+    clock = Clock()
+    player = Player(ten_frames(), clock=lambda: clock.now, sleep=clock.sleep)
+    seen = [(frame.index, round(clock.now - 100, 6)) for frame in player]
+    assert seen == [(k, k / 10) for k in range(10)]
+    assert player.dropped == []
+
+
+def test_player_drops_what_comes_too_late_and_gives_the_newest() -> None:
+    clock = Clock()
+    player = Player(ten_frames(), clock=lambda: clock.now, sleep=clock.sleep)
+    seen = []
+    for frame in player:
+        seen.append(frame.index)
+        clock.now += 0.25  # work
+    # Asked at 0, 0.25, 0.5, ...: the newest by then; at the end the last one.
+    assert seen == [0, 2, 5, 7, 9]
+    assert player.dropped == [1, 3, 4, 6, 8]
+
+
+def test_player_at_another_speed() -> None:
+    clock = Clock()
+    player = Player(ten_frames(), speed=2.0, clock=lambda: clock.now, sleep=clock.sleep)
+    assert len(list(player)) == 10
+    assert clock.now - 100 == pytest.approx(0.45)
+
+
+def test_player_refuses() -> None:
+    with pytest.raises(InputError, match="go back"):
+        Player(ten_frames(np.array([0.0, 0.2, 0.1])))
+    with pytest.raises(InputError, match="speed"):
+        Player(ten_frames(), speed=0.0)
+
+
+def test_a_mapper_takes_frames_as_they_come(room_recording: Path) -> None:
+    """A late program loses frames, and the mapper goes on with those that it gets."""
+    recording = tofuse.open(room_recording)
+    clock = Clock()
+    step = float(np.median(np.diff(recording.timestamps)))
+    player = Player(recording, clock=lambda: clock.now, sleep=clock.sleep)
+    mapper = Mapper("default")
+    posed = 0
+    for frame in player:
+        posed += mapper.push(frame) is not None
+        clock.now += 0.4 * step if len(player.dropped) else 1.2 * step
+    assert len(player.dropped) == 1
+    result = mapper.finish()
+    assert len(result.trajectory) == len(recording) - 1
+    assert posed >= 1
