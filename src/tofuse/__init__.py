@@ -17,6 +17,7 @@ from tofuse._version import __version__
 
 if TYPE_CHECKING:
     from tofuse.errors import InputError, OutputError, RegistrationError, TofuseError
+    from tofuse.live.player import Player
     from tofuse.pipeline.config import Config
     from tofuse.pipeline.mapper import Mapper
     from tofuse.pipeline.reconstruct import reconstruct
@@ -32,6 +33,7 @@ _HOMES = {
     "InputError": "tofuse.errors",
     "Mapper": "tofuse.pipeline.mapper",
     "OutputError": "tofuse.errors",
+    "Player": "tofuse.live.player",
     "RangeFrame": "tofuse.recordings.frames",
     "Reconstruction": "tofuse.results.types",
     "Recording": "tofuse.recordings.recording",
@@ -48,6 +50,7 @@ __all__ = [
     "InputError",
     "Mapper",
     "OutputError",
+    "Player",
     "RangeFrame",
     "Reconstruction",
     "Recording",
