@@ -52,7 +52,7 @@ class Sequence:
         The recording that map consistency looks at: unfiltered, but for an object, which is
         cut out.
     reference
-        (N, 4, 4) T_world_camera.
+        (N, 4, 4) T_world_camera, NaN where it is not known.
     exact
         Whether the reference is the truth.
     """
@@ -71,6 +71,7 @@ class _Kind:
     open: Callable[[Path], Recording]
     exact: bool
     farthest_m: float | None = None  # the object is nearer, the background is not
+    referenced: bool = True
 
 
 def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = False) -> Sequence:
@@ -92,7 +93,8 @@ def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = Fals
         cleaned.append(apply_filters(config.model_filters, tracked[-1], past)[0])
         past.append(frame)
     reference = recording.reference
-    assert reference is not None
+    if reference is None:
+        reference = np.full((len(tracked), 4, 4), np.nan)
     source = ArraySource(bare, reference, metadata=recording.metadata)
     return Sequence(
         f"{kind.title}, {len(tracked)} frames",
@@ -150,6 +152,9 @@ KINDS = {
         "Chair, iPhone LiDAR, 256 x 192", _recorded("iphone_chair_3dscannerapp"), False
     ),
     "kinect": _Kind("Loop round boxes, Kinect v2, 512 x 424", _kinect_loop, False),
+    "corridor": _Kind(
+        "Corridor, SR4000, 176 x 144", _recorded("sr4000_corridor"), False, referenced=False
+    ),
     "room": _Kind(f"Furnished room, {_SR4000}", _simulated("room", "room"), True),
     "empty-room": _Kind(
         f"Empty room, textured, {_SR4000}", _simulated("empty-room", "empty-room"), True
@@ -166,12 +171,12 @@ KINDS = {
 
 
 def names() -> list[str]:
-    """Return the names of the sequences."""
-    return list(KINDS)
+    """Return the names of the sequences that have a reference."""
+    return [name for name, kind in KINDS.items() if kind.referenced]
 
 
 def check(name: str) -> str:
     """Return the name if there is such a sequence; InputError if not."""
     if name not in KINDS:
-        raise InputError(f"is {name!r}", where="--sequences", remedy=f"use some of {names()}")
+        raise InputError(f"is {name!r}", where="--sequences", remedy=f"use some of {list(KINDS)}")
     return name

@@ -264,6 +264,44 @@ def test_a_spoilt_frame_is_lost_and_the_next_is_found(request, scene, spoil, amp
             assert_near(step, true)
 
 
+STRETCHES = {
+    "mirrored": "mirrored left to right",
+    "upside down": "mirrored top to bottom",
+    "turned round": "turned upside down",
+    "ten times too far": "times what they were",
+    "ten times too near": "times what they were",
+    "a tenth too far": "times what they were",
+    "a tenth too near": "times what they were",
+}
+
+
+@pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
+@pytest.mark.parametrize("spoil", STRETCHES)
+def test_what_is_wrong_with_a_stretch_of_images_is_told(corner, spoil, amplitude):
+    frames = list(corner.frames)
+    if not amplitude:
+        frames = [replace(frame, amplitude_image=None) for frame in frames]
+    frames[3:6] = [SPOILT[spoil](frame) for frame in frames[3:6]]
+    steps = run(frames)
+    for step in steps[3:6]:
+        assert_marked(step)
+        # Of a corner alone, nearer by a tenth is what it looks like from another place.
+        if amplitude or "tenth" not in spoil:
+            assert STRETCHES[spoil] in step.reason
+    for k in (0, 1, 2, 6, 7):
+        assert_near(steps[k], corner.poses[k])
+        assert steps[k].reference is None or steps[k].reference < 3 or steps[k].reference > 5
+
+
+def test_images_that_stay_turned_over_are_followed_but_get_no_pose(room):
+    """Also once the camera has left the last keyframe that it was believed at."""
+    options = Keyframes(keyframe_angle=0.06, keyframe_distance=0.05)
+    steps = run([*room.frames[:2], *[mirrored(frame) for frame in room.frames[2:]]], options)
+    for step in steps[2:]:
+        assert_marked(step)
+        assert "mirrored left to right" in step.reason
+
+
 @pytest.mark.parametrize("spoil", [SPOILT["blank"], SPOILT["sparse"]], ids=["blank", "sparse"])
 def test_a_recording_may_begin_with_spoilt_frames(room, spoil):
     steps = run([spoil(room.frames[0]), spoil(room.frames[1]), *room.frames[2:]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -14,6 +14,7 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.odometry.likeness import likeness, thumbnail
+from tofuse.odometry.mending import Mending, glance, looks_turned_over, mendings
 from tofuse.odometry.motion import Moment, Motion, is_small
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -38,6 +39,8 @@ _WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.
 
 # From one frame to the next no view gets so many times deeper, nor as much nearer.
 _RESCALED = 4.0
+# An image that fits is wrong all the same if it fits so many times better otherwise.
+_CLEARLY = 1.02
 # Keyframes that are kept, so that memory stays flat, and those of them that a lost view is aligned
 # with, so that it does not cost more than ten that are not.
 _REMEMBERED, _TRIED = 40, 5
@@ -239,6 +242,17 @@ class _Found:
     how: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class _Mended:
+    """A view that fits where it was expected, once what is wrong with its image is undone."""
+
+    mending: Mending
+    frame: RangeFrame
+    view: SurfaceMap
+    aligned: Aligned
+    target: _Keyframe
+
+
 class _KeyframeTracker(Tracker):
     def __init__(self, options: Keyframes) -> None:
         self._options = options
@@ -251,6 +265,9 @@ class _KeyframeTracker(Tracker):
         self._lost = False
         self._depth = 0.0  # median of the last frame with a pose, m
         self._searched = 0  # frames in a row that only a search could find, or not even that
+        self._frame: RangeFrame | None = None  # the last one where it was expected, and its depths
+        self._glance = np.zeros((0, 0), np.float32)
+        self._mended: _Mended | None = None  # what the frame before was, if that was wrong
 
     def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
         """See `Tracker.push`."""
@@ -269,19 +286,28 @@ class _KeyframeTracker(Tracker):
         now = Moment(frame.index, frame.timestamp)
         if self._T is None:
             self._keep(view, np.eye(4))
-            self._T, self._T_odometry = np.eye(4), T_odometry
-            self._motion.follow(self._T)
-            self._depth, self._before = self._keyframes[0].depth, now
+            self._T = np.eye(4)
+            self._follow(frame, view, self._T, T_odometry, now)
             return Step("tracked", "", np.eye(4), surface=view)
 
         reasons: list[str] = []
         expected = self._expected(T_odometry)
-        depth = float(np.median(view.z[view.z > 0]))
-        if not self._lost and not 1 / _RESCALED < depth / self._depth < _RESCALED:
-            return self._lose(f"the typical depth was {self._depth:.2g} m and is {depth:.2g} m")
-        found = self._track(view, expected, reasons)
+        found = None
+        rescaled = not self._lost and not _is_comparable(view.depth, self._depth)
+        if rescaled:
+            words = f"the typical depth was {self._depth:.2g} m and is {view.depth:.2g} m"
+            reasons.append(words)
+        else:
+            found = self._track(view, expected, reasons)
+        since = now.seconds_since(self._before)
+        if self._is_suspicious(view, found, expected, since):
+            mended = self._mend(frame, expected, found)
+            if mended is not None:
+                return self._follow_mended(mended, T_odometry, now)
         if found is not None:
             self._searched = 0
+        elif rescaled:
+            return self._lose(reasons[0])
         elif self._lost:
             found = self._relocate(view) or self._search(view)
         else:
@@ -291,7 +317,7 @@ class _KeyframeTracker(Tracker):
             return self._lose(reasons[0])
         reference = found.reference
         T = found.aligned.T_world_source
-        surprise = self._motion.surprise(T, expected, now.seconds_since(self._before))
+        surprise = self._motion.surprise(T, expected, since)
         if surprise:  # few iterations do for small motions alone
             how = replace(options.alignment, levels=_PATIENT)
             found = replace(found, aligned=align(view, found.targets, T, how))
@@ -299,21 +325,87 @@ class _KeyframeTracker(Tracker):
         if surprise:
             self._doubted = frame.index, step
             return self._lose(f"fits keyframe {reference.view.index}, but {surprise}")
-        self._depth = depth
         earlier: tuple[tuple[int, Step], ...] = ()
-        if self._motion.follow(T):
+        if self._follow(frame, view, T, T_odometry, now):
             words = "the camera jumped, and this view goes on from there"
             step = replace(step, reason="; ".join(filter(None, (step.reason, words))))
             if self._doubted is not None:
                 earlier = (self._doubted,)
-        self._doubted = None
+        self._doubted = self._mended = None
         if self._searched:  # a camera that is put down anew for each view has no velocity
             self._motion.interrupt()
-        self._T, self._T_odometry, self._lost = T, T_odometry, False
-        self._before = now
         if self._is_new(T, reference):
             self._keep(view, T)
         return replace(step, earlier=earlier)
+
+    def _follow(
+        self,
+        frame: RangeFrame,
+        view: SurfaceMap,
+        T: Float64,
+        T_odometry: Float64 | None,
+        now: Moment,
+    ) -> bool:
+        """Take the pose of a frame; returns whether the camera jumped to get there."""
+        self._T, self._T_odometry, self._before, self._lost = T, T_odometry, now, False
+        self._depth, self._frame, self._glance = view.depth, frame, glance(view.z)
+        return self._motion.follow(T)
+
+    def _is_suspicious(
+        self,
+        view: SurfaceMap,
+        found: _Found | None,
+        expected: Float64 | None,
+        seconds: float | None,
+    ) -> bool:
+        """Whether it must be asked if something is wrong with an image."""
+        if expected is None and self._lost:
+            return False  # where it would fit is not known
+        if found is None or self._mended is not None:
+            return True
+        T = found.aligned.T_world_source
+        return self._motion.is_surprising(T, expected, seconds) or looks_turned_over(
+            self._glance, glance(view.z)
+        )
+
+    def _mend(
+        self, frame: RangeFrame, expected: Float64 | None, found: _Found | None
+    ) -> _Mended | None:
+        """See whether a frame fits better where it was expected if it is mirrored or rescaled."""
+        assert self._T is not None
+        assert self._frame is not None
+        options = self._options
+        before = self._mended
+        keyframe = self._keyframes[-1] if before is None else before.target
+        targets = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+        start = self._T if expected is None else expected
+        wrong: Iterable[Mending] = () if before is None else [before.mending]
+        wrong = wrong or mendings(self._frame, frame, se3.inverse(self._T) @ start)
+        best, least = None, 0.0 if found is None else _CLEARLY * found.aligned.score
+        for mending in wrong:
+            mended = mending(frame)
+            view = surface_map(mended, options.surface)
+            aligned = align(view, targets, start, options.alignment)
+            if (
+                aligned.score > least
+                and not options.acceptance.objection(aligned, view.depth)
+                and is_small(se3.inverse(start) @ aligned.T_world_source)
+            ):
+                best, least = _Mended(mending, mended, view, aligned, keyframe), aligned.score
+        return best
+
+    def _follow_mended(self, mended: _Mended, T_odometry: Float64 | None, now: Moment) -> Step:
+        """Follow the camera by an image that is wrong, which gets no pose for that."""
+        self._motion.dismiss()
+        T = mended.aligned.T_world_source
+        self._follow(mended.frame, mended.view, T, T_odometry, now)
+        self._doubted = None
+        if self._is_new(T, mended.target):
+            # Poses that are told must not rest on it, so it is no keyframe like others.
+            mended = replace(mended, target=_keyframe(mended.view, T))
+        self._mended = mended
+        words = "it fits where the camera was expected once that is undone"
+        return Step("lost", f"the image is {mended.mending.words}: {words}", None)
 
     def _step(self, view: SurfaceMap, found: _Found, *, lit: bool) -> Step:
         """What a view is taken for that was aligned and is believed."""
@@ -359,6 +451,12 @@ class _KeyframeTracker(Tracker):
         """Align with the newest keyframes, from the guess and then from where the camera was."""
         options = self._options
         newest = self._keyframes[-options.targets :]
+        if not _is_comparable(view.depth, newest[-1].depth):
+            reasons.append(
+                f"the typical depth of keyframe {newest[-1].view.index} is "
+                f"{newest[-1].depth:.2g} m, and of this view {view.depth:.2g} m"
+            )
+            return None
         targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
         for predicted, start, how, chosen in self._predictions(view, targets, expected):
             aligned = align(view, targets, predicted, how, start=start)
@@ -418,6 +516,8 @@ class _KeyframeTracker(Tracker):
         found = []
         for k in likeness(thumbnail(view), [k.thumbnail for k in self._keyframes])[:_TRIED]:
             keyframe = self._keyframes[k]
+            if not _is_comparable(view.depth, keyframe.depth):
+                continue
             target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
             coarse = align(view, target, keyframe.T_world_camera, wide)
             if not options.relocated.objection(coarse, view.depth):
@@ -441,6 +541,8 @@ class _KeyframeTracker(Tracker):
         if self._searched > recovery.patience and self._searched % recovery.patience:
             return None
         for keyframe in self._keyframes[: -recovery.keyframes - 1 : -1]:
+            if not _is_comparable(view.depth, keyframe.depth):
+                continue
             match = search(view, keyframe.view, recovery.search)
             if match is None or not recovery.believes(match, self._lost):
                 continue
@@ -466,8 +568,7 @@ class _KeyframeTracker(Tracker):
         )
 
     def _keep(self, view: SurfaceMap, T: Float64) -> None:
-        depth = float(np.median(view.z[view.z > 0]))
-        self._keyframes.append(_Keyframe(view, T, depth, thumbnail(view)))
+        self._keyframes.append(_keyframe(view, T))
         if len(self._keyframes) > _REMEMBERED:
             del self._keyframes[self._dispensable()]
 
@@ -489,10 +590,19 @@ class _KeyframeTracker(Tracker):
         return int(np.argmin(away.min(1)))
 
 
+def _keyframe(view: SurfaceMap, T: Float64) -> _Keyframe:
+    return _Keyframe(view, T, view.depth, thumbnail(view))
+
+
+def _is_comparable(depth: float, other: float) -> bool:
+    """Whether two views of such typical depths can show the same from near the same place."""
+    return 1 / _RESCALED < depth / other < _RESCALED
+
+
 def _turns(view: SurfaceMap) -> list[Float64]:
     """Motions of the camera to try: none, and turns about itself and about what it sees."""
     centre = np.eye(4)
-    centre[2, 3] = float(np.median(view.z[view.z > 0]))
+    centre[2, 3] = view.depth
     motions = [np.eye(4)]
     for angle in np.radians([-12, -6, 6, 12]):
         for axis in (3, 4):

@@ -70,14 +70,10 @@ class Motion:
         as it moved before: a jump of the camera, or of the recording, does not change how it moves,
         but a mirrored image does.
         """
-        if self._T is None or expected is None or self._missed >= _FORGOTTEN:
+        if expected is None or self._missed >= _FORGOTTEN:
             return ""
         difference = _size(se3.inverse(expected) @ T)
-        if self._differences:
-            usual = np.max(self._differences, axis=0)
-        else:
-            usual = _size(se3.inverse(self._T) @ expected)
-        allowed = _reach(seconds, self._missed + 1) + _TIMES * usual
+        allowed = self._allowed(expected, seconds)
         if (difference <= allowed * (self._missed + 1)).all():
             self._differences.append(difference / (self._missed + 1))
             self._elsewhere = None
@@ -92,6 +88,25 @@ class Motion:
             "the motion leads"
         )
 
+    def _allowed(self, expected: Float64, seconds: float | None) -> Float64:
+        """What a motion may differ from the expected one for each frame, m and rad."""
+        if self._T is None:
+            return np.full(2, np.inf)
+        if self._differences:
+            usual = np.max(self._differences, axis=0)
+        else:
+            usual = _size(se3.inverse(self._T) @ expected)
+        return np.asarray(_reach(seconds, self._missed + 1) + _TIMES * usual, np.float64)
+
+    def is_surprising(
+        self, T: Float64, expected: Float64 | None, seconds: float | None = None
+    ) -> bool:
+        """Whether a pose differs much from what was expected, without taking note of it."""
+        if expected is None or self._missed >= _FORGOTTEN:
+            return False
+        allowed = self._allowed(expected, seconds) * (self._missed + 1)
+        return bool((_size(se3.inverse(expected) @ T) > allowed).any())
+
     def follow(self, T: Float64) -> bool:
         """Take the pose of the next frame; returns whether the camera jumped to get there."""
         before, frames = self._T, self._missed + 1
@@ -104,6 +119,10 @@ class Motion:
             self._per_frame = se3.log(se3.inverse(before) @ T) / frames
         self._T, self._missed, self._elsewhere = T, 0, None
         return jumped
+
+    def dismiss(self) -> None:
+        """Say that the last surprise told nothing of the camera."""
+        self._elsewhere = None
 
     def interrupt(self) -> None:
         """Say that the camera may be anywhere by the next frame."""
