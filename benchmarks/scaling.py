@@ -6,6 +6,8 @@ each kernel's own CPU time on one thread, beside the time that the machine needs
 that the kernel must touch, which are those of its arrays, each once. The frames are those of a
 made room, or of a recording. All but the compilation is warm.
 
+With `--whole` the memory of whole runs is printed instead: everything but reading and writing.
+
     python benchmarks/scaling.py [RECORDING] [--columns 160 320 640] [--counts 500 1000 5000]
 """
 
@@ -33,6 +35,7 @@ from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.threads import threads as using_threads
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 
@@ -176,6 +179,26 @@ def over_count(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[
         )
 
 
+def whole_run(frames: Sequence[RangeFrame], counts: Sequence[int]) -> Iterator[str]:
+    """Memory of a whole run, loops, refinement and model included, as the sequence goes on."""
+    mapper = Mapper()
+    source = forth_and_back(frames, max(counts))
+    yield f"{'frames':>8}{'CPU, s':>9}{'memory, MB':>12}"
+    done = 0
+    for count in sorted(counts):
+        start = time.process_time()
+        for _ in range(count - done):
+            mapper.push(next(source))
+        done = count
+        spent = time.process_time() - start
+        yield f"{count:>8}{spent:>9.1f}{resident_bytes() / 1e6:>12.0f}"
+    start = time.process_time()
+    result = mapper.finish()
+    spent = time.process_time() - start
+    yield f"{'finished':>8}{spent:>9.1f}{resident_bytes() / 1e6:>12.0f}"
+    yield f"{result.has_pose.mean():.0%} posed, {len(result.diagnostics.loops)} loops considered"
+
+
 def resident_bytes() -> int:
     """Memory that the process holds now; at its peak where the system only tells that."""
     try:
@@ -312,6 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[500, 1000, 5000])
     parser.add_argument("--length", type=int, default=LENGTH, help="frames of the sequence")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--whole", action="store_true", help="only the memory of a whole run")
     parser.add_argument("--compile-only", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.compile_only:
@@ -331,6 +355,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.recording
         else made_frames(widest, options.length)
     )
+    if options.whole:
+        _print("Whole run", whole_run(frames, options.counts))
+        return
     with using_threads(options.threads):
         _print("Resolution", over_resolution(frames, options.columns))
         _print("Number of frames", over_count(frames, options.counts))
