@@ -125,6 +125,7 @@ def simulate(arguments: argparse.Namespace) -> int:
             texture=not arguments.uniform,
             without=tuple(w for w in arguments.without.split(",") if w),
             correction=not arguments.no_correction,
+            imu=arguments.imu,
             sigma=arguments.sigma,
             progress=progress,
         )

@@ -159,6 +159,7 @@ def _simulate(commands: Any) -> None:
     p.add_argument(
         "--no-correction", action="store_true", help="leave out the factory's depth correction"
     )
+    p.add_argument("--imu", action="store_true", help="an accelerometer on the camera as well")
     p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the peaks scene (0.05)")
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")

@@ -16,6 +16,7 @@ from tofuse.fusion.options import Fusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.loops import LoopDetector
+from tofuse.posegraph.outside import Outside
 from tofuse.posegraph.refinement import NoRefinement, Refining
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.results.output import read_run_json
@@ -48,6 +49,8 @@ class Config:
     model_filters
         Applied after tracking, to what goes into the model: a tracker that weighs each pixel by
         its noise loses by what a clean model gains.
+    outside
+        Sensors beside the camera whose measurements count.
     """
 
     method: str
@@ -59,6 +62,7 @@ class Config:
     refinement: Refining = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
+    outside: tuple[Outside, ...] = ()
 
     @property
     def window(self) -> int:

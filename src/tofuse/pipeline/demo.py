@@ -121,6 +121,7 @@ def simulate_to(
     texture: bool = True,
     without: tuple[str, ...] = (),
     correction: bool = True,
+    imu: bool = False,
     sigma: float | None = None,
     progress: Progress | None = None,
 ) -> int:
@@ -159,6 +160,7 @@ def simulate_to(
             frames=frames,
             correction=correction,
             texture=texture,
+            imu=imu,
             progress=tell,
             **options,
         )

@@ -13,7 +13,9 @@ from tofuse.evaluation.sightings import Sightings
 from tofuse.geometry import se3
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.posegraph.graph import LoopRecord, Optimisation
+from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.suspicion import Suspicion
 from tofuse.posegraph.trust import expected_error, loop_errors
 from tofuse.registration.base import Registration
 from tofuse.results.types import FrameRecord, Reason, Verdict
@@ -78,6 +80,8 @@ class Evidence:
         Indices of the frames that are the same as the one before, to the last pixel.
     interruptions
         Positions among the records at which another recording begins.
+    outside
+        What became of sensors beside the camera.
     """
 
     records: tuple[FrameRecord, ...]
@@ -93,6 +97,7 @@ class Evidence:
     ambiguity_m: float | None = None
     repeated: tuple[int, ...] = ()
     interruptions: tuple[int, ...] = ()
+    outside: tuple[OutsideRecord, ...] = ()
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
@@ -105,6 +110,7 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
         *_loops(evidence),
         *(_drift(evidence) if evidence.covariances is None else _uncertainty(evidence)),
         *_optimiser(evidence),
+        *_outside(evidence),
         *_images(evidence),
     ]
     return verdict_of(reasons), tuple(reasons)
@@ -219,6 +225,13 @@ def _optimiser(e: Evidence) -> Iterator[Reason]:
         yield Reason("not_refined", _all_posed(e), text)
 
 
+def _outside(e: Evidence) -> Iterator[Reason]:
+    for sensor in e.outside:
+        if 2 * sensor.used < sensor.measured:
+            text = f"{sensor.text[0].upper()}{sensor.text[1:]}."
+            yield Reason("sensor_differs", _all_posed(e), text)
+
+
 def _drift(e: Evidence) -> Iterator[Reason]:
     """Without known errors only loops tell of drift."""
     graph = e.optimisation.graph
@@ -231,6 +244,7 @@ def _drift(e: Evidence) -> Iterator[Reason]:
 def _uncertainty(e: Evidence) -> Iterator[Reason]:
     """With known errors of the registrations, those of the path follow."""
     yield from _missed(e)
+    yield from _suspected(e)
     graph = e.optimisation.graph
     assert e.covariances is not None
     if len(graph.ids) < 2:
@@ -293,6 +307,34 @@ def _missed(e: Evidence) -> Iterator[Reason]:
         "noise explains: the depth offset or the focal length of the camera may be wrong."
     )
     yield Reason("calibration_alarm", (first, last), text)
+
+
+def _suspected(e: Evidence) -> Iterator[Reason]:
+    """All views together may say what is wrong with the camera."""
+    found = None if e.refinement is None else e.refinement.suspicion
+    if found is None or not found.alarm or found.gap is None:
+        return
+    gap = found.gap
+    (m, rad), (m_after, rad_after) = gap.before, gap.after
+    text = (
+        f"Neighbours alone miss the loop {gap.i} to {gap.j} by {m:.3f} m and "
+        f"{np.degrees(rad):.1f} degrees; {' or '.join(proposals(found))} would leave "
+        f"{m_after:.3f} m and {np.degrees(rad_after):.1f} degrees."
+    )
+    yield Reason("calibration_alarm", (gap.i, gap.j), text)
+
+
+def proposals(found: Suspicion) -> list[str]:
+    """What the views say of the camera, in words, for each error by itself."""
+    words = []
+    if "focal" in found.errors:
+        share = 1 / (1 + found.errors["focal"]) - 1
+        more = "larger" if share > 0 else "smaller"
+        words.append(f"a focal length {abs(share):.1%} {more}")
+    if "offset" in found.errors:
+        more = "longer" if found.errors["offset"] > 0 else "shorter"
+        words.append(f"ranges {abs(found.errors['offset']) * 1e3:.0f} mm {more}")
+    return words
 
 
 def _way(poses: Float64) -> float:

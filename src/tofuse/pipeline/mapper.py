@@ -28,6 +28,7 @@ from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.posegraph.outside import Sensed, Told, told_by, with_outside
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -52,6 +53,15 @@ class _Place:
 
 
 @dataclass(frozen=True, eq=False)
+class _Judged:
+    """What the verdict looks at: without sensors beside the camera, but for how they led."""
+
+    sequential: Float64
+    optimisation: Optimisation
+    covariances: Float64
+
+
+@dataclass(frozen=True, eq=False)
 class _Closed:
     """What there is once loops are closed."""
 
@@ -59,6 +69,8 @@ class _Closed:
     sequential: Float64
     optimisation: Optimisation
     covariances: Float64
+    told: Told
+    judged: _Judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +139,7 @@ class Mapper:
         self._repeated: list[int] = []
         self._lost: dict[int, _Place] = {}  # the last frames, if they have no pose
         self._interruptions: list[int] = []
+        self._sensed: dict[int, tuple[Float64 | None, Float64 | None]] = {}
         self._knows_errors = False
         self._seen: dict[str, int] = {}
         self._removed: dict[str, int] = {}
@@ -148,6 +161,7 @@ class Mapper:
         frame: Frame,
         *,
         T_odometry: Float64 | None = None,
+        gravity: Float64 | None = None,
         history: Sequence[Frame] | None = None,
     ) -> Float64 | None:
         """Add the next frame.
@@ -158,6 +172,8 @@ class Mapper:
             As the camera gave it. Its `index` must be larger than those before.
         T_odometry
             (4, 4) T_world_camera from odometry, in any fixed world frame.
+        gravity
+            (4,) unit vector in which things fall in the camera's frame, and its sigma in rad.
         history
             Unfiltered frames just before this one, oldest first, for temporal filters; the
             frames pushed before it unless given.
@@ -174,6 +190,7 @@ class Mapper:
             can't work on, or its index does not grow.
         """
         self._check(frame)
+        self._sensed[frame.index] = (T_odometry, gravity)
         repeated = self._is_repeated(frame)
         with threads(self.threads):
             with self._watch.timing("filters"):
@@ -387,29 +404,40 @@ class Mapper:
         with self._watch.timing("loops"):
             loops = self._loops.finish()
             graph = self._graph(loops)
-        sequential = graph.poses
+        sequential = led = graph.poses
+        told = told_by(self.config.outside, self._all_sensed(graph), self._graph(()))
+        graph = with_outside(graph, told)
         optimisation = Optimisation(graph, (), True)
-        if graph.loop.any():
+        if graph.loop.any() or told:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation = self.config.optimiser.optimise(graph)
+                if told and graph.loop.any():  # what loops are to be held against
+                    alone = with_outside(self._graph(()), told)
+                    led = self.config.optimiser.optimise(alone).graph.poses
             loops = _decided(loops, optimisation)
             optimisation = without_left_out(optimisation)
-        covariances = pose_covariances(optimisation.graph)
-        return _Closed(loops, sequential, optimisation, covariances)
+        graph = optimisation.graph
+        covariances = pose_covariances(graph)
+        judged = _Judged(led, optimisation, covariances)
+        if told:
+            # The verdict stays with what was seen: no file beside the images makes it better.
+            seen = self._graph(loops).with_poses(graph.poses)
+            judged = _Judged(led, replace(optimisation, graph=seen), pose_covariances(seen))
+        return _Closed(loops, sequential, optimisation, covariances, told, judged)
 
     def _refine(self, closed: _Closed) -> _Refined:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
         with self._watch.timing("refinement"):
-            refinement = self._refiner.finish(graph.ids.tolist(), graph.poses)
+            refinement = self._refiner.finish(graph.ids.tolist(), graph.poses, closed.told)
             if refinement.kept:
-                graph = self._graph(closed.loops, refinement)
+                graph = with_outside(self._graph(closed.loops, refinement), closed.told)
         return _Refined(graph, refinement)
 
     def _fuse(self, closed: _Closed, refined: _Refined) -> _Fused:
         graph, refinement = refined.graph, refined.refinement
-        moved = bool(graph.loop.any()) or refinement.kept
+        moved = bool(graph.loop.any()) or refinement.kept or bool(closed.told)
         self._progress.stage("fusing", self._model.views)
         with self._watch.timing("fusion"):
             ids = graph.ids.tolist()
@@ -424,7 +452,7 @@ class Mapper:
     def _check_all(self, closed: _Closed, refined: _Refined, fused: _Fused) -> Reconstruction:
         loops, optimisation, covariances = closed.loops, closed.optimisation, closed.covariances
         graph, refinement, model = refined.graph, refined.refinement, fused.model
-        sequential = closed.sequential
+        sequential, judged = closed.sequential, closed.judged
         self._progress.stage("checking")
         records = self._finished_records(covariances)
         with self._watch.timing("checking"):
@@ -432,16 +460,17 @@ class Mapper:
                 records,
                 tuple(s.registration if s else None for s in self._steps),
                 tuple(c.record for c in loops),
-                sequential,
-                optimisation,
+                judged.sequential,
+                judged.optimisation,
                 self._sightings(graph),
-                covariances if self._knows_errors else None,
+                judged.covariances if self._knows_errors else None,
                 refinement,
                 frozenset((g.i, g.j) for g in self._given_loops),
                 tuple(d for d in self._depths if d > 0),
                 self._ambiguity_m,
                 tuple(self._repeated),
                 tuple(self._interruptions),
+                closed.told.records,
             )
             verdict, reasons = judge(evidence)
         reasons = (*reasons, *self._about_surface(model))
@@ -463,12 +492,31 @@ class Mapper:
                 fused.before,
                 refinement,
                 optimisation.parts,
+                closed.told.records,
             ),
             config=self.config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(self._records)},
             seed=self.seed,
             threads=self.threads,
         )
+
+    def _all_sensed(self, graph: PoseGraph) -> Sensed:
+        """What the recording holds of the frames of a graph, beside their views."""
+        n = len(graph.ids)
+        odometry, gravity = np.full((n, 4, 4), np.nan), np.full((n, 4), np.nan)
+        for k, index in enumerate(graph.ids.tolist()):
+            T, down = self._sensed[index]
+            if T is not None:
+                odometry[k] = T
+            if down is not None:
+                gravity[k] = down
+        posed = [
+            position
+            for position, step in enumerate(self._steps)
+            if step is not None and step.T_world_camera is not None
+        ]
+        parts = np.searchsorted(self._interruptions, posed, side="right")
+        return Sensed(graph.ids, odometry, gravity, parts)
 
     def _graph(self, loops: Sequence[ClosedLoop], refined: Refinement | None = None) -> PoseGraph:
         """The graph as the tracker left it, or with what the refinement measured instead."""

@@ -17,6 +17,7 @@ from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.loops import Confirmation
 from tofuse.posegraph.nearby import Nearby
+from tofuse.posegraph.outside import GravityEdges
 from tofuse.posegraph.planes import Planes
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.revisits import Revisits
@@ -75,4 +76,6 @@ def default(kind: ViewKind) -> Config:
         # Not for clouds: it believes what a registration says of its errors, and ICP's is too good.
         optimiser=LevenbergMarquardt(),
         refinement=Joint(),
+        # Odometry only when asked for: a file beside the images may be of anything.
+        outside=(GravityEdges(),),
     )

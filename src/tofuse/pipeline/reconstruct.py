@@ -108,7 +108,7 @@ def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages)
     """Give the mapper the frames that it has not seen."""
     if tracked.done == len(recording):
         return
-    mapper, odometry = tracked.mapper, recording.odometry
+    mapper, odometry, gravity = tracked.mapper, recording.odometry, recording.gravity
     recent: dict[int, Frame] = {}
     first = tracked.done
     for k, item in enumerate(recording.read_all(first=first), first):
@@ -122,9 +122,10 @@ def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages)
             mapper.skip(index, time, str(item))
         else:
             T = None if odometry is None or not np.isfinite(odometry[k]).all() else odometry[k]
+            down = None if gravity is None or not np.isfinite(gravity[k]).all() else gravity[k]
             past = past_frames(recording, index, window - 1, recent)
             recent = {f.index: f for f in [*past, item]}
-            mapper.push(item, T_odometry=T, history=past)
+            mapper.push(item, T_odometry=T, gravity=down, history=past)
         tracked.done = k + 1
         if tracked.done < len(recording) and stages.due():
             stages.save(_TRACKING, tracked)

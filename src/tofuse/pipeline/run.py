@@ -157,6 +157,8 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         names = [item["part"] for item in corrections]
         if "multipath" in names and "scattering" not in names:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
+        # The world is the object, of which neither gravity nor the camera's odometry knows.
+        config = changed(config, {"outside": []}, where="--object")
     if front or corrections != chosen["corrections"]:
         lists = {"filters": [*front, *chosen["filters"]], "corrections": corrections}
         config = changed(config, lists, where="--object" if options.object else "--max-depth")

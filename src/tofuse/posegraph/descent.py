@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.posegraph import robust
 from tofuse.posegraph.charts import CHARTS, Chart, Rotation
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import Factor, PairSystem
@@ -62,7 +63,7 @@ class Problem:
         if down is None:
             R = poses[self.gravity.vertices, :3, :3]
             seen = (R @ self.gravity.directions[..., None])[..., 0]
-            down = (seen / self.gravity.sigma[:, None] ** 2).sum(0)
+            down = vertical(seen, self.gravity)
         # The rotation whose third axis is down; the other two don't matter.
         down = down / np.linalg.norm(down)
         x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
@@ -84,6 +85,13 @@ class Problem:
         world, R = poses[-1, :3, :3], poses[self.gravity.vertices, :3, :3]
         return (world.T @ R @ self.gravity.directions[..., None])[..., 0]
 
+    def gravity_cost(self, down: Float64) -> float:
+        """What gravity's errors (g, 3) add to the objective."""
+        x = (down**2).sum(-1)
+        if self.gravity is None or np.isinf(self.gravity.gate):
+            return float((down**2).sum())
+        return float(robust.cost("geman-mcclure", x, self.gravity.gate).sum())
+
     def linearised(
         self, poses: Float64, e: Float64, down: Float64, weights: Float64
     ) -> tuple[Any, Float64]:
@@ -100,6 +108,9 @@ class Problem:
                 -(R @ se3.hat(self.gravity.directions)) / self.gravity.sigma[:, None, None]
             )
             Jt = np.swapaxes(J, 1, 2)
+            if np.isfinite(self.gravity.gate):
+                x = (down**2).sum(-1)
+                Jt = Jt * robust.weight("geman-mcclure", x, self.gravity.gate)[:, None, None]
             H = np.concatenate([H, Jt @ J])
             g = np.concatenate([g, (Jt @ down[..., None])[..., 0]])
         basis = self.chart.basis(poses)
@@ -137,6 +148,19 @@ class Problem:
         return plain.system.factor(matrix, gradient)
 
 
+def vertical(seen: Float64, gravity: Gravity) -> Float64:
+    """(3,) direction in the world that directions (g, 3) agree on, each by its sigma and gate."""
+    known = 1 / gravity.sigma**2
+    if np.isinf(gravity.gate):
+        return np.asarray((seen * known[:, None]).sum(0), np.float64)
+    down = np.median(seen, axis=0)  # which a few can't turn
+    for _ in range(10):
+        down = down / max(float(np.linalg.norm(down)), 1e-12)
+        x = ((seen - down) ** 2).sum(1) * known
+        down = (seen * (known * robust.weight("huber", x, 1.0))[:, None]).sum(0)
+    return np.asarray(down, np.float64)
+
+
 Cost = Callable[[Float64], Float64]
 
 
@@ -164,7 +188,7 @@ class Descent:
         self._note()
 
     def _note(self) -> None:
-        self.log.append((self.chi2, float((self.down**2).sum())))
+        self.log.append((self.chi2, self.problem.gravity_cost(self.down)))
 
     def run(self, total: Cost, weights: Cost, tolerance: float, iterations: int) -> bool:
         """Step down until a step gains too little; whether that came before the last step."""
@@ -211,4 +235,4 @@ class Descent:
         return None
 
     def _value(self, total: Cost) -> float:
-        return float(total(self.chi2).sum()) + float((self.down**2).sum())
+        return float(total(self.chi2).sum()) + self.problem.gravity_cost(self.down)

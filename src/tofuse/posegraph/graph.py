@@ -31,12 +31,16 @@ class Gravity:
         (g,) standard deviation of each, rad.
     world
         (3,) the same direction in the world, or None where it is to be found too.
+    gate
+        Squared error, in units of sigma, beyond which a direction hardly counts (Geman and
+        McClure): an accelerometer that is moved measures more than gravity.
     """
 
     vertices: Integers
     directions: Float64
     sigma: Float64
     world: Float64 | None = None
+    gate: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)

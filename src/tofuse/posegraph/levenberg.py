@@ -141,6 +141,7 @@ def _gravity_of(graph: PoseGraph, number: Integers) -> Gravity | None:
         gravity.directions[here],
         gravity.sigma[here],
         gravity.world,
+        gravity.gate,
     )
 
 

@@ -13,6 +13,7 @@ from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.common_planes import CHANCE, Aligned, PlaneOptions, refine_clouds
+from tofuse.posegraph.outside import Told
 from tofuse.posegraph.refinement import (
     Refinement,
     Refiner,
@@ -84,7 +85,7 @@ class _Planes(Refiner):
         depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
         self._store.push(_Kept(view.index, depth, points), T_world_camera)
 
-    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
         views = self._store.views
         if len(views) < 2:

@@ -19,6 +19,9 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph import robust
+from tofuse.posegraph.descent import vertical
+from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.views import KeptView, overlaps
 
@@ -154,6 +157,29 @@ class Refined:
     information: Float64
 
 
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What is known of the views' poses beside what they show.
+
+    Attributes
+    ----------
+    pairs, measured, information
+        (M, 2) positions i, j of views, (M, 4, 4) their T_i_j and (M, 6, 6) the information of it.
+    gravity
+        Directions in which things fall, or None.
+    """
+
+    pairs: Integers
+    measured: Float64
+    information: Float64
+    gravity: Gravity | None = None
+
+    @classmethod
+    def nothing(cls) -> Beside:
+        """Nothing is known."""
+        return cls(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+
+
 @dataclass(eq=False)
 class _Pairs:
     """Directed pairs, what is known of each, and what was summed last."""
@@ -174,6 +200,7 @@ def refine(
     options: RefineOptions,
     *,
     calibrate: Sequence[int] = (),
+    beside: Beside | None = None,
 ) -> Refined:
     """Move all views until they agree with all that they overlap with.
 
@@ -183,8 +210,11 @@ def refine(
         (N, 4, 4) T_world_camera to start from; the first stays.
     calibrate
         Errors of the camera to estimate as well, by their number in `kernels.refinement`.
+    beside
+        What is known of the poses beside what the views show.
     """
     start = poses
+    beside = beside or Beside.nothing()
     errors = np.zeros(kernels.ERRORS)
     known = np.ones(kernels.ERRORS, np.int64)
     known[list(calibrate)] = 0
@@ -192,10 +222,10 @@ def refine(
     state = _no_pairs()
     for stage in options.rounds:
         pairs = chosen(overlaps(views, poses, options.overlap)[0], options.neighbours)
-        state = _directed(views, pairs, options, state)
+        state = _directed(views, pairs, options, state, beside)
         for _ in range(stage.iterations if len(pairs) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
-            step, change = _solve(poses, state, known)
+            step, change = _solve(poses, state, known, beside)
             poses = se3.orthonormalise(poses @ se3.exp(step))
             poses[0] = start[0]
             errors = errors + change
@@ -210,6 +240,129 @@ def refine(
     measured = _alone(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
     return Refined(poses, errors, pairs, tuple(moved), before, after, *measured)
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What each pair says of single errors of the camera, when all poses follow them.
+
+    Attributes
+    ----------
+    gradient, information
+        (M, ERRORS) of each pair i < j, both directions together: the first derivative of half its
+        squared residuals where no error is assumed, and half the second.
+    """
+
+    gradient: Float64
+    information: Float64
+
+    def estimate(self) -> Float64:
+        """(ERRORS,) errors that fit best, each by itself, as far as one step tells."""
+        return np.asarray(
+            -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
+        )
+
+    def sigma(self, pairs: Integers, views: int) -> Float64:
+        """(ERRORS,) standard deviations, by how much views (of pairs (M, 2)) differ in it.
+
+        Noise that neighbouring pixels share, and errors of single views, are in it; errors that
+        all views have in common are not.
+        """
+        left = self.gradient + self.information * self.estimate()
+        of_view = np.zeros((views, left.shape[1]))
+        for ends in pairs.T:
+            np.add.at(of_view, ends, left)
+        spread = np.sqrt((of_view**2).sum(0))
+        return np.asarray(spread / np.maximum(self.information.sum(0), 1e-12), np.float64)
+
+
+def response(
+    views: Sequence[KeptView],
+    poses: Float64,
+    pairs: Integers,
+    options: RefineOptions,
+    *,
+    beside: Beside | None = None,
+) -> Response:
+    """Tell what refined views say of errors of the camera that they share.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4), as they fit best without any error.
+    pairs
+        (M, 2) positions of views i < j.
+    """
+    beside = beside or Beside.nothing()
+    none, asked = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
+    stage = options.rounds[-1]
+    state = _directed(views, pairs, options, _no_pairs(), beside)
+    _evaluate(views, poses, none, np.ones_like(asked), state, stage, options)
+    _without_exposure(state)
+    _rescale(state, stage)
+    _evaluate(views, poses, none, asked, state, stage, options)
+    H, g = _without_exposure(state)
+    m = len(beside.pairs)
+    i, j = state.system.pairs.T
+    T_i_j = se3.inverse(poses[i]) @ poses[j]
+    more_H, more_g = _steps(T_i_j[len(H) :], beside)
+    still = np.tile(np.diag(_STILL / UNITS**2), (len(poses), 1, 1)), np.zeros((len(poses), 6))
+    matrix, gradient = state.system.relative(
+        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, still
+    )
+    factor = state.system.factor(matrix, gradient, _DAMPING)
+    assert factor is not None, "the poses are held, so the system is not singular"
+    A = se3.adjoint(se3.inverse(T_i_j[: len(H)]))
+
+    def relative(step: Float64) -> Float64:
+        return step[state.source] - (A @ step[state.target][..., None])[..., 0]
+
+    rest = relative(_finite(factor.step()))
+    slope = g[:, :6] + (H[:, :6, :6] @ rest[..., None])[..., 0]
+    first, second = np.empty((len(H), kernels.ERRORS)), np.empty((len(H), kernels.ERRORS))
+    for k in range(kernels.ERRORS):
+        mixed = H[:, :6, 6 + k]
+        column = state.system.gradient(np.concatenate([mixed, np.zeros((m, 6))]), T_i_j)
+        follow = relative(_finite(factor.solve(column)))
+        first[:, k] = g[:, 6 + k] + (mixed * rest).sum(1) + (slope * follow).sum(1)
+        second[:, k] = H[:, 6 + k, 6 + k] + 2 * (mixed * follow).sum(1)
+        second[:, k] += np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
+    half = len(pairs)
+    return Response(first[:half] + first[half:], second[:half] + second[half:])
+
+
+def alone(
+    views: Sequence[KeptView],
+    pairs: Integers,
+    T_i_j: Float64,
+    options: RefineOptions,
+    errors: Float64,
+    *,
+    iterations: int = 8,
+) -> Float64:
+    """(M, 4, 4) relative poses T_i_j of pairs (M, 2), each aligned by itself.
+
+    Parameters
+    ----------
+    T_i_j
+        (M, 4, 4) to start from.
+    errors
+        (ERRORS,) that the camera is taken to have.
+    """
+    count = len(pairs)
+    both = [views[k] for k in pairs.ravel()]
+    poses = np.tile(np.eye(4), (2 * count, 1, 1))
+    poses[1::2] = T_i_j
+    state = _directed(
+        both, np.arange(2 * count).reshape(-1, 2), options, _no_pairs(), Beside.nothing()
+    )
+    known, stage = (errors == 0).astype(np.int64), options.rounds[-1]
+    for _ in range(iterations):
+        _evaluate(both, poses, errors, known, state, stage, options)
+        step, _ = _solve(poses, state, np.ones_like(known), Beside.nothing())
+        poses = se3.orthonormalise(poses @ se3.exp(step))
+        _rescale(state, stage)
+    return np.asarray(se3.inverse(poses[::2]) @ poses[1::2], np.float64)
 
 
 def chosen(pairs: Integers, neighbours: int) -> Integers:
@@ -230,7 +383,11 @@ def _no_pairs() -> _Pairs:
 
 
 def _directed(
-    views: Sequence[KeptView], pairs: Integers, options: RefineOptions, before: _Pairs
+    views: Sequence[KeptView],
+    pairs: Integers,
+    options: RefineOptions,
+    before: _Pairs,
+    beside: Beside,
 ) -> _Pairs:
     """Both directions of each pair, with what was known of them before."""
     target = np.concatenate([pairs[:, 0], pairs[:, 1]])
@@ -238,7 +395,8 @@ def _directed(
     n = len(target)
     most = np.maximum(3.0, options.most_sigma_m / np.array([v.sigma for v in views]))
     first = np.arange(len(views)) == 0
-    system = PairSystem(len(views), np.stack([target, source], 1), fixed=first)
+    joined = np.concatenate([np.stack([target, source], 1), beside.pairs])
+    system = PairSystem(len(views), joined, fixed=first)
     unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
     state = _Pairs(target, source, *unknown, most[source], system)
     lit = np.array([v.surface.has_photo for v in views]) & options.photometric
@@ -321,34 +479,96 @@ def _alone(poses: Float64, pairs: Integers, state: _Pairs) -> tuple[Float64, Flo
     return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
 
 
-def _solve(poses: Float64, state: _Pairs, known: Int64) -> tuple[Float64, Float64]:
+def _solve(poses: Float64, state: _Pairs, known: Int64, beside: Beside) -> tuple[Float64, Float64]:
     """One Gauss-Newton step: (N, 6) right perturbations of the poses, and that of the errors."""
     H, g = _without_exposure(state)
     free = 6 + np.flatnonzero(known == 0)
-    n = len(poses)
-    T_target_source = se3.inverse(poses[state.target]) @ poses[state.source]
+    n, m = len(poses), len(beside.pairs)
     system = state.system
+    i, j = system.pairs.T
+    T_i_j = se3.inverse(poses[i]) @ poses[j]
+    more_H, more_g = _steps(T_i_j[len(H) :], beside)
     # Just enough that a view which nothing holds stays.
-    still = np.broadcast_to(np.diag(_STILL / UNITS**2), (n, 6, 6)), np.zeros((n, 6))
-    matrix, gradient = system.relative(H[:, :6, :6], g[:, :6], T_target_source, still)
+    still = np.tile(np.diag(_STILL / UNITS**2), (n, 1, 1)), np.zeros((n, 6))
+    shared = _Shared(
+        [system.gradient(np.concatenate([H[:, :6, k], np.zeros((m, 6))]), T_i_j) for k in free],
+        H[:, free[:, None], free].sum(0),
+        g[:, free].sum(0),
+    )
+    firm = _STILL / _ERROR_UNIT**2 + _DAMPING * shared.small.diagonal()
+    if beside.gravity is not None:
+        firm = np.append(firm, np.zeros(2))
+        _add_gravity(poses, beside.gravity, still, shared, system)
+    matrix, gradient = system.relative(
+        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, still
+    )
     factor = system.factor(matrix, gradient, _DAMPING)
     assert factor is not None, "the poses are held, so the system is not singular"
-    # Poses by themselves, and how they follow each error: then the errors have a small system.
-    columns = [system.gradient(H[:, :6, k], T_target_source) for k in free]
+    # Poses by themselves, and how they follow what they share: then that has a small system.
+    columns, small, right = shared.columns, shared.small, shared.right
     step = _finite(factor.step())
-    follow = np.zeros((len(free), n, 6))
-    small, right = H[:, free[:, None], free].sum(0), g[:, free].sum(0)
-    firm = _STILL / _ERROR_UNIT**2 + _DAMPING * small.diagonal()
+    follow = np.zeros((len(columns), n, 6))
     for k, column in enumerate(columns):
         follow[k] = _finite(factor.solve(column))
         right[k] += column.ravel() @ step[system.free].ravel()
     for k, column in enumerate(columns):
-        small[k] += follow[:, system.free].reshape(len(free), -1) @ column.ravel()
-    small[np.diag_indices(len(free))] += firm
+        small[k] += follow[:, system.free].reshape(len(columns), -1) @ column.ravel()
+    small[np.diag_indices(len(columns))] += firm
     change = -np.linalg.solve(small, right)
     errors = np.zeros(kernels.ERRORS)
-    errors[free - 6] = change
+    errors[free - 6] = change[: len(free)]
     return step + np.tensordot(change, follow, 1), errors
+
+
+@dataclass(eq=False)
+class _Shared:
+    """Equations of unknowns that all poses share: their columns, own block, and gradient."""
+
+    columns: list[Float64]
+    small: Float64
+    right: Float64
+
+
+def _steps(T_i_j: Float64, beside: Beside) -> tuple[Float64, Float64]:
+    """Normal equations of the relative poses that are known beside what the views show."""
+    e = se3.log(se3.inverse(beside.measured) @ T_i_j)
+    J = se3.jacobian_inverse(e)
+    JtW = np.swapaxes(J, 1, 2) @ beside.information
+    return JtW @ J, (JtW @ e[..., None])[..., 0]
+
+
+def _add_gravity(
+    poses: Float64,
+    gravity: Gravity,
+    single: tuple[Float64, Float64],
+    shared: _Shared,
+    system: PairSystem,
+) -> None:
+    """Add what gravity says of single poses, and of the vertical in the world, which they share."""
+    at, d = gravity.vertices, gravity.directions
+    R = poses[at, :3, :3]
+    seen = (R @ d[..., None])[..., 0]
+    down = vertical(seen, gravity)
+    down /= np.linalg.norm(down)
+    across = np.linalg.svd(down[None])[2][1:].T  # (3, 2) directions in which it may turn
+    e = seen - down
+    known = 1 / gravity.sigma**2
+    if np.isfinite(gravity.gate):
+        known = known * robust.weight("geman-mcclure", (e * e).sum(1) * known, gravity.gate)
+    J = -R @ se3.hat(d)
+    Jt = known[:, None, None] * np.swapaxes(J, 1, 2)
+    np.add.at(single[0][:, 3:, 3:], at, Jt @ J)
+    np.add.at(single[1][:, 3:], at, (Jt @ e[..., None])[..., 0])
+    cross = np.zeros((2, len(poses), 6))
+    for k in range(2):
+        np.add.at(cross[k][:, 3:], at, -Jt @ across[:, k])
+    shared.columns += [column[system.free] for column in cross]
+    own = len(shared.small)
+    small = np.zeros((own + 2, own + 2))
+    small[:own, :own] = shared.small
+    small[own:, own:] = known.sum() * np.eye(2)
+    shared.small = small
+    shared.right = np.append(shared.right, -across.T @ (known[:, None] * e).sum(0))
 
 
 def _finite(step: Float64 | None) -> Float64:

@@ -14,7 +14,9 @@ from tofuse.kernels import refinement as kernels
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.refine import RefineOptions, refine
+from tofuse.posegraph.outside import Told
+from tofuse.posegraph.refine import Beside, RefineOptions, refine
+from tofuse.posegraph.suspicion import Suspicion, loop_gap, suspicion
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore
 from tofuse.recordings.frames import Frame
 
@@ -55,6 +57,8 @@ class Refinement:
         the depth (share), and by how much rays are wider than thought (share).
     edges
         What each pair measures by itself, in frame indices; none unless kept.
+    suspicion
+        What the views say of errors of the camera, where they were asked.
     """
 
     poses: Float64
@@ -66,6 +70,7 @@ class Refinement:
     support: tuple[float, float] = (0.0, 0.0)
     errors: dict[str, float] = field(default_factory=dict)
     edges: tuple[Measured, ...] = ()
+    suspicion: Suspicion | None = None
 
 
 class Refiner(Protocol):
@@ -75,8 +80,11 @@ class Refiner(Protocol):
         """Add the next view that has a pose, with its surface where the tracker prepared one."""
         ...
 
-    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
-        """Refine the poses (N, 4, 4) of all frames, whose indices are `ids`, ascending."""
+    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+        """Refine the poses (N, 4, 4) of all frames, whose indices are `ids`, ascending.
+
+        `told` is what other sensors say of them.
+        """
         ...
 
 
@@ -104,7 +112,7 @@ class _Idle(Refiner):
     def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
         """Keep nothing."""
 
-    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
         return Refinement(poses)
 
@@ -154,7 +162,7 @@ class _Joint(Refiner):
         if surface is not None:
             self._store.push(surface.thinned(_COLUMNS), T_world_camera)
 
-    def finish(self, ids: Sequence[int], poses: Float64) -> Refinement:
+    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
         options = self._options
         row = {int(index): k for k, index in enumerate(ids)}
@@ -164,15 +172,22 @@ class _Joint(Refiner):
             return Refinement(poses, views=len(views))
         before = poses[at]
         numbers = [_ERRORS[name] for name in options.calibrate]
-        refined = refine(views, before, options.refine, calibrate=numbers)
+        beside = _beside([v.surface.index for v in views], told or Told())
+        refined = refine(views, before, options.refine, calibrate=numbers, beside=beside)
         support = refined.before.of_views(len(views)), refined.after.of_views(len(views))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(views), len(refined.pairs), support=mean)
         if not len(refined.pairs) or mean[1] < mean[0]:
             return unchanged
         after = without_losers(before, refined.poses, support[1] < support[0] - options.loss)
+        if numbers:
+            gap = loop_gap(views, refined, refined.poses, refined.errors, options.refine)
+            found = Suspicion(gap=gap)
+        else:
+            found = suspicion(views, refined, options.refine, beside)
         return replace(
             moved_to(unchanged, at, after),
+            suspicion=found,
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
             edges=tuple(
                 Measured(views[i].surface.index, views[j].surface.index, T, H / _SHARED_NOISE)
@@ -181,6 +196,26 @@ class _Joint(Refiner):
                 )
             ),
         )
+
+
+def _beside(ids: Sequence[int], told: Told) -> Beside:
+    """What other sensors say of the views, on the scale of what their pixels say."""
+    place = {index: k for k, index in enumerate(ids)}
+    steps = told.between(ids)
+    m = len(steps)
+    gravity = told.gravity_of(ids)
+    if gravity is not None:
+        gravity = replace(
+            gravity,
+            sigma=gravity.sigma / np.sqrt(_SHARED_NOISE),
+            gate=gravity.gate * _SHARED_NOISE,
+        )
+    return Beside(
+        np.array([(place[s.i], place[s.j]) for s in steps], np.intp).reshape(m, 2),
+        np.array([s.T_i_j for s in steps]).reshape(m, 4, 4),
+        np.array([s.information * _SHARED_NOISE for s in steps]).reshape(m, 6, 6),
+        gravity,
+    )
 
 
 def without_losers(before: Float64, after: Float64, lost: NDArray[np.bool_]) -> Float64:

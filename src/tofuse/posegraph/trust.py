@@ -54,7 +54,7 @@ def pose_covariances(graph: PoseGraph) -> Float64:
         return out
     joined = parts_of(len(out), graph.edges) == 0
     try:
-        out[joined] = factor.covariances()[joined]
+        out[joined] = factor.covariances()[: len(out)][joined]
     except RuntimeError:
         return out
     return out

@@ -37,6 +37,7 @@ from tofuse.recordings.frames import (
     Frame,
     RangeFrame,
 )
+from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
 from tofuse.sensor.correction import DepthCorrection
 
@@ -104,6 +105,7 @@ class NativeSource(FileSource):
             self.reference = tum_poses(self, folder / "groundtruth.txt")
         if is_file(folder / "odometry.txt"):
             self.odometry = tum_poses(self, folder / "odometry.txt")
+        self._read_gravity()
         self._check_sizes()
         self._fill_metadata()
 
@@ -242,6 +244,18 @@ class NativeSource(FileSource):
         if rows is not None and length != rows:
             raise self._count_error(path, f"{length} rows")
         return columns
+
+    def _read_gravity(self) -> None:
+        if self.imu is None:
+            return
+        self.gravity = gravity_at(self.timestamps, self.imu)
+        path = self.folder / "imu.csv"
+        if self.gravity is None:
+            self.warnings.append(
+                f"{path}: has no columns timestamp, ax, ay, az, so it does not tell what is down"
+            )
+        elif not np.isfinite(self.gravity).any():
+            self.warnings.append(f"{path}: nothing was measured at the time of any frame")
 
     def _count_error(self, where: Path, what: str) -> InputError:
         return InputError(

@@ -30,6 +30,9 @@ class Source(Protocol):
         Only ever compared with.
     odometry
         (N, 4, 4) T_world_camera from odometry, NaN where there is none; or None.
+    gravity
+        (N, 4) unit vector in which things fall in the camera's frame, and its standard deviation
+        in rad (`recordings.imu`), NaN where there is none; or None.
     warnings
         What a person should know about how the recording was read, one line each.
     metadata
@@ -39,6 +42,7 @@ class Source(Protocol):
     timestamps: Float64
     reference: Float64 | None
     odometry: Float64 | None
+    gravity: Float64 | None
     warnings: list[str]
     metadata: dict[str, Any]
 
@@ -56,6 +60,7 @@ class ArraySource:
     odometry: Float64 | None = None
     warnings: list[str] = field(default_factory=list)
     metadata: dict[str, Any] = field(default_factory=dict)
+    gravity: Float64 | None = None
 
     def __post_init__(self) -> None:
         self.timestamps = np.array([f.timestamp for f in self.frames], float)
@@ -121,6 +126,11 @@ class Recording:
     def odometry(self) -> Float64 | None:
         """(M, 4, 4) T_world_camera of odometry, NaN where there is none; or None."""
         return None if self.source.odometry is None else self.source.odometry[self.indices]
+
+    @property
+    def gravity(self) -> Float64 | None:
+        """(M, 4) direction in which things fall and its sigma, see `Source`; or None."""
+        return None if self.source.gravity is None else self.source.gravity[self.indices]
 
     @property
     def warnings(self) -> list[str]:

@@ -32,6 +32,7 @@ class FileSource(ABC):
         self.timestamps = timestamps
         self.reference: Float64 | None = None
         self.odometry: Float64 | None = None
+        self.gravity: Float64 | None = None
         self.warnings: list[str] = []
         self.metadata: dict[str, Any] = {}
 
@@ -156,8 +157,9 @@ class JoinedSource:
         self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
         self.warnings = _joined_warnings(self.parts, names)
         self.timestamps = self._joined_times(names)
-        self.reference = _joined_poses([p.reference for p in self.parts], counts)
-        self.odometry = _joined_poses([p.odometry for p in self.parts], counts)
+        self.reference = _joined([p.reference for p in self.parts], counts, (4, 4))
+        self.odometry = _joined([p.odometry for p in self.parts], counts, (4, 4))
+        self.gravity = _joined([p.gravity for p in self.parts], counts, (4,))
         self.metadata: dict[str, Any] = dict(self.parts[0].metadata)
         for part in self.parts[1:]:
             # Only what holds for all of them.
@@ -203,12 +205,13 @@ def _joined_warnings(parts: Sequence[Source], names: Sequence[str]) -> list[str]
     ]
 
 
-def _joined_poses(poses: Sequence[Float64 | None], counts: Sequence[int]) -> Float64 | None:
-    if all(p is None for p in poses):
+def _joined(
+    known: Sequence[Float64 | None], counts: Sequence[int], shape: tuple[int, ...]
+) -> Float64 | None:
+    if all(k is None for k in known):
         return None
-    return np.concatenate(
-        [np.full((n, 4, 4), np.nan) if p is None else p for p, n in zip(poses, counts, strict=True)]
-    )
+    parts = zip(known, counts, strict=True)
+    return np.concatenate([np.full((n, *shape), np.nan) if k is None else k for k, n in parts])
 
 
 class LimitedSource:
@@ -219,6 +222,7 @@ class LimitedSource:
         self.timestamps = source.timestamps
         self.reference = source.reference
         self.odometry = source.odometry
+        self.gravity = source.gravity
         self.warnings = source.warnings
         self.metadata = source.metadata
 

@@ -194,8 +194,10 @@ class _AveragedSource:
         middle = np.array([(a + b - 1) // 2 for a, b in stretches], np.intp)
         self.timestamps: Float64 = recording.timestamps[middle]
         reference, odometry = recording.reference, recording.odometry
+        gravity = recording.gravity
         self.reference = None if reference is None else reference[middle]
         self.odometry = None if odometry is None else odometry[middle]
+        self.gravity = None if gravity is None else gravity[middle]
         self.metadata: dict[str, Any] = {
             **recording.metadata,
             "averaged": [b - a for a, b in stretches],

@@ -24,6 +24,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.suspicion import Suspicion
 from tofuse.results.types import Reconstruction
 
 UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
@@ -333,6 +334,16 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 }
                 for p in d.parts
             ],
+            "outside": [
+                {
+                    "sensor": s.sensor,
+                    "measured": s.measured,
+                    "used": s.used,
+                    "scale": s.scale,
+                    "text": s.text,
+                }
+                for s in d.outside
+            ],
             "refinement": _refinement(d.refinement),
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
@@ -352,6 +363,30 @@ def _refinement(r: Refinement | None) -> dict[str, Any] | None:
         "support_before": r.support[0],
         "support_after": r.support[1],
         "camera": r.errors,
+        "suspicion": _suspicion(r.suspicion),
+    }
+
+
+def _suspicion(s: Suspicion | None) -> dict[str, Any] | None:
+    """What the views say of their camera; None where they were not asked."""
+    if s is None:
+        return None
+    gap = s.gap
+    return {
+        "alarm": s.alarm,
+        "camera": s.errors,
+        "sigma": s.sigmas,
+        "support": s.support,
+        "loop": None
+        if gap is None
+        else {
+            "i": gap.i,
+            "j": gap.j,
+            "gap_m": gap.before[0],
+            "gap_rad": gap.before[1],
+            "calibrated_gap_m": gap.after[0],
+            "calibrated_gap_rad": gap.after[1],
+        },
     }
 
 

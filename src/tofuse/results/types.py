@@ -12,6 +12,7 @@ from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.odometry.base import Status
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
+from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
 
 Float64 = NDArray[np.float64]
@@ -63,6 +64,8 @@ class Diagnostics:
         What became of the refinement over all views.
     parts
         The connected parts of the graph, where the optimiser ran and tells them apart.
+    outside
+        What became of sensors beside the camera.
     """
 
     verdict: Verdict
@@ -76,6 +79,7 @@ class Diagnostics:
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()
+    outside: tuple[OutsideRecord, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from tofuse.sensor.correction import DepthCorrection
 from tofuse.sensor.models import CameraModel, camera_model
 from tofuse.simulation import scene as scenes
 from tofuse.simulation import sensor
+from tofuse.simulation.accelerometer import accelerations
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.simulation.render import Rendered, render
@@ -162,6 +163,7 @@ def simulate(
     correction: bool = True,
     texture: bool = True,
     axis_offset_m: float = 0.0,
+    imu: bool = False,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
 ) -> Path:
@@ -190,6 +192,8 @@ def simulate(
         False gives every surface the same albedo.
     axis_offset_m
         See `scene.build`.
+    imu
+        Whether an accelerometer on the camera is recorded as well.
     sigma_m
         Noise of "peaks" in m.
     progress
@@ -243,6 +247,7 @@ def simulate(
     return writer.finish(
         groundtruth=made.poses,
         correction=made.correction if correction else None,
+        imu=accelerations(made.sequence, times[0], times[-1], seed) if imu else None,
         frames={
             "integration_us": np.full(len(times), round(model.integration_s * 1e6)),
             "drift_m": np.array([sensor.drift(model, t) for t in times]) * effects.thermal_drift,

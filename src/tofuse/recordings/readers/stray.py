@@ -16,6 +16,7 @@ from tofuse.files.video import Video
 from tofuse.geometry import quaternion
 from tofuse.parts import part
 from tofuse.recordings.frames import UInt8
+from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.phones import (
     IMAGE_SIZE,
     PhoneSource,
@@ -31,6 +32,16 @@ Float64 = NDArray[np.float64]
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _LENS = ("fx", "fy", "cx", "cy")
+# Axes of the phone are x right, y up and z towards the face of a person; the camera's image is
+# turned by a quarter. Apple's accelerometers measure g downwards at rest.
+_IMU = {
+    "a_y": ("ax", 1.0),
+    "a_x": ("ay", 1.0),
+    "a_z": ("az", 1.0),
+    "alpha_y": ("wx", -1.0),
+    "alpha_x": ("wy", -1.0),
+    "alpha_z": ("wz", -1.0),
+}
 
 
 @part("reader", "stray", label="validated")
@@ -58,7 +69,7 @@ class StraySource(PhoneSource):
     Attributes
     ----------
     imu
-        Columns of imu.csv by name, or None.
+        Columns as those of the native imu.csv, along the axes of the depth camera; or None.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -76,6 +87,8 @@ class StraySource(PhoneSource):
         self.video = self._open_video(folder / "rgb.mp4")
         self.imu = self._read_imu(folder / "imu.csv")
         self._read_odometry(folder)
+        if self.imu is not None:
+            self.gravity = gravity_at(self.timestamps, self.imu)
 
     def read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
         """See `PhoneSource.read_color`."""
@@ -104,10 +117,16 @@ class StraySource(PhoneSource):
         if not is_file(path):
             return None
         try:
-            return read_columns(path)
+            columns = read_columns(path)
         except InputError as error:
             self.warnings.append(f"{error}: left out")
             return None
+        if not {"timestamp", *_IMU} <= set(columns):
+            self.warnings.append(f"{path}: has no columns {', '.join(_IMU)}: left out")
+            return None
+        return {"timestamp": columns["timestamp"]} | {
+            name: sign * columns[own] for own, (name, sign) in _IMU.items()
+        }
 
     def _read_odometry(self, folder: Path) -> None:
         """Take times, poses and, where newer versions of the app tell it, each frame's lens."""

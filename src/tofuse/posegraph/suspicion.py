@@ -1,0 +1,179 @@
+"""Whether all views together say that the camera errs: what is to be checked, and what it does.
+
+A focal length that is wrong, or a depth that is off, bends the path, and no single registration
+can tell. But where views overlap, and best where a path comes back, they can't all be satisfied.
+So each error is asked for by itself, with all poses free to follow. What would satisfy the views
+better is a proposal; an alarm, if it is more than a camera that came calibrated is off by, and a
+loop that neighbours alone miss closes with it.
+
+The focal length stands for other errors too: a depth that is off by a constant looks much like it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.refine import Beside, Refined, RefineOptions, Round, alone, refine, response
+from tofuse.posegraph.views import KeptView
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+# Light that comes by other ways, and pixels that see two surfaces, look like a focal length that is
+# wrong by up to a percent; cameras come calibrated to better than that. Depths are off by a
+# centimetre, where the maker's promises hold.
+TOLERANCES = {"focal": 0.02, "offset": 0.02}
+# Standard deviations by which an error must stand out, and what of the tolerance one step, which
+# falls short, must show to have a closer look.
+_SURE, _WORTH = 4.0, 0.2
+# Of the tolerance: an error that is known less well is not told.
+_VAGUE = 0.25
+_NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
+# The way to what fits may be long.
+_ROUNDS = (Round(4, 0.02, 0.1), Round(4, 0.005, 0.03), Round(6, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A loop of views that overlap one after the other, and its ends too.
+
+    `before` and `after` are by how much (m, rad) the neighbours, each aligned by itself, miss what
+    its ends say: without and with the errors that were estimated.
+    """
+
+    i: int
+    j: int
+    before: tuple[float, float]
+    after: tuple[float, float]
+
+    @property
+    def closes(self) -> bool:
+        """Whether the errors explain it: one part is less than half, the other not more."""
+        shares = [b / max(a, 1e-12) for a, b in zip(self.before, self.after, strict=True)]
+        return max(shares) <= 1 and min(shares) < 0.5
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """What the views say of errors of the camera that all of them share.
+
+    Attributes
+    ----------
+    alarm
+        Whether the camera ought to be checked.
+    errors, sigmas
+        Of each error by itself, where the views hold it, as in `Refinement.errors`, and their
+        standard deviations by how much views differ: proposals, nothing is changed by them.
+    support
+        How well the views agree without and with the error that serves best, see `refine.Support`.
+    gap
+        Of the longest loop; None where there is none, or nothing was suspected.
+    """
+
+    alarm: bool = False
+    errors: dict[str, float] = field(default_factory=dict)
+    sigmas: dict[str, float] = field(default_factory=dict)
+    support: tuple[float, float] | None = None
+    gap: Gap | None = None
+
+
+def suspicion(
+    views: Sequence[KeptView], refined: Refined, options: RefineOptions, beside: Beside
+) -> Suspicion:
+    """Ask refined views for the errors of their camera."""
+    pairs, poses = refined.pairs, refined.poses
+    if not len(pairs):
+        return Suspicion()
+    said = response(views, poses, pairs, options, beside=beside)
+    estimate, sigma = said.estimate(), said.sigma(pairs, len(views))
+    looked = [
+        name
+        for name, k in _NUMBERS.items()
+        if sigma[k] < _VAGUE * TOLERANCES[name]
+        and abs(estimate[k]) > max(_SURE * sigma[k], _WORTH * TOLERANCES[name])
+    ]
+    if not looked:
+        return Suspicion()
+    errors: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
+    best: Refined | None = None
+    for name in _NUMBERS:
+        if sigma[_NUMBERS[name]] > _VAGUE * TOLERANCES[name]:
+            continue
+        found = refine(
+            views,
+            poses,
+            replace(options, rounds=_ROUNDS),
+            calibrate=[_NUMBERS[name]],
+            beside=beside,
+        )
+        errors[name] = float(found.errors[_NUMBERS[name]])
+        sigmas[name] = float(sigma[_NUMBERS[name]])
+        if best is None or _gain(found, views) > _gain(best, views):
+            best = found
+    assert best is not None, "what was looked at is held"
+    large = any(abs(errors[name]) > TOLERANCES[name] for name in errors)
+    gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
+    alarm = gap is not None and gap.closes and _gain(best, views) > 0
+    support = float(best.before.of_views(len(views)).mean())
+    return Suspicion(alarm, errors, sigmas, (support, support + _gain(best, views)), gap)
+
+
+def _gain(found: Refined, views: Sequence[KeptView]) -> float:
+    n = len(views)
+    return float(found.after.of_views(n).mean() - found.before.of_views(n).mean())
+
+
+def loop_gap(
+    views: Sequence[KeptView],
+    refined: Refined,
+    poses: Float64,
+    errors: Float64,
+    options: RefineOptions,
+) -> Gap | None:
+    """By how much the longest loop of neighbours misses, without errors of the camera and with.
+
+    Parameters
+    ----------
+    refined
+        Where no error is assumed.
+    poses, errors
+        (N, 4, 4) and (ERRORS,) with them.
+    """
+    ends = longest_loop(refined.pairs)
+    if ends is None:
+        return None
+    i, j = ends
+    chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
+    pairs = np.concatenate([chain, [[i, j]]])
+    gaps = []
+    for at, wrong in ((refined.poses, np.zeros(kernels.ERRORS)), (poses, errors)):
+        T = se3.inverse(at[pairs[:, 0]]) @ at[pairs[:, 1]]
+        T = alone(views, pairs, T, options, wrong)
+        way = np.eye(4)
+        for step in T[:-1]:
+            way = way @ step
+        miss = se3.inverse(T[-1]) @ way
+        gaps.append((float(np.linalg.norm(miss[:3, 3])), float(se3.angle(miss))))
+    return Gap(views[i].surface.index, views[j].surface.index, gaps[0], gaps[1])
+
+
+def longest_loop(pairs: Integers) -> tuple[int, int] | None:
+    """Ends of the pair that are furthest apart in time and joined by neighbours all the way."""
+    if not len(pairs):
+        return None
+    joined = np.zeros(int(pairs.max()) + 1, bool)
+    joined[pairs[pairs[:, 1] == pairs[:, 0] + 1, 0]] = True
+    broken = np.concatenate([[0], np.cumsum(~joined)])
+    i, j = pairs.T
+    whole = (broken[j] == broken[i]) & (j > i + 1)
+    if not whole.any():
+        return None
+    k = int(np.argmax(np.where(whole, j - i, -1)))
+    return int(i[k]), int(j[k])
