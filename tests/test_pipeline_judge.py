@@ -13,7 +13,9 @@ from tofuse.geometry import se3
 from tofuse.pipeline.judge import Evidence, judge, stretches
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import GraphPart, LoopRecord, Optimisation
+from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.suspicion import Gap, Suspicion
 from tofuse.posegraph.trust import pose_covariances
 from tofuse.registration.base import Registration
 from tofuse.results.types import FrameRecord, Reason
@@ -130,6 +132,9 @@ CASES = {
     "implausible_depth": evidence(depths=(25.0,) * 9),
     "stood_still": evidence(steps=[(0.001 * (k % 2), 0, 0, 0, 0, 0) for k in range(9)]),
     "single_frame": evidence(("tracked",)),
+    "sensor_differs": replace(
+        evidence(), outside=(OutsideRecord("odometry", 8, 0, None, "it was not used"),)
+    ),
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
 }
 
@@ -314,3 +319,19 @@ def test_the_gravest_reason_decides() -> None:
     assert of("unreadable_frames", "loop_gap") == "degraded"
     assert of("loop_gap", "few_poses", "single_frame") == "failed"
     assert {force for force, _ in REASONS.values()} == {"failed", "degraded", "note"}
+
+
+def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
+    gap = Gap(2, 7, (0.33, 0.2), (0.09, 0.05))
+    found = Suspicion(True, {"focal": -0.05, "offset": -0.03}, {"focal": 0.003}, (0.6, 0.7), gap)
+    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, suspicion=found)
+    case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=refinement)
+    verdict, reasons = judge(case)
+    assert verdict == "degraded"
+    [alarm] = [r for r in reasons if r.code == "calibration_alarm"]
+    assert alarm.frames == (2, 7)
+    for words in ("0.330 m", "11.5 degrees", "focal length 5.3% larger", "ranges 30 mm shorter"):
+        assert words in alarm.text
+    # Without an alarm nothing is said.
+    calm = replace(case, refinement=replace(refinement, suspicion=replace(found, alarm=False)))
+    assert "calibration_alarm" not in [r.code for r in judge(calm)[1]]

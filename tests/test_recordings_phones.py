@@ -99,7 +99,11 @@ def test_stray(tmp_path: Path) -> None:
     frame = recording[0]
     assert isinstance(frame, RangeFrame)
     check_lens(frame, made.FX, made.CX, made.CY)
-    assert recording.source.imu["a_y"].tolist() == [-9.8]  # type: ignore[attr-defined]
+    # What the phone measures downwards in its own axes is upwards in those of the camera.
+    imu = recording.source.imu  # type: ignore[attr-defined]
+    assert [imu[name].tolist() for name in ("ax", "ay", "az", "wz")] == [[-9.8], [0], [0], [-0.5]]
+    assert recording.gravity is not None  # but nothing was measured at the time of the frames
+    assert not np.isfinite(recording.gravity).any()
 
 
 def test_stray_with_video_and_a_lens_for_each_frame(tmp_path: Path) -> None:

@@ -220,6 +220,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "frames",
         "loops",
         "optimiser",
+        "outside",
         "refinement",
         "filters",
     ]

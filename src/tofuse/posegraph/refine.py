@@ -350,7 +350,7 @@ def alone(
         (ERRORS,) that the camera is taken to have.
     """
     count = len(pairs)
-    both = [views[k] for k in pairs.ravel()]
+    both = [views[int(k)] for k in pairs.ravel()]
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
     state = _directed(

@@ -29,9 +29,11 @@ Integers = NDArray[np.intp]
 # wrong by up to a percent; cameras come calibrated to better than that. Depths are off by a
 # centimetre, where the maker's promises hold.
 TOLERANCES = {"focal": 0.02, "offset": 0.02}
-# Standard deviations by which an error must stand out, and what of the tolerance one step, which
-# falls short, must show to have a closer look.
-_SURE, _WORTH = 4.0, 0.2
+# Standard deviations by which an error must stand out, in the end and to have a closer look; and
+# what of the tolerance one step, which falls short, must show for that.
+_SURE, _LIKELY, _WORTH = 4.0, 2.5, 0.2
+# Loops are closed that miss by no more, m and rad.
+_CLOSED = (0.01, np.radians(0.5))
 # Of the tolerance: an error that is known less well is not told.
 _VAGUE = 0.25
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
@@ -54,9 +56,15 @@ class Gap:
 
     @property
     def closes(self) -> bool:
-        """Whether the errors explain it: one part is less than half, the other not more."""
-        shares = [b / max(a, 1e-12) for a, b in zip(self.before, self.after, strict=True)]
-        return max(shares) <= 1 and min(shares) < 0.5
+        """Whether the errors explain it: one part is less than half, the other not more.
+
+        A gap of less than a centimetre and half a degree says nothing, as not every error bends
+        every path.
+        """
+        parts = list(zip(self.before, self.after, _CLOSED, strict=True))
+        if any(b > max(a, least) for a, b, least in parts):
+            return False
+        return all(a < least for a, _, least in parts) or any(b < 0.5 * a for a, b, _ in parts)
 
 
 @dataclass(frozen=True)
@@ -96,7 +104,7 @@ def suspicion(
         name
         for name, k in _NUMBERS.items()
         if sigma[k] < _VAGUE * TOLERANCES[name]
-        and abs(estimate[k]) > max(_SURE * sigma[k], _WORTH * TOLERANCES[name])
+        and abs(estimate[k]) > max(_LIKELY * sigma[k], _WORTH * TOLERANCES[name])
     ]
     if not looked:
         return Suspicion()
@@ -118,7 +126,7 @@ def suspicion(
         if best is None or _gain(found, views) > _gain(best, views):
             best = found
     assert best is not None, "what was looked at is held"
-    large = any(abs(errors[name]) > TOLERANCES[name] for name in errors)
+    large = any(abs(e) > max(TOLERANCES[n], _SURE * sigmas[n]) for n, e in errors.items())
     gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
     alarm = gap is not None and gap.closes and _gain(best, views) > 0
     support = float(best.before.of_views(len(views)).mean())
