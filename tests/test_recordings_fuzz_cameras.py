@@ -13,6 +13,7 @@ import made_arrays
 import made_ifm
 import made_kinect
 import made_phones
+import made_sens
 from test_recordings_fuzz import damage
 from tofuse.errors import TofuseError
 from tofuse.recordings.open import open_recording
@@ -25,6 +26,7 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "mkv": (made_kinect.make_small_mkv, "a.mkv", "azure-kinect"),
     "o3r": (made_ifm.make_o3r, "a.data", "ifm-o3r"),
     "npz": (made_arrays.make_npz, "a.npz", "npz"),
+    "sens": (made_sens.make_sens, "a.sens", "sens"),
     "zense": (made_arrays.make_zense, None, "zense"),
     "r3d": (made_phones.make_r3d, "scan.r3d", "record3d"),
 }

@@ -1,0 +1,218 @@
+"""Readers of scans: LAS and LAZ by laspy, E57 by pye57 (the extra `scan`)."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_head
+from tofuse.geometry.quaternion import to_matrix
+from tofuse.parts import part
+from tofuse.recordings.cloud_files import (
+    MAP_COORDINATES_M,
+    CloudFileSource,
+    needed_files,
+    sniff_clouds,
+)
+from tofuse.recordings.frames import CloudFrame
+from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
+
+Float64 = NDArray[np.float64]
+
+MAX_POINTS = 100_000_000
+_STEP_M = 1000.0  # coordinates of maps are moved by whole kilometres
+_MISSING = "give `pip install 'tofuse[scan]'`"
+
+
+@part("reader", "las")
+@dataclass(frozen=True)
+class LasScans:
+    """A .las or .laz file, or a folder of them; metres."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        return sniff_clouds(path, ".las", ".laz")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "las")
+        files = needed_files(path, ".las", ".laz")
+        shift = _shift(files[0])
+        source = CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
+        if shift.any():
+            source.metadata["shift_m"] = shift.tolist()
+            text = ", ".join(f"{value:.0f}" for value in shift)
+            source.warnings.append(f"{path}: coordinates are those of the files less ({text}) m")
+        return source
+
+
+def _laspy(path: Path) -> Any:
+    try:
+        return importlib.import_module("laspy")
+    except ImportError as error:
+        raise InputError("needs the package laspy", where=path, remedy=_MISSING) from error
+
+
+def _las_header(path: Path) -> Any:
+    laspy = _laspy(path)
+    if read_head(path, 4) != b"LASF":
+        raise InputError("isn't a LAS file", where=path, remedy="check the file")
+    try:
+        with laspy.open(path) as file:
+            header = file.header
+    except Exception as error:  # laspy raises what comes along
+        raise _damaged(error, path) from error
+    count, size = int(header.point_count), int(header.point_format.size)
+    whole = path.stat().st_size
+    packed = bool(getattr(header, "are_points_compressed", False))
+    if count > MAX_POINTS or (not packed and count * size > whole):
+        raise InputError(
+            f"claims {count} points in {whole} bytes", where=path, remedy="copy the file again"
+        )
+    return header
+
+
+def _shift(path: Path) -> Float64:
+    """Return what to take off the coordinates of a map, so that float32 holds the rest."""
+    header = _las_header(path)
+    low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return np.zeros(3)
+    if max(np.abs(low).max(), np.abs(high).max()) <= MAP_COORDINATES_M:
+        return np.zeros(3)
+    return np.round((low + high) / 2 / _STEP_M) * _STEP_M
+
+
+def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
+    _las_header(path)
+    try:
+        points = _laspy(path).read(path)
+        xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1) - shift
+        names = set(points.point_format.dimension_names)
+        amplitude = np.asarray(points["intensity"], np.float32)
+        color = None
+        if {"red", "green", "blue"} <= names:
+            wide = np.stack([np.asarray(points[c]) for c in ("red", "green", "blue")], 1)
+            # The standard has 16 bits; many programs fill 8 of them.
+            color = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
+    except InputError:
+        raise
+    except Exception as error:
+        raise _damaged(error, path) from error
+    return cloud_frame(
+        index,
+        timestamp,
+        xyz.astype(np.float32),
+        amplitude=amplitude if amplitude.any() else None,
+        color=color if color is not None and color.any() else None,
+    )
+
+
+@part("reader", "e57")
+@dataclass(frozen=True)
+class E57Scans:
+    """A .e57 file: one view for each scan in it, in the scanner's frame; its poses to compare."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        file = file_of(path, ".e57")
+        try:
+            if file is not None and read_head(file, 8) == b"ASTM-E57":
+                return Sniff(1.0, "an E57 file")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> E57Source:
+        """See `Reader.open`."""
+        refuse_camera(options, "e57")
+        return E57Source(needed_file(path, ".e57"))
+
+
+class E57Source(FileSource):
+    """Scans of a file, read when they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if read_head(path, 8) != b"ASTM-E57":
+            raise InputError("isn't an E57 file", where=path, remedy="check the file")
+        try:
+            self._pye57 = importlib.import_module("pye57")
+        except ImportError as error:
+            raise InputError("needs the package pye57", where=path, remedy=_MISSING) from error
+        try:
+            file = self._pye57.E57(str(path))
+            try:
+                headers = [file.get_header(k) for k in range(file.scan_count)]
+                self.counts = [int(header.point_count) for header in headers]
+                poses = [self._pose(header) for header in headers]
+            finally:
+                file.close()
+        except Exception as error:  # the library raises what comes along
+            raise _damaged(error, path) from error
+        if not self.counts:
+            raise InputError("holds no scan", where=path, remedy="export scans, not only pictures")
+        super().__init__(np.arange(len(self.counts), dtype=float))
+        self.reference = np.full((len(poses), 4, 4), np.nan)
+        for k, pose in enumerate(poses):
+            try:
+                self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
+            except InputError as error:
+                self.warnings.append(f"{error}; left out")
+
+    def load(self, index: int) -> CloudFrame:
+        """See `FileSource.load`."""
+        where = f"{self.path}: scan {index}"
+        if self.counts[index] > MAX_POINTS:
+            raise InputError(f"claims {self.counts[index]} points", where=where)
+        try:
+            file = self._pye57.E57(str(self.path))
+            try:
+                data = file.read_scan(
+                    index, intensity=True, colors=True, ignore_missing_fields=True, transform=False
+                )
+            finally:
+                file.close()
+            points = np.stack([np.asarray(data[f"cartesian{a}"], float) for a in "XYZ"], 1)
+        except Exception as error:
+            raise _damaged(error, where) from error
+        color = None
+        if all(f"color{c}" in data for c in ("Red", "Green", "Blue")):
+            color = np.stack([np.asarray(data[f"color{c}"]) for c in ("Red", "Green", "Blue")], 1)
+            color = color.astype(np.uint8)
+        amplitude = data.get("intensity")
+        return cloud_frame(
+            index,
+            float(index),
+            points.astype(np.float32),
+            amplitude=None if amplitude is None else np.asarray(amplitude, np.float32),
+            color=color,
+        )
+
+    def _pose(self, header: Any) -> Float64:
+        pose = np.eye(4)
+        if header.has_pose():
+            w, x, y, z = (float(value) for value in header.rotation)
+            pose[:3, :3] = to_matrix(np.array([x, y, z, w]))
+            pose[:3, 3] = header.translation
+        return pose
+
+
+def _damaged(error: Exception, where: str | Path) -> InputError:
+    return InputError(
+        f"can't be read ({type(error).__name__}: {str(error)[:200]})",
+        where=where,
+        remedy="copy or export it again",
+    )

@@ -1,0 +1,246 @@
+"""Reader of ScanNet's .sens files (version 4)."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import as_color, parse_image
+from tofuse.files.reading import input_error, read_head
+from tofuse.geometry.cameras import Pinhole
+from tofuse.geometry.se3 import inverse
+from tofuse.parts import part
+from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
+from tofuse.recordings.color import sampled_color
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
+
+Float64 = NDArray[np.float64]
+
+VERSION = 4
+RAW, ZLIB, OCCI = 0, 1, 2  # how depth is compressed
+_COLORS = {0: "raw", 1: "png", 2: "jpeg"}
+_FRAME = struct.Struct("<16f4Q")
+_SHAPES = struct.Struct("<2i4IfQ")
+_MAX_SIDE = 8192
+_MAX_NAME = 4096
+_TIMES_PER_S = 1e6
+_RATE_HZ = 30.0
+
+
+@part("reader", "sens")
+@dataclass(frozen=True)
+class Sens:
+    """A .sens file: depth, colour, both lenses, and the poses of ScanNet to compare with."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        file = file_of(path, ".sens")
+        try:
+            if file is not None and read_head(file, 4) == struct.pack("<I", VERSION):
+                return Sniff(1.0, "a .sens file")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> SensSource:
+        """See `Reader.open`."""
+        return SensSource(needed_file(path, ".sens"), options)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A frame: where its images lie in the file, and how long they are."""
+
+    start: int
+    color: int
+    depth: int
+
+
+class SensSource(FileSource):
+    """Frames found by walking over the file once, and read one by one."""
+
+    def __init__(self, path: Path, options: ReaderOptions) -> None:
+        self.path = path
+        super().__init__(np.zeros(0))
+        try:
+            with path.open("rb") as file:
+                self._size = file.seek(0, 2)
+                file.seek(0)
+                count = self._read_header(file)
+                found = list(self._walk(file, count))
+        except OSError as error:
+            raise input_error(error, path) from error
+        if not found:
+            raise self._error("holds no whole frame", "copy the file again")
+        self.entries = [entry for entry, _, _ in found]
+        times = np.array([time for _, time, _ in found]) / _TIMES_PER_S
+        self.timestamps = times if times.any() else np.arange(len(found)) / _RATE_HZ
+        check_timestamps(self.timestamps, path, self.warnings)
+        if len(found) < count:
+            self.warnings.append(f"{path}: cut off after {len(found)} of {count} frames")
+        self.reference = self._poses([pose for _, _, pose in found])
+        if options.camera is not None:
+            about, camera = load_camera(options.camera)
+            if (camera.width, camera.height) != self.depth_size or not isinstance(camera, Pinhole):
+                raise InputError(
+                    f"isn't a lens of {self.depth_size[0]} x {self.depth_size[1]} pixels",
+                    where=options.camera,
+                    remedy="give the depth camera's",
+                )
+            self.camera, self.unit = camera, about.depth_unit_m
+        self.metadata |= {
+            "sensor": self.sensor,
+            "depth_unit_m": self.unit,
+            "depth_kind": "z",
+            "frame_rate_hz": _RATE_HZ,
+        }
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        entry, where = self.entries[index], f"{self.path}: frame {index}"
+        try:
+            with self.path.open("rb") as file:
+                file.seek(entry.start)
+                packed_color, packed_depth = file.read(entry.color), file.read(entry.depth)
+        except OSError as error:
+            raise input_error(error, self.path) from error
+        counts = self._depth(packed_depth, where)
+        depth = depth_from_counts(counts, self.unit)
+        frame = RangeFrame(index, float(self.timestamps[index]), self.camera, depth)
+        if not packed_color or self.color is None:
+            return frame
+        image = self._color(packed_color, where)
+        return RangeFrame(
+            index,
+            frame.timestamp,
+            self.camera,
+            depth,
+            color_image=sampled_color(frame, image, self.color),
+        )
+
+    def _read_header(self, file: BinaryIO) -> int:
+        version, length = struct.unpack("<IQ", self._take(file, 12))
+        if version != VERSION or length > _MAX_NAME:
+            raise self._error(f"isn't a .sens file of version {VERSION}", "export it again")
+        self.sensor = self._take(file, length).decode("utf-8", "replace")[:200] or "ScanNet"
+        matrices = np.frombuffer(self._take(file, 256), "<f4").reshape(4, 4, 4).astype(float)
+        shapes = _SHAPES.unpack(self._take(file, _SHAPES.size))
+        self.color_packing, self.depth_packing = shapes[:2]
+        color_size, self.depth_size = (shapes[2], shapes[3]), (shapes[4], shapes[5])
+        per_metre, count = shapes[6], int(shapes[7])
+        if not all(1 < side <= _MAX_SIDE for side in self.depth_size):
+            raise self._error(f"has depth images of {self.depth_size}", "export it again")
+        if self.depth_packing not in (RAW, ZLIB):
+            raise self._error(
+                f"has depth compressed by method {self.depth_packing}", "export it with zlib"
+            )
+        if not 1 <= per_metre <= 1e6:
+            raise self._error(f"has {per_metre} counts to a metre", "export it again")
+        self.unit = 1.0 / per_metre
+        color_lens, color_place, depth_lens, depth_place = matrices
+        self.camera = self._lens(depth_lens, self.depth_size, "depth")
+        self.color: ColorCamera | None = None
+        if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
+            self.color = ColorCamera(
+                self._lens(color_lens, color_size, "color"),
+                self._T_color_depth(color_place, depth_place),
+            )
+        return count
+
+    def _T_color_depth(self, T_device_color: Float64, T_device_depth: Float64) -> Float64:
+        """Return where the depth camera is seen from the colour camera; identity if not told."""
+        try:
+            places = [
+                read_matrix_pose(T, f"{self.path}: extrinsics")
+                for T in (T_device_color, T_device_depth)
+            ]
+        except InputError as error:
+            self.warnings.append(f"{error}; colour is taken from the place of depth")
+            return np.eye(4)
+        if not np.isfinite(places).all():
+            return np.eye(4)
+        return inverse(places[0]) @ places[1]
+
+    def _lens(self, matrix: Float64, size: tuple[int, int], name: str) -> Pinhole:
+        values = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+        numbers = {key: float(value) for key, value in values.items()}
+        return checked_lens(Pinhole, size, numbers, f"{self.path}: {name} lens")
+
+    def _walk(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
+        """Find frames until the file ends; what is cut off is left out."""
+        at = file.tell()
+        for _ in range(count):
+            file.seek(at)
+            head = file.read(_FRAME.size)
+            if len(head) < _FRAME.size:
+                return
+            *pose, _, time, color, depth = _FRAME.unpack(head)
+            start = at + _FRAME.size
+            at = start + color + depth
+            if at > self._size:
+                return
+            yield _Entry(start, color, depth), time, np.array(pose).reshape(4, 4)
+
+    def _poses(self, tables: list[Float64]) -> Float64 | None:
+        """Return T_world_camera; the format writes minus infinity where tracking was lost."""
+        poses = np.full((len(tables), 4, 4), np.nan)
+        wrong = 0
+        for k, table in enumerate(tables):
+            try:
+                poses[k] = read_matrix_pose(table, f"{self.path}: pose of frame {k}")
+            except InputError:
+                wrong += 1
+        if wrong:
+            self.warnings.append(f"{self.path}: {wrong} poses are no rigid motions, and left out")
+        return poses if np.isfinite(poses[:, 0, 0]).any() else None
+
+    def _depth(self, packed: bytes, where: str) -> NDArray[np.uint16]:
+        width, height = self.depth_size
+        expected = 2 * width * height
+        if self.depth_packing == ZLIB:
+            unpacker = zlib.decompressobj()
+            try:
+                packed = unpacker.decompress(packed, expected + 1)
+            except zlib.error as error:
+                raise InputError(
+                    f"has damaged depth ({error})", where=where, remedy="copy the file again"
+                ) from error
+        if len(packed) != expected:
+            raise InputError(
+                f"has {len(packed)} bytes of depth, not {expected}",
+                where=where,
+                remedy="copy the file again",
+            )
+        return np.frombuffer(packed, "<u2").reshape(height, width)
+
+    def _color(self, packed: bytes, where: str) -> NDArray[np.uint8]:
+        assert self.color is not None
+        size = (self.color.camera.width, self.color.camera.height)
+        if self.color_packing != RAW:
+            return as_color(parse_image(packed, f"{where}: colour", size=size))
+        if len(packed) != 3 * size[0] * size[1]:
+            raise InputError(f"has {len(packed)} bytes of colour", where=where)
+        return np.frombuffer(packed, np.uint8).reshape(size[1], size[0], 3)
+
+    def _take(self, file: BinaryIO, count: int) -> bytes:
+        data = file.read(count)
+        if len(data) < count:
+            raise self._error("is cut off", "copy the file again")
+        return data
+
+    def _error(self, problem: str, remedy: str) -> InputError:
+        return InputError(problem, where=self.path, remedy=remedy)
