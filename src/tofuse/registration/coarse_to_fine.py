@@ -19,7 +19,7 @@ from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
 from tofuse.registration.pairs import FEWEST_PAIRS
-from tofuse.registration.reduce import averaged
+from tofuse.registration.reduce import averaged, reduced
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All
 from tofuse.registration.shape import shape_at
@@ -94,6 +94,9 @@ class CoarseToFine(Registrar):
         Points of each plane fit.
     max_iterations
         Of each level.
+    coarsest
+        Resolution of the coarsest level, m, at most: for guesses that are that good. None: a tenth
+        of the scene.
     """
 
     resolution: float | None = None
@@ -102,11 +105,14 @@ class CoarseToFine(Registrar):
     reach: float = 3.0
     neighbours: int = 12
     max_iterations: int = 40
+    coarsest: float | None = None
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         if self.resolution is not None and not 0 < self.resolution < math.inf:
             raise ValueError(f"resolution is {self.resolution}, not a length in metres")
+        if self.coarsest is not None and not self.coarsest > 0:
+            raise ValueError(f"coarsest is {self.coarsest}, not above 0")
         if self.points < _SMALLEST_LEVEL:
             raise ValueError(f"points is {self.points}, not {_SMALLEST_LEVEL} or more")
 
@@ -128,7 +134,9 @@ class CoarseToFine(Registrar):
                 )
         fine = self._finest(source, target)
         levels = [fine]
-        while levels[-1][0] * 2 * _EXTENT_SHARE < _extent(fine[2]):
+        most = _extent(fine[2]) / _EXTENT_SHARE
+        most = most if self.coarsest is None else min(most, self.coarsest)
+        while levels[-1][0] * 2 < most:
             resolution = 2 * levels[-1][0]
             coarser = resolution, averaged(fine[1], resolution), averaged(fine[2], resolution)
             if min(len(coarser[1]), len(coarser[2])) < _SMALLEST_LEVEL:
@@ -167,13 +175,7 @@ class CoarseToFine(Registrar):
             size = self.resolution
             return size, averaged(source, size), averaged(target, size)
         size = max(spacing(source), spacing(target))
-        while True:
-            data, model = averaged(source, size), averaged(target, size)
-            most = max(len(data), len(model))
-            if most <= self.points:
-                break
-            # Points lie on surfaces: their number falls with the square of the edge.
-            size *= 1.02 * max(1.05, math.sqrt(most / self.points))
+        size, data, model = reduced(source, target, size, self.points)
         # Averaging thins noise, but not what is rough in itself: that keeps its first size.
         first = size, data, model
         while max(self._roughness(data), self._roughness(model)) > _ROUGHEST:

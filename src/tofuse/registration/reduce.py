@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from tofuse.recordings.frames import CloudFrame, Frame
@@ -24,3 +26,19 @@ def averaged(view: Frame, size: float) -> CloudFrame:
     return CloudFrame(
         view.index, view.timestamp, means.astype(np.float32), origin=np.asarray(view.origin)
     )
+
+
+def reduced(
+    source: Frame, target: Frame, size: float, most: int
+) -> tuple[float, CloudFrame, CloudFrame]:
+    """Return both views averaged alike, with at most so many points each, and the cubes' edges.
+
+    The edges are of `size` m, or longer where that leaves too many points.
+    """
+    while True:
+        data, model = averaged(source, size), averaged(target, size)
+        count = max(len(data), len(model))
+        if count <= most:
+            return size, data, model
+        # Points lie on surfaces: their number falls with the square of the edge.
+        size *= 1.02 * max(1.05, math.sqrt(count / most))

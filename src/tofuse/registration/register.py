@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofuse.errors import InputError
+from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import CoarseToFine
+from tofuse.registration.fpfh import Fpfh
 
 Float64 = NDArray[np.float64]
 
 _FEWEST_POINTS = 10
 _FURTHEST_M = 1e9
+# Share of the points with a partner below which a start is doubted, and how many times as many
+# another one must give.
+_LEAST_SHARE, _CLEARLY = 1 / 3, 1.5
 
 
 def register(
@@ -34,7 +39,9 @@ def register(
     source, target
         Frames of a recording, or arrays; non-finite points are dropped.
     guess
-        (4, 4) T_target_source to start from; the identity unless given.
+        (4, 4) T_target_source to start from. Unless given, the identity; and where from there
+        less than a third of the points find a partner, and no method is given, the views are
+        registered without a guess as well (`Fpfh`), which counts if more of them do by half.
     method
         What registers; unless given, generalised ICP with a robust loss from coarse to fine, at
         resolutions found from the points: `CoarseToFine`.
@@ -57,11 +64,41 @@ def register(
     """
     start = np.eye(4) if guess is None else se3.check_pose(guess, where="guess")
     rng = np.random.default_rng([seed, 0])
-    method = CoarseToFine() if method is None else method
+    if method is None:
+        method = CoarseToFine() if guess is not None else _NoGuess()
     if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
         views = _view(source, "source"), _view(target, "target")
         return method.register(*views, start, rng)
     return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
+
+
+@dataclass(frozen=True)
+class _NoGuess(Registrar):
+    """From the identity, and where that leads nowhere, from what is alike in both views."""
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`."""
+        near, failure = None, None
+        try:
+            near = CoarseToFine().register(source, target, guess, rng)
+        except RegistrationError as error:
+            failure = error
+        if near is not None and near.share >= _LEAST_SHARE:
+            return near
+        try:
+            far = Fpfh().register(source, target, guess, rng)
+        except RegistrationError:
+            far = None
+        if far is not None and (near is None or far.share > _CLEARLY * near.share):
+            return far
+        if near is None:
+            assert failure is not None
+            raise failure
+        return near
 
 
 def _register_arrays(
