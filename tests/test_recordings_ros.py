@@ -16,7 +16,8 @@ from test_recordings_fuzz import damage
 from test_recordings_fuzz_cameras import read_through
 from tofuse.errors import InputError
 from tofuse.files.images import png_bytes
-from tofuse.geometry.cameras import BrownConrady, Fisheye
+from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
+from tofuse.recordings import bags
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.readers import ros
@@ -73,18 +74,18 @@ class Bag:
         rows = np.pad(rows, ((0, 0), (0, pad)))
         self.write(
             topic,
-            ros._IMAGE,
+            ros.IMAGE,
             time,
             self.make(
-                ros._IMAGE, self.header(time), height, width, encoding, 0, rows.shape[1],
+                ros.IMAGE, self.header(time), height, width, encoding, 0, rows.shape[1],
                 rows.ravel(),
             ),
         )  # fmt: skip
 
     def compressed(self, topic: str, time: float, data: bytes, format_: str) -> None:
         content = np.frombuffer(data, np.uint8)
-        message = self.make(ros._COMPRESSED, self.header(time), format_, content)
-        self.write(topic, ros._COMPRESSED, time, message)
+        message = self.make(ros.COMPRESSED, self.header(time), format_, content)
+        self.write(topic, ros.COMPRESSED, time, message)
 
     def info(
         self, topic: str, model: str = "plumb_bob", D: tuple[float, ...] = (0.1, 0.02)
@@ -93,19 +94,22 @@ class Bag:
         roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         D = (*D, *(0.0,) * (5 - len(D)))
         values = (12, 16, model, np.array(D), K, np.eye(3).ravel(), np.zeros(12), 0, 0, roi)
-        self.write(topic, ros._INFO, 10.0, self.make(ros._INFO, self.header(10.0), *values))
+        self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
 
-    def cloud(self, topic: str, time: float, points: np.ndarray, light: np.ndarray) -> None:
+    def cloud(
+        self, topic: str, time: float, points: np.ndarray, light: np.ndarray, height: int = 1
+    ) -> None:
         field = "sensor_msgs/msg/PointField"
         names = ("x", "y", "z", "intensity")
         fields = [self.make(field, n, 4 * k, 7, 1) for k, n in enumerate(names)]
         data = np.concatenate([points, light[:, None]], 1).astype("<f4")
         content = np.frombuffer(data.tobytes(), np.uint8)
         message = self.make(
-            ros._CLOUD, self.header(time), 1, len(data), fields, False, 16, 16 * len(data),
+            ros.CLOUD, self.header(time), height, len(data) // height, fields, False, 16,
+            16 * len(data) // height,
             content, True,
         )  # fmt: skip
-        self.write(topic, ros._CLOUD, time, message)
+        self.write(topic, ros.CLOUD, time, message)
 
     def close(self) -> Path:
         self.writer.close()
@@ -189,6 +193,176 @@ def test_clouds(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.amplitude, light[keep])
 
 
+def test_organised_clouds_are_images(tmp_path: Path) -> None:
+    """Clouds in rows and columns that lie on a camera's rays keep the grid, and get the camera."""
+    bag = Bag(tmp_path, "ros2")
+    z = RNG.uniform(1, 3, (4, 12, 16)).astype(np.float32)
+    z[:, 2, 3] = np.nan
+    v, u = np.mgrid[:12, :16].astype(np.float32)
+    light = RNG.uniform(size=(4, 192)).astype(np.float32)
+    for k in range(4):
+        points = np.stack([(u - 7.5) / 20 * z[k], (v - 5.5) / 21 * z[k], z[k]], -1)
+        bag.cloud("/tof/points", 10 + k, points.reshape(-1, 3), light[k], height=12)
+    recording = open_recording(bag.close())
+    for k in (0, 3):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        np.testing.assert_allclose(frame.z[frame.valid], z[k][np.isfinite(z[k])], rtol=1e-6)
+        assert frame.valid.sum() == 191
+        np.testing.assert_allclose(frame.camera.rays()[4, 9], (1.5 / 20, -1.5 / 21), atol=1e-5)
+        np.testing.assert_array_equal(frame.amplitude_image, light[k].reshape(12, 16))
+
+
+def test_infrared_of_the_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/camera/depth/camera_info")
+    bright = RNG.integers(0, 4000, (3, 12, 16)).astype(np.uint16)
+    for k in range(3):
+        bag.image(TOPIC, 10 + k / 10, COUNTS[k], "16UC1")
+        bag.image("/camera/infra_wide/image", 10 + k / 10, np.zeros((12, 20), np.uint16), "mono16")
+        if k != 1:
+            bag.image("/camera/ir/image_raw", 10.002 + k / 10, bright[k], "mono16")
+    recording = open_recording(bag.close())
+    assert recording.metadata["amplitude_topic"] == "/camera/ir/image_raw"
+    for k, expected in ((0, bright[0]), (1, np.zeros((12, 16))), (2, bright[2])):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        np.testing.assert_array_equal(frame.amplitude_image, expected)
+
+
+def test_the_topic_can_be_chosen(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/a/depth/camera_info")
+    bag.info("/b/depth/camera_info")
+    bag.image("/a/depth/image_raw", 10, COUNTS[0], "16UC1")
+    bag.image("/b/depth/image_raw", 10, COUNTS[1], "16UC1")
+    path = bag.close()
+    assert open_recording(path).metadata["topic"] == "/a/depth/image_raw"
+    recording = open_recording(path, topic="/b/depth/image_raw")
+    assert recording.warnings == []
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    np.testing.assert_allclose(frame.z, COUNTS[1] / 1000, rtol=1e-6)
+    with pytest.raises(InputError, match=r"has no images or clouds at /c .*/a/depth/image_raw"):
+        open_recording(path, topic="/c")
+
+
+def real_sense(folder: Path, kind: str, model: str, *, name: str) -> Path:
+    """A bag as RealSense's SDK writes it: .bag with CameraInfo, newer .db3 with text."""
+    bag = Bag(folder, kind)
+    stream = "/device_0/sensor_0/Depth_0"
+    D = (0.1, 0.02, 0.001, -0.002, 0.01)
+    text, number = "std_msgs/msg/String", "std_msgs/msg/Float32"
+    if kind == "ros1":
+        bag.info(f"{stream}/info/camera_info", model, D if model != "None" else (0.0,))
+        bag.write("/device_0/sensor_0/option/Depth_Units/value", number, 1.0,
+                  bag.make(number, 0.00025))  # fmt: skip
+    else:
+        coeffs = ",".join(map(str, D if model != "None" else (0,) * 5))
+        lens = f"width=16;height=12;fx=20;ppx=7.5;fy=21;ppy=5.5;model={model};coeffs={coeffs}"
+        bag.write(f"{stream}/camera_info", text, 1.0, bag.make(text, lens))
+        bag.write("/device_0/sensor_0/option/Depth_Units/value", text, 1.0,
+                  bag.make(text, "0.000250"))  # fmt: skip
+    pair = "diagnostic_msgs/msg/KeyValue"
+    for key, value in (("Serial Number", "f0001"), ("Name", name)):
+        bag.write("/device_0/info", pair, 1.0, bag.make(pair, key, value))
+    for k in range(3):
+        bag.image(f"{stream}/image/data", 10 + k / 30, COUNTS[k], "mono16")
+        infrared = (COUNTS[k] % 250).astype(np.uint8)
+        bag.image("/device_0/sensor_0/Infrared_0/image/data", 10 + k / 30, infrared, "mono8")
+    return bag.close()
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])
+def test_realsense_bags(tmp_path: Path, kind: str) -> None:
+    recording = open_recording(real_sense(tmp_path, kind, "None", name="Intel RealSense L515"))
+    assert (recording.format, len(recording)) == ("realsense-bag", 3)
+    assert recording.metadata["sensor"] == "Intel RealSense L515"
+    for k in (0, 2, 1):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        assert frame.camera == Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
+        np.testing.assert_allclose(frame.z, COUNTS[k] * 0.00025, rtol=1e-6)
+        np.testing.assert_array_equal(frame.amplitude_image, COUNTS[k] % 250)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])
+def test_realsense_stereo_and_lenses(tmp_path: Path, kind: str) -> None:
+    path = real_sense(tmp_path, kind, "Inverse Brown Conrady", name="Intel RealSense D435")
+    frame = open_recording(path)[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.amplitude_image is None  # infrared of another viewpoint
+    brown = BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, 0.1, 0.02, 0.001, -0.002, 0.01)
+    straight = np.array([(3 - 7.5) / 20, (9 - 5.5) / 21, 1.0])
+    u, v = brown.project(straight)
+    expected = ((u - 7.5) / 20, (v - 5.5) / 21)
+    np.testing.assert_allclose(frame.camera.rays()[9, 3], expected, atol=1e-6)
+    with pytest.raises(InputError, match="--topic"):
+        open_recording(path, topic="/device_0/sensor_0/Depth_0/image/data")
+
+
+def orbbec(folder: Path, distortion: tuple[float, ...]) -> Path:
+    """A bag as Orbbec's SDK writes it: ROS's images with more fields behind, an own profile."""
+    bag = Bag(folder, "ros1")
+    header = struct.pack("<4I", 0, 10, 0, 3) + b"cam"
+    profile = header + struct.pack(
+        "<2B9f3f3H4f8fB", 3, 10, *np.eye(3).ravel(), 0, 0, 0, 16, 12, 15, 20, 21, 7.5, 5.5,
+        *distortion, 1,
+    )  # fmt: skip
+    kinds = {
+        "/cam/streamProfileType_3": "custom_msg/msg/OBStreamProfileInfo",
+        "/cam/sensor_3/frameType_3": "sensor_msgs/msg/Image",
+        "/cam/sensor_1/frameType_1": "sensor_msgs/msg/Image",
+    }
+    definition = "Header header\nuint8 streamType\n"
+    connections = {
+        topic: bag.writer.add_connection(topic, kind, msgdef=definition, md5sum="0" * 32)
+        for topic, kind in kinds.items()
+    }
+    bag.writer.write(connections["/cam/streamProfileType_3"], 10**10, profile)
+    for k in range(3):
+        for topic, counts in (
+            ("/cam/sensor_3/frameType_3", COUNTS[k]),
+            ("/cam/sensor_1/frameType_1", COUNTS[k] // 2),
+        ):
+            time = 10 + k / 15
+            head = struct.pack("<4I", k, int(time), round(time % 1 * 1e9), 3) + b"cam"
+            body = struct.pack("<3I", 12, 16, 6) + b"mono16" + struct.pack("<BII", 0, 32, 384)
+            raw = head + body + counts.astype("<u2").tobytes() + struct.pack("<QQ", 5, 6)
+            bag.writer.write(connections[topic], round(time * 1e9), raw)
+    return bag.close()
+
+
+def test_orbbec_bags(tmp_path: Path) -> None:
+    k = (0.5, -2.6, 1.4, 0.4, -2.4, 1.4, 0.0001, -0.0002)  # k1 to k6, then p1 and p2
+    recording = open_recording(orbbec(tmp_path, k))
+    assert (recording.format, len(recording)) == ("orbbec-bag", 3)
+    assert np.diff(recording.timestamps) == pytest.approx(1 / 15, abs=1e-6)
+    for index in (0, 2, 1):
+        frame = recording[index]
+        assert isinstance(frame, RangeFrame)
+        assert isinstance(frame.camera, Rational)
+        assert (frame.camera.k3, frame.camera.p1) == pytest.approx((1.4, 0.0001))
+        np.testing.assert_allclose(frame.z, COUNTS[index] / 1000, rtol=1e-6)
+        np.testing.assert_array_equal(frame.amplitude_image, COUNTS[index] // 2)
+
+
+@pytest.mark.parametrize("maker", ["realsense", "orbbec"])
+def test_damaged_bags_of_makers(tmp_path: Path, maker: str) -> None:
+    if maker == "realsense":
+        path = real_sense(tmp_path, "ros1", "None", name="Intel RealSense L515")
+    else:
+        path = orbbec(tmp_path, (0.0,) * 8)
+    content, seen = path.read_bytes(), np.zeros(3, int)
+    for k in range(40):
+        damage([path], np.random.default_rng([102, k]))
+        seen += read_through(path, f"{maker}-bag")
+        if path.is_dir():
+            path.rmdir()
+        path.write_bytes(content)
+    assert seen[1] + seen[2] > 0
+
+
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
@@ -235,6 +409,6 @@ def test_without_rosbags_it_is_said_how_to_get_it(
             raise ImportError(name)
         return found(name)
 
-    monkeypatch.setattr(ros.importlib, "import_module", missing)
+    monkeypatch.setattr(bags.importlib, "import_module", missing)
     with pytest.raises(InputError, match=r"is a ROS bag; give `pip install 'tofuse\[ros\]'`"):
         open_recording(tmp_path / "a.bag")

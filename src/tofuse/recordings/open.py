@@ -24,6 +24,7 @@ def open_recording(
     *paths: str | Path,
     format: str | None = None,  # noqa: A002
     camera: str | Path | None = None,
+    topic: str | None = None,
     min_depth: float | None = None,
     max_depth: float | None = None,
 ) -> Recording:
@@ -38,6 +39,8 @@ def open_recording(
         Name of a reader, where guessing isn't wanted.
     camera
         A camera.json that replaces the recording's own camera.
+    topic
+        Which topic of a bag holds the depth images or clouds, where guessing isn't wanted.
     min_depth, max_depth
         Points nearer or farther are left out, in m: by z in images, by distance in clouds.
 
@@ -50,7 +53,7 @@ def open_recording(
     if not paths:
         raise InputError("no recording was given", remedy="give a path")
     _check_depths(min_depth, max_depth)
-    options = ReaderOptions(None if camera is None else Path(camera))
+    options = ReaderOptions(None if camera is None else Path(camera), topic)
     found = [item for path in paths for item in _resolve(Path(path), format)]
     sources = [item.reader.open(item.path, options) for item in found]
     source: Source = sources[0]

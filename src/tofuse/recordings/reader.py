@@ -41,9 +41,12 @@ class ReaderOptions:
     ----------
     camera
         A camera.json that replaces the recording's own.
+    topic
+        Of a bag, where the guessed one isn't wanted.
     """
 
     camera: Path | None = None
+    topic: str | None = None
 
 
 class Reader(Protocol):

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, RayTable
+from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole
 from tofuse.live.device import (
     TIMEOUT_S,
     DeviceError,
@@ -19,6 +19,7 @@ from tofuse.live.device import (
 )
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.inverse_lens import inverse_brown
 
 
 @part("device", "realsense")
@@ -131,18 +132,9 @@ def _camera(rs: Any, lens: Any) -> Camera:
     if lens.model == rs.distortion.brown_conrady:
         return BrownConrady(*size, *focal, *k)
     if lens.model == rs.distortion.inverse_brown_conrady:
-        return _inverse_brown(BrownConrady(*size, *focal, *k))
+        return inverse_brown(BrownConrady(*size, *focal, *k))
     raise DeviceError(
         f"has a lens of the model {lens.model}",
         where="RealSense",
         remedy="record the stream that is not distorted, or give a camera.json with rays",
     )
-
-
-def _inverse_brown(lens: BrownConrady) -> RayTable:
-    """Return the camera whose polynomial leads from the pixel to the ray, not the other way."""
-    focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
-    v, u = np.mgrid[: lens.height, : lens.width]
-    slopes = (np.stack([u, v], axis=-1) - centre) / focal
-    points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
-    return RayTable(((lens.project(points) - centre) / focal).astype(np.float32))

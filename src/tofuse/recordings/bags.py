@@ -1,0 +1,150 @@
+"""Bags and the messages of one of their topics, by the package rosbags."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.recordings.ros_messages import taken
+
+Float64 = NDArray[np.float64]
+
+MISSING = "give `pip install 'tofuse[ros]'`, which brings rosbags"
+ROS1_MAGIC = b"#ROSBAG V2"
+MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
+
+
+def open_bag(path: Path) -> Any:
+    """Open a bag, to be closed by its ``close``.
+
+    Raises
+    ------
+    InputError
+        If rosbags is missing, or can't open it.
+    """
+    try:
+        highlevel = importlib.import_module("rosbags.highlevel")
+        typesys = importlib.import_module("rosbags.typesys")
+    except ImportError as error:
+        raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
+    try:
+        store = typesys.get_typestore(typesys.Stores.LATEST)
+        bag = highlevel.AnyReader([path], default_typestore=store)
+        bag.open()
+        return bag
+    except Exception as error:
+        raise InputError(
+            f"can't be opened as a bag ({type(error).__name__}: {str(error)[:200]})",
+            where=path,
+            remedy="check the bag, or reindex it",
+        ) from error
+
+
+def open_container(path: Path) -> Any:
+    """Open a ROS 1 bag whose messages rosbags is not to decode.
+
+    Makers' own definitions of them are often incomplete.
+
+    Raises
+    ------
+    InputError
+        If rosbags is missing, or can't open it.
+    """
+    try:
+        rosbag1 = importlib.import_module("rosbags.rosbag1")
+    except ImportError as error:
+        raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
+    try:
+        bag = rosbag1.Reader(path)
+        bag.open()
+        return bag
+    except Exception as error:
+        raise InputError(
+            f"can't be opened as a bag ({type(error).__name__}: {str(error)[:200]})",
+            where=path,
+            remedy="check the bag, or reindex it",
+        ) from error
+
+
+def damaged(error: Exception, where: str | Path) -> InputError:
+    """Return our own error for whatever rosbags says of a damaged bag."""
+    return InputError(
+        f"can't be read ({type(error).__name__}: {str(error)[:200]})",
+        where=where,
+        remedy="check the bag, or reindex it",
+    )
+
+
+class Track:
+    """The messages of one topic, read in order or one by one.
+
+    Attributes
+    ----------
+    connection
+        As rosbags gives it, with ``topic`` and ``msgtype``.
+    times
+        (N,) seconds at which they were taken, by their headers, or else arrived.
+    """
+
+    def __init__(self, bag: Any, connection: Any) -> None:
+        self.bag, self.connection = bag, connection
+        found = [(t, taken(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()]
+        self._arrived = [arrived for arrived, _ in found]
+        self.times: Float64 = np.array([when or t / 1e9 for t, when in found])
+        self._running: Iterator[tuple[Any, int, Any]] | None = None
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self._arrived)
+
+    def raw(self, index: int) -> Any:
+        """Return the bytes of a message; the next one follows the last without a search."""
+        if self._running is None or index != self._next:
+            # Of messages of one time, the one that is meant is so many further on.
+            time = self._arrived[index]
+            self._running = self._messages(time)
+            for _ in range(index - self._arrived.index(time)):
+                next(self._running)
+        self._next = index + 1
+        try:
+            return next(self._running)[2]
+        except BaseException:
+            self._running = None
+            raise
+
+    def message(self, index: int) -> Any:
+        """Return a message as rosbags decodes it."""
+        raw = self.raw(index)
+        try:
+            return self.bag.deserialize(raw, self.connection.msgtype)
+        except BaseException:
+            self._running = None
+            raise
+
+    def near(self, time: float, limit: float) -> int | None:
+        """Return the index of the message taken nearest to a time, or None beyond a limit in s."""
+        if not len(self.times):
+            return None
+        k = int(np.argmin(np.abs(self.times - time)))
+        return k if abs(self.times[k] - time) <= limit else None
+
+    def _messages(self, start: int | None = None) -> Iterator[tuple[Any, int, Any]]:
+        found: Iterator[tuple[Any, int, Any]] = self.bag.messages(
+            connections=[self.connection], start=start
+        )
+        return found
+
+
+def first_message(bag: Any, topic: str) -> Any:
+    """Return the first message of a topic, or None if there is none."""
+    chosen = [c for c in bag.connections if c.topic == topic]
+    if chosen:
+        for connection, _, raw in bag.messages(connections=chosen):
+            return bag.deserialize(raw, connection.msgtype)
+    return None

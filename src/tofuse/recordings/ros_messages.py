@@ -1,0 +1,153 @@
+"""What ROS messages hold: images, compressed depth, lenses and clouds, as rosbags gives them."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import parse_image
+from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
+from tofuse.recordings.camera_file import checked_lens
+
+Float32 = NDArray[np.float32]
+
+ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+GREY = {"mono8": "u1", "8UC1": "u1", **ENCODINGS}
+_PNG = b"\x89PNG\r\n\x1a\n"
+_COMPRESSED_HEAD = 12
+_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_AMPLITUDES = ("intensity", "amplitude", "i")
+_MAX_SIDE = 16384
+
+
+def taken(raw: Any, is2: bool) -> float:
+    """Seconds at which a message was taken, by the header that it begins with; 0 if not told.
+
+    After four bytes (ROS 1: the sequence number; ROS 2: the encoding) come seconds and nanoseconds.
+    """
+    head = bytes(raw[:12])
+    if len(head) < 12:
+        return 0.0
+    big_endian = is2 and not head[1] & 1
+    seconds, nanoseconds = struct.unpack_from(">II" if big_endian else "<II", head, 4)
+    return seconds + nanoseconds / 1e9 if nanoseconds < 10**9 else 0.0
+
+
+def image(message: Any, where: str, encodings: dict[str, str] = ENCODINGS) -> NDArray[Any]:
+    """Return the (H, W) image of a message, with the padding of its rows left out.
+
+    Raises
+    ------
+    InputError
+        If it has another encoding, or is cut off.
+    """
+    if message.encoding not in encodings:
+        raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
+    order = ">" if message.is_bigendian else "<"
+    kind = np.dtype(order + encodings[message.encoding])
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(message.data, np.uint8)
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * kind.itemsize:
+        raise InputError(f"claims {width} x {height} pixels of {step} bytes a row", where=where)
+    if len(data) < step * height:
+        raise InputError("is cut off", where=where, remedy="check the bag")
+    rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
+    return np.ascontiguousarray(rows).view(kind)
+
+
+def decompressed(message: Any, where: str) -> NDArray[Any]:
+    """Return the image of compressed_depth_image_transport: PNG, of inverse depth for floats."""
+    data = bytes(message.data)
+    at = data.find(_PNG, 0, 64)
+    if at < 0:
+        raise InputError("isn't compressed as PNG", where=where, remedy="record it as PNG or raw")
+    counts = parse_image(data[at:], where, dtype="uint16")
+    if not str(message.format).startswith("32FC1"):
+        return counts
+    if at < _COMPRESSED_HEAD:
+        raise InputError("lacks the parameters of its depth", where=where)
+    a, b = np.frombuffer(data, "<f4", 2, at - 8)
+    with np.errstate(all="ignore"):
+        depth = np.float32(a) / (counts.astype(np.float32) - np.float32(b))
+    return np.where(counts > 0, depth, np.float32(np.nan)).astype(np.float32)
+
+
+def lens(info: Any, where: str) -> Pinhole:
+    """Return the lens of a CameraInfo; rows 1 and 2 are called k and d in ROS 2, K and D in 1."""
+    K = np.asarray(getattr(info, "k", getattr(info, "K", ())), float)
+    D = [float(v) for v in getattr(info, "d", getattr(info, "D", ()))]
+    if K.shape != (9,):
+        raise InputError("has no 3x3 matrix K", where=where, remedy="give --camera camera.json")
+    values = {"fx": K[0], "fy": K[4], "cx": K[2], "cy": K[5]}
+    model = str(info.distortion_model)
+    cls: type[Pinhole] = Pinhole
+    names: tuple[str, ...] = ()
+    if any(D):
+        if model in ("equidistant", "fisheye"):
+            cls, names = Fisheye, ("k1", "k2", "k3", "k4")
+        elif model == "plumb_bob" or (not model and len(D) == 5):
+            cls, names = BrownConrady, ("k1", "k2", "p1", "p2", "k3")
+        elif model == "rational_polynomial":
+            cls, names = Rational, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        else:
+            raise InputError(
+                f"has the distortion model {model!r:.40}",
+                where=where,
+                remedy="give --camera camera.json",
+            )
+        if any(D[len(names) :]):
+            raise InputError(
+                f"has {len(D)} coefficients for {model}", where=where, remedy="give --camera"
+            )
+    values |= dict(zip(names, D, strict=False))
+    numbers = {name: float(v) for name, v in values.items()}
+    return checked_lens(cls, (int(info.width), int(info.height)), numbers, where)
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points (N, 3) of a PointCloud2, their amplitude (N,) or None, and how they are organised."""
+
+    points: Float32
+    amplitude: Float32 | None
+    width: int
+    height: int
+
+
+def cloud(message: Any, where: str) -> Cloud:
+    """Read a PointCloud2.
+
+    Raises
+    ------
+    InputError
+        If it lacks coordinates, or is cut off.
+    """
+    order = ">" if message.is_bigendian else "<"
+    fields = {f.name: f for f in message.fields if f.datatype in _FIELD_TYPES}
+    missing = [name for name in "xyz" if name not in fields]
+    if missing:
+        raise InputError(f"has no field {missing[0]!r}", where=where, remedy="record x, y and z")
+    count, step = int(message.width) * int(message.height), int(message.point_step)
+    data = np.frombuffer(message.data, np.uint8)
+    if step < 1 or count * step > len(data):
+        raise InputError("is cut off", where=where, remedy="check the bag")
+    rows = data[: count * step].reshape(count, step)
+
+    def column(name: str) -> Float32:
+        field = fields[name]
+        kind = np.dtype(order + _FIELD_TYPES[field.datatype])
+        start = int(field.offset)
+        if start + kind.itemsize > step:
+            raise InputError(f"has its field {name!r} outside of a point", where=where)
+        values = np.ascontiguousarray(rows[:, start : start + kind.itemsize]).view(kind)[:, 0]
+        with np.errstate(all="ignore"):
+            return values.astype(np.float32)
+
+    points = np.stack([column(name) for name in "xyz"], 1)
+    amplitude = next((column(name) for name in _AMPLITUDES if name in fields), None)
+    return Cloud(points, amplitude, int(message.width), int(message.height))
