@@ -36,6 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         method=arguments.method,
         config=arguments.config,
         camera=arguments.camera,
+        topic=arguments.topic,
         format=arguments.format,
         seed=arguments.seed,
         threads=arguments.threads,
@@ -138,7 +139,12 @@ def inspect(arguments: argparse.Namespace) -> int:
     from tofuse.inspection.inspect import inspect_recording
     from tofuse.recordings.open import open_recording
 
-    recording = open_recording(*arguments.inputs, format=arguments.format, camera=arguments.camera)
+    recording = open_recording(
+        *arguments.inputs,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+    )
     found = inspect_recording(recording)
     if arguments.json:
         emit(found.to_dict())
@@ -157,7 +163,12 @@ def convert(arguments: argparse.Namespace) -> int:
     from tofuse.recordings.convert import convert as convert_recording
     from tofuse.recordings.open import open_recording
 
-    recording = open_recording(*arguments.inputs, format=arguments.format, camera=arguments.camera)
+    recording = open_recording(
+        *arguments.inputs,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+    )
     recording = recording.select(arguments.start, arguments.end, arguments.every)
     done = convert_recording(recording, arguments.out)
     console = _Output(highlight=False, soft_wrap=True)
@@ -232,7 +243,12 @@ def noise(arguments: argparse.Namespace) -> int:
         raise OutputError(
             "is there already", where=arguments.out, remedy="give --overwrite to replace it"
         )
-    recording = open_recording(*arguments.inputs, format=arguments.format, camera=arguments.camera)
+    recording = open_recording(
+        *arguments.inputs,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+    )
     fit = estimate_noise(recording, arguments.name)
     if arguments.out is not None:
         fit.model.save(arguments.out)

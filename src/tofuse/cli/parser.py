@@ -85,6 +85,7 @@ def _run(commands: Any) -> None:
     g = p.add_argument_group("what to read")
     g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    g.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
     g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
     g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
     g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
@@ -170,6 +171,7 @@ def _inspect(commands: Any) -> None:
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
     p.add_argument("--json", action="store_true", help="as JSON")
 
 
@@ -179,6 +181,7 @@ def _convert(commands: Any) -> None:
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder for it")
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
     p.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
     p.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
     p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
@@ -209,6 +212,7 @@ def _noise(commands: Any) -> None:
     p.add_argument("--name", metavar="NAME", help="what to call the camera")
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
     p.add_argument("--json", action="store_true", help="as JSON")
 
 

@@ -43,6 +43,7 @@ class Options:
     method: str | None = None
     config: Path | None = None
     camera: Path | None = None
+    topic: str | None = None
     format: str | None = None
     seed: int | None = None
     threads: int | None = None
@@ -70,7 +71,9 @@ def run(
     """
     progress = progress or Silent()
     seed = _seed(options)
-    recording = open_recording(*inputs, format=options.format, camera=options.camera)
+    recording = open_recording(
+        *inputs, format=options.format, camera=options.camera, topic=options.topic
+    )
     recording = recording.select(options.start, options.end, options.every)
     if options.average_still:
         recording = average_still(recording)
@@ -119,6 +122,7 @@ def _key(
         "config": plain(config.to_dict()),
         "seed": seed,
         "format": recording.format,
+        "topic": options.topic,
         "frames": recording.indices.tolist(),
         "average_still": options.average_still,
     }
