@@ -467,3 +467,46 @@ def test_a_search_is_believed_only_with_a_lead_and_without_contradiction():
     # A camera that was lost may stand anywhere, and rooms look alike.
     assert not recovery.believes(match(0.5, 0.4, 0.0), lost=True)
     assert recovery.believes(match(0.5, 0.2, 0.0), lost=True)
+
+
+def turned_box(albedos):
+    """A tracker that saw a box from four sides alike, in other colours, and was lost; a view."""
+    frame = Sequence("box", [0]).frames[0]
+    frame = frame.keep((frame.z > 0) & (frame.z < 1.6))
+    u = np.arange(frame.camera.width) / 9.0
+
+    def painted(k):
+        if not albedos:
+            return replace(frame, amplitude_image=None)
+        paint = np.exp(0.5 * np.sin(u * (1 + 0.3 * k) + 2 * k)).astype(np.float32)
+        return replace(frame, amplitude_image=frame.amplitude_image * paint)
+
+    tracker = Keyframes().start(0)
+    centre = np.eye(4)
+    centre[2, 3] = float(np.median(frame.z[frame.z > 0])) + 0.15
+    poses = []
+    for k in range(4):
+        turn = se3.exp(np.array([0, 0, 0, 0, k * np.pi / 2, 0]))
+        poses.append(centre @ turn @ se3.inverse(centre))
+        if k == 0:
+            tracker.push(painted(0))
+        else:
+            view = surface_map(replace(painted(k), index=k), tracker._options.surface)
+            tracker._keep(view, poses[k])
+    tracker._T = se3.exp(np.array([3.0, 0, 0, 0, 0, 0]))  # last seen elsewhere
+    tracker.interrupt()
+    return tracker.push(replace(painted(2), index=9)), poses
+
+
+def test_a_box_that_looks_the_same_from_four_sides_is_not_guessed_at():
+    step, _ = turned_box(albedos=False)
+    assert_marked(step)
+    assert "elsewhere" in step.reason
+
+
+def test_a_box_that_is_painted_is_known_again():
+    step, poses = turned_box(albedos=True)
+    assert step.status == "tracked"
+    away = se3.inverse(poses[2]) @ step.T_world_camera
+    assert np.linalg.norm(away[:3, 3]) < 0.01
+    assert se3.angle(away) < 0.02

@@ -396,7 +396,7 @@ def test_each_frame_says_why_it_is_lost(shown):
 
 
 def test_loops_timings_and_objective(shown):
-    assert shown.row("0 and 23")[1:] == ["✓ accepted", "–", "62.0 %", "14 mm", "1.0 %"]
+    assert shown.row("0 and 23")[1:] == ["✓ accepted", "–", "62.0 %", "14 mm", "1.0 %", "–"]
     assert shown.row("2 and 22")[1:3] == ["✗ rejected", "overlap is below 25 %"]
     assert shown.row("odometry")[1] == "2.4 s"
     assert shown.row("total")[1] == "4.7 s"

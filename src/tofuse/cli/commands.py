@@ -359,7 +359,7 @@ def optimize(arguments: argparse.Namespace) -> int:
             f"part from vertex {piece.first}: {piece.vertices} poses, {piece.edges} edges, "
             f"objective {piece.before:.6g} to {piece.after:.6g}"
         )
-    if done.parts and not any(p.improved for p in done.parts):
+    if not done.improved:
         print("nothing better was found: the poses are those of the input")
     return 0
 

@@ -125,6 +125,9 @@ class Recovery:
     margin, lost_margin
         Least lead in score before the best other pose; the second after a frame was lost, when
         the keyframe may show another place that looks alike.
+    relocated_margin
+        Least lead, as a share of the points, of the keyframe that a lost view fits best before
+        others that put it elsewhere.
     contradiction
         Largest share of what lands on a surface that lies where the other view saw through, or
         reflects otherwise.
@@ -139,6 +142,7 @@ class Recovery:
     score: float = 0.25
     margin: float = 0.025
     lost_margin: float = 0.15
+    relocated_margin: float = 0.05
     contradiction: float = 0.08
     prior_m: float = 0.03
     prior_rad: float = 0.03
@@ -149,7 +153,7 @@ class Recovery:
             raise ValueError(f"keyframes is {self.keyframes}, not 0 to {_REMEMBERED}")
         if not 1 <= self.patience <= 1_000_000:
             raise ValueError(f"patience is {self.patience}, not 1 or more")
-        for name in ("score", "margin", "lost_margin", "contradiction"):
+        for name in ("score", "margin", "lost_margin", "relocated_margin", "contradiction"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
         for name in ("prior_m", "prior_rad"):
@@ -309,10 +313,11 @@ class _KeyframeTracker(Tracker):
         elif rescaled:
             return self._lose(reasons[0])
         elif self._lost:
-            found = self._relocate(view) or self._search(view)
+            fits = self._relocated(view)
+            found = self._leading(fits, reasons) if fits else self._search(view)
         else:
             # It was there a moment ago, and an older keyframe may show a place that looks alike.
-            found = self._search(view) or self._relocate(view)
+            found = self._search(view) or self._leading(self._relocated(view), reasons)
         if found is None:
             return self._lose(reasons[0])
         reference = found.reference
@@ -508,8 +513,8 @@ class _KeyframeTracker(Tracker):
         unknown = "the prediction did not fit" if expected is not None else "nothing predicted it"
         yield T, chosen.T_world_source, how, f"{unknown}: found from {where}"
 
-    def _relocate(self, view: SurfaceMap) -> _Found | None:
-        """Look for the view among the keyframes that look most like it."""
+    def _relocated(self, view: SurfaceMap) -> list[_Found]:
+        """Where the view fits, among the keyframes that look most like it; the best first."""
         options = self._options
         wide = replace(options.alignment, levels=_WIDE, prior_m=3.0, prior_rad=3.0)
         fine = replace(options.alignment, levels=_PATIENT)
@@ -522,6 +527,7 @@ class _KeyframeTracker(Tracker):
             coarse = align(view, target, keyframe.T_world_camera, wide)
             if not options.relocated.objection(coarse, view.depth):
                 found.append((coarse.score, k, coarse.T_world_source))
+        fits = []
         for _, k, T in sorted(found, key=lambda one: (-one[0], one[1])):
             keyframe = self._keyframes[k]
             target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
@@ -530,7 +536,28 @@ class _KeyframeTracker(Tracker):
             objection = options.relocated.objection(aligned, view.depth)
             if not objection and aligned.converged and not len(aligned.unobservable):
                 how = f"found again at keyframe {keyframe.view.index}"
-                return _Found(aligned, target, keyframe, how)
+                fits.append(_Found(aligned, target, keyframe, how))
+        return fits
+
+    def _leading(self, fits: list[_Found], reasons: list[str]) -> _Found | None:
+        """The best fit, unless the view fits elsewhere nearly as well: places may look alike."""
+        if not fits:
+            return None
+        assert self._T is not None
+        best, recovery = fits[0], self._options.recovery
+        T = best.aligned.T_world_source
+        rivals = [fit for fit in fits[1:] if recovery.search.differ(T, fit.aligned.T_world_source)]
+        if not rivals or is_small(se3.inverse(self._T) @ T):
+            return best
+        rival = max(rivals, key=lambda fit: fit.aligned.score)
+        lead = best.aligned.score - rival.aligned.score
+        if lead >= recovery.relocated_margin:
+            return replace(best, how=f"{best.how}, leading by {lead:.0%} of the points")
+        reasons.insert(
+            0,
+            f"fits keyframe {best.reference.view.index}, but leads the fit of keyframe "
+            f"{rival.reference.view.index}, elsewhere, by {max(lead, 0):.0%} of the points only",
+        )
         return None
 
     def _search(self, view: SurfaceMap) -> _Found | None:

@@ -15,7 +15,7 @@ from tofuse.odometry.motion import Moment, jumps
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import Suspicion
+from tofuse.posegraph.suspicion import in_words
 from tofuse.posegraph.trust import expected_error, loop_errors
 from tofuse.registration.base import Registration
 from tofuse.results.types import FrameRecord, Reason, Verdict
@@ -216,7 +216,8 @@ def _optimiser(e: Evidence) -> Iterator[Reason]:
     if not e.optimisation.converged:
         text = "The optimiser ran out of iterations before it settled."
         yield Reason("optimiser_gave_up", _all_posed(e), text)
-    if any(part.before > 0 and not part.improved for part in e.optimisation.parts):
+    tried = any(e.optimisation.objective) and not e.optimisation.improved
+    if tried or any(part.before > 0 and not part.improved for part in e.optimisation.parts):
         text = "The optimiser found nothing better than the poses that it was given."
         yield Reason("not_improved", _all_posed(e), text)
     r = e.refinement
@@ -318,23 +319,10 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
     (m, rad), (m_after, rad_after) = gap.before, gap.after
     text = (
         f"Neighbours alone miss the loop {gap.i} to {gap.j} by {m:.3f} m and "
-        f"{np.degrees(rad):.1f} degrees; {' or '.join(proposals(found))} would leave "
+        f"{np.degrees(rad):.1f} degrees; {' or '.join(in_words(found))} would leave "
         f"{m_after:.3f} m and {np.degrees(rad_after):.1f} degrees."
     )
     yield Reason("calibration_alarm", (gap.i, gap.j), text)
-
-
-def proposals(found: Suspicion) -> list[str]:
-    """What the views say of the camera, in words, for each error by itself."""
-    words = []
-    if "focal" in found.errors:
-        share = 1 / (1 + found.errors["focal"]) - 1
-        more = "larger" if share > 0 else "smaller"
-        words.append(f"a focal length {abs(share):.1%} {more}")
-    if "offset" in found.errors:
-        more = "longer" if found.errors["offset"] > 0 else "shorter"
-        words.append(f"ranges {abs(found.errors['offset']) * 1e3:.0f} mm {more}")
-    return words
 
 
 def _way(poses: Float64) -> float:

@@ -22,10 +22,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from tofuse.errors import InputError
 from tofuse.geometry import quaternion, se3
 from tofuse.parts import part
 from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
+from tofuse.posegraph.levenberg import check_motions
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -156,12 +156,9 @@ class Castellani(Optimiser):
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`. The objective is logged after every step, and never rises.
 
-        Raises InputError if a pose or a measurement is not finite.
+        Raises InputError if a pose or a measurement is no rigid motion.
         """
-        for name, T in (("pose", graph.poses), ("measurement", graph.measurements)):
-            bad = np.flatnonzero(~np.isfinite(T).all((1, 2)))
-            if len(bad):
-                raise InputError(f"{name} {bad[0]} is not finite", where="pose graph")
+        check_motions(graph)
         problem = Problem.of(graph, self.normalisation)
         q = quaternion.from_matrix(graph.poses[:, :3, :3])
         t = graph.poses[:, :3, 3].copy()

@@ -17,6 +17,7 @@ from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
+from tofuse.posegraph.sparse import parts_of
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -32,7 +33,8 @@ class Elch(Optimiser):
     Positions are moved in proportion, and orientations turned by slerp, with distances of their
     own: the traces of the edges' covariances of translation and of rotation. A pose off the loop
     moves with the pose of the loop that it hangs on. A closed loop is an edge of the graph for
-    those after it. The first vertex stays where it is. Gravity and anchors are not used.
+    those after it. The first vertex of each connected part stays where it is. Gravity and anchors
+    are not used.
     """
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
@@ -53,10 +55,15 @@ class Elch(Optimiser):
                 poses = _spread(poses, graph, loop, share[0], share[1])
                 history.append(graph.with_poses(poses).chi2())
             known[loop] = True
-        if len(poses):
-            poses = graph.poses[0] @ se3.inverse(poses[0]) @ poses
-            poses[0] = graph.poses[0]
-        return Optimisation(graph.with_poses(se3.orthonormalise(poses)), tuple(history), True)
+        part = parts_of(len(poses), graph.edges)
+        for k in range(int(part.max(initial=-1)) + 1):
+            here = np.flatnonzero(part == k)
+            first = graph.poses[here[0]]
+            if np.array_equal(poses[here], graph.poses[here]):
+                continue  # not even by rounding
+            poses[here] = se3.orthonormalise(first @ se3.inverse(poses[here[0]]) @ poses[here])
+            poses[here[0]] = first
+        return Optimisation(graph.with_poses(poses), tuple(history), True)
 
 
 def _lengths(graph: PoseGraph) -> tuple[Float64, Float64]:

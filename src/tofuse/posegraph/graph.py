@@ -114,6 +114,8 @@ class PoseGraph:
                 raise InputError("a direction or anchor names no vertex", where="pose graph")
         if m and (self.edges.min() < 0 or self.edges.max() >= n):
             raise InputError("an edge names a vertex that is not there", where="pose graph")
+        if m and (self.edges[:, 0] == self.edges[:, 1]).any():
+            raise InputError("an edge joins a vertex to itself", where="pose graph")
 
     @classmethod
     def empty(cls) -> PoseGraph:
@@ -199,6 +201,13 @@ class Optimisation:
     weights: Float64 | None = None
     parts: tuple[GraphPart, ...] = ()
 
+    @property
+    def improved(self) -> bool:
+        """Whether anything better than the input was found, by the method's own objective."""
+        if self.parts:
+            return any(part.improved for part in self.parts)
+        return len(self.objective) > 1 and self.objective[-1] < self.objective[0]
+
 
 class Optimiser(Protocol):
     """A method that spreads the error of the loops over the poses."""
@@ -215,8 +224,9 @@ class LoopRecord:
     """A candidate for a loop, and what was decided; `i` < `j` are frame indices.
 
     `overlap` is the share of points with a partner, `rms_m` their rms distance,
-    `free_space_violation` the share of points that one view put where the other saw through
-    (None where not computed).
+    `free_space_violation` the share of points that one view put where the other saw through,
+    `margin` by what share of the points the pose that a search found leads its best rival (None
+    where not computed).
     """
 
     i: int
@@ -226,3 +236,4 @@ class LoopRecord:
     overlap: float | None = None
     rms_m: float | None = None
     free_space_violation: float | None = None
+    margin: float | None = None

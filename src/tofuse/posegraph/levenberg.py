@@ -19,6 +19,8 @@ from tofuse.posegraph.sparse import parts_of
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
+_RIGID = 1e-3  # by how much a rotation may be off orthonormal
+_FARTHEST_M = 1e9  # beyond it, a position is damage
 _NEGATIVE = -1e-9  # of the largest eigenvalue: below it information is not positive
 
 
@@ -169,15 +171,11 @@ def added_up(histories: list[tuple[float, ...]]) -> tuple[float, ...]:
 
 
 def check_graph(graph: PoseGraph) -> None:
-    """Raise InputError where poses or measurements are not finite, or information not positive."""
-    for name, values in (
-        ("pose", graph.poses),
-        ("measurement", graph.measurements),
-        ("information", graph.information),
-    ):
-        bad = np.flatnonzero(~np.isfinite(values).all((1, 2)))
-        if len(bad):
-            raise InputError(f"{name} {bad[0]} is not finite", where="pose graph")
+    """Raise InputError for poses or measurements that are none, or information not positive."""
+    check_motions(graph)
+    bad = np.flatnonzero(~np.isfinite(graph.information).all((1, 2)))
+    if len(bad):
+        raise InputError(f"information {bad[0]} is not finite", where="pose graph")
     eigenvalues = np.linalg.eigvalsh(graph.information)
     if len(eigenvalues):
         bad = np.flatnonzero(eigenvalues[:, 0] < _NEGATIVE * np.abs(eigenvalues).max(axis=1))
@@ -186,3 +184,17 @@ def check_graph(graph: PoseGraph) -> None:
             raise InputError(
                 "the information matrix is not positive", where=f"pose graph, edge {i} {j}"
             )
+
+
+def check_motions(graph: PoseGraph) -> None:
+    """Raise InputError for poses or measurements that are no rigid motions."""
+    for name, T in (("pose", graph.poses), ("measurement", graph.measurements)):
+        bad = np.flatnonzero(~np.isfinite(T).all((1, 2)))
+        if len(bad):
+            raise InputError(f"{name} {bad[0]} is not finite", where="pose graph")
+        R = np.clip(T[:, :3, :3], -10, 10)
+        off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max((1, 2), initial=0)
+        far = np.abs(T[:, :3, 3]).max(1, initial=0)
+        bad = np.flatnonzero((off > _RIGID) | (far > _FARTHEST_M) | (np.linalg.det(R) < 0))
+        if len(bad):
+            raise InputError(f"{name} {bad[0]} is no rigid motion", where="pose graph")

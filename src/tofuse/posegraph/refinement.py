@@ -15,7 +15,7 @@ from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.outside import Told
-from tofuse.posegraph.refine import Beside, RefineOptions, refine
+from tofuse.posegraph.refine import Beside, Refined, RefineOptions, refine
 from tofuse.posegraph.suspicion import Suspicion, loop_gap, suspicion
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore
 from tofuse.recordings.frames import Frame
@@ -189,13 +189,24 @@ class _Joint(Refiner):
             moved_to(unchanged, at, after),
             suspicion=found,
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
-            edges=tuple(
-                Measured(views[i].surface.index, views[j].surface.index, T, H / _SHARED_NOISE)
-                for (i, j), T, H in zip(
-                    refined.pairs, refined.measured, refined.information, strict=True
-                )
-            ),
+            edges=_measured([v.surface.index for v in views], refined),
         )
+
+
+def _measured(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
+    """What pairs measure by themselves, with what all of them together can know.
+
+    What is wrong with a view is wrong in all its pairs, so that many know little more than one.
+    """
+    pairs = refined.pairs
+    partners = np.bincount(pairs.ravel(), minlength=len(ids))
+    shared = _SHARED_NOISE * 0.5 * partners[pairs].sum(1)
+    return tuple(
+        Measured(ids[i], ids[j], T, H / less)
+        for (i, j), T, H, less in zip(
+            pairs, refined.measured, refined.information, shared, strict=True
+        )
+    )
 
 
 def _beside(ids: Sequence[int], told: Told) -> Beside:

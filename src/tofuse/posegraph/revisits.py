@@ -250,16 +250,19 @@ class _RevisitLoops(Loops):
     ) -> dict[tuple[int, int], ClosedLoop]:
         """Search views in each other without a guess.
 
-        Returns what is found and believed, and of those that only look alike also why not.
+        Returns what is found and believed, and of the others why not.
         """
         recovery = self._options.recovery
-        found = {}
-        refused = dict.fromkeys(alike, "looks alike, but a search finds no pose that leads")
+        found, margins = {}, {}
+        refused = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
         for i, j in pairs:
             match = search(surfaces[j], surfaces[i], recovery.search)
+            if match is not None:
+                margins[i, j] = match.margin
             if match is None or not recovery.believes(match):
+                refused[i, j] += f"; {_not_believed(match, recovery)}"
                 continue
-            if (i, j) in refused and not self._plausible(
+            if (i, j) in alike and not self._plausible(
                 surfaces[i], surfaces[j], match.T_target_source
             ):
                 refused[i, j] = _TOO_FAR
@@ -271,18 +274,20 @@ class _RevisitLoops(Loops):
         for (i, j), match in found.items():
             alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
             if alone and not recovery.believes(match, lost=True):
-                if (i, j) in refused:
-                    refused[i, j] = (
-                        f"looks alike, but the pose found leads by {match.margin:.0%} of the "
-                        "points only, and no other loop says the same"
-                    )
+                refused[i, j] += (
+                    f"; the pose that a search finds leads by {match.margin:.0%} of the points "
+                    "only, and no other loop says the same"
+                )
                 continue
             lead = f"found by a search, leading by {match.margin:.0%} of the points"
             how = lead if alone else f"{lead}; another loop says the same"
-            if (i, j) in refused:
+            if (i, j) in alike:
                 how = f"looks alike, {how}"
             believed[i, j] = self._measured(surfaces[i], surfaces[j], match, how)
-        no = {p: ClosedLoop(LoopRecord(*p, False, refused[p])) for p in alike}
+        no = {}
+        for p in pairs:
+            record = LoopRecord(*p, False, "") if p in alike else closed[p].record
+            no[p] = ClosedLoop(replace(record, reason=refused[p], margin=margins.get(p)))
         return no | believed
 
     def _plausible(
@@ -328,6 +333,7 @@ class _RevisitLoops(Loops):
             overlap=match.agreement.overlap,
             rms_m=match.agreement.rms_m,
             free_space_violation=match.agreement.violation,
+            margin=match.margin,
         )
         C = covariance(source, [Target(target, np.eye(4))], there, options)
         return ClosedLoop(record, there.T_world_source, np.asarray(np.linalg.inv(C), np.float64))
@@ -380,3 +386,15 @@ class _RevisitLoops(Loops):
         if len(aligned.unobservable) > self._options.weak:
             return f"what both see leaves {len(aligned.unobservable)} directions open"
         return ""
+
+
+def _not_believed(match: Match | None, recovery: Recovery) -> str:
+    """Why what a search found is no loop, in words."""
+    if match is None:
+        return "there is too little to search with"
+    if match.score < recovery.score:
+        return f"a search finds nothing that {recovery.score:.0%} of the points support"
+    if match.margin < recovery.margin:
+        return f"what a search finds leads its best rival by {match.margin:.1%} of the points only"
+    share = match.agreement.contradiction
+    return f"{share:.0%} of what meets under the pose that a search finds contradicts it"

@@ -185,3 +185,16 @@ def longest_loop(pairs: Integers) -> tuple[int, int] | None:
         return None
     k = int(np.argmax(np.where(whole, j - i, -1)))
     return int(i[k]), int(j[k])
+
+
+def in_words(found: Suspicion) -> list[str]:
+    """What the views say of the camera, in words, for each error by itself."""
+    words = []
+    if "focal" in found.errors:
+        share = 1 / (1 + found.errors["focal"]) - 1
+        more = "larger" if share > 0 else "smaller"
+        words.append(f"a focal length {abs(share):.1%} {more}")
+    if "offset" in found.errors:
+        more = "longer" if found.errors["offset"] > 0 else "shorter"
+        words.append(f"ranges {abs(found.errors['offset']) * 1e3:.0f} mm {more}")
+    return words

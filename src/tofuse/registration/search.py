@@ -139,6 +139,14 @@ class SearchOptions:
             if not 0 <= getattr(self, name) <= 1e3:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
+    def differ(self, a: Float64, b: Float64) -> bool:
+        """Whether two poses (4, 4) are different answers."""
+        between = se3.inverse(a) @ b
+        return bool(
+            np.linalg.norm(between[:3, 3]) > self.distinct_m
+            or se3.angle(between) > self.distinct_rad
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -483,17 +491,11 @@ def _distinct(found: list[Candidate], options: SearchOptions) -> tuple[Candidate
     """Order candidates, the best first, and leave out those that are nearly a better one."""
     distinct: list[Candidate] = []
     for candidate in sorted(found, key=lambda candidate: -candidate.score):
-        if all(_differ(candidate, other, options) for other in distinct):
+        if all(
+            options.differ(candidate.T_target_source, other.T_target_source) for other in distinct
+        ):
             distinct.append(candidate)
     return tuple(distinct)
-
-
-def _differ(a: Candidate, b: Candidate, options: SearchOptions) -> bool:
-    between = se3.inverse(a.T_target_source) @ b.T_target_source
-    return bool(
-        np.linalg.norm(between[:3, 3]) > options.distinct_m
-        or se3.angle(between) > options.distinct_rad
-    )
 
 
 def _upright(down: Float64) -> Float64:

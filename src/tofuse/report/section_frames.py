@@ -88,6 +88,7 @@ def loops(s: Subject) -> Values:
             words.share(p.overlap),
             words.length(p.rms_m),
             words.share(p.free_space_violation),
+            words.share(p.margin),
         )
         for p in loops
     ]

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.suspicion import in_words
 from tofuse.report import plots, words
 from tofuse.report.subject import Figure, Subject, Values
 
@@ -201,7 +203,39 @@ def optimised(s: Subject) -> Values:
             refined += f"Their support fell from {support}, so nothing of it was kept."
         else:
             refined = "No two views overlap enough to refine them together."
-    return {"optimised": " ".join(out), "refined": refined}
+    out += [f"{sensor.text[0].upper()}{sensor.text[1:]}." for sensor in d.outside]
+    return {"optimised": " ".join(out), "refined": refined, "camera_check": _camera_check(r)}
+
+
+def _camera_check(r: Refinement | None) -> str:
+    """What the views say of their camera, in words."""
+    if r is None or not r.views:
+        return ""
+    out = ""
+    if r.errors:
+        told = [
+            f"{name} {words.signed_length(value)}"
+            if name == "offset"
+            else f"{name} {100 * value:+.1f} %".replace("-", "−")
+            for name, value in r.errors.items()
+        ]
+        out = f"Errors of the camera were estimated with them: {', '.join(told)}. "
+    s = r.suspicion
+    if s is None:
+        return out.strip()
+    if s.errors:
+        verdict = "The camera should be checked" if s.alarm else "That is no reason for an alarm"
+        out += f"The views would agree better with {' or '.join(in_words(s))}. {verdict}. "
+    elif not r.errors:
+        out += "The views ask for no other focal length, and no offset of the ranges. "
+    if s.gap is not None:
+        gap, (m, rad), (m_after, rad_after) = s.gap, s.gap.before, s.gap.after
+        out += (
+            f"From view {gap.i} to {gap.j} neighbours alone miss by {words.length(m)} and "
+            f"{np.degrees(rad):.1f}°; with a camera corrected so, by {words.length(m_after)} and "
+            f"{np.degrees(rad_after):.1f}°."
+        )
+    return out.strip()
 
 
 def objective(s: Subject) -> Values:

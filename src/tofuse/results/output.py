@@ -319,6 +319,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                     "overlap": p.overlap,
                     "rms_m": p.rms_m,
                     "free_space_violation": p.free_space_violation,
+                    "margin": p.margin,
                 }
                 for p in d.loops
             ],
