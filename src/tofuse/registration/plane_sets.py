@@ -1,0 +1,340 @@
+"""Registration by the planes of two range images (Mure-Dubois and Hügli 2008)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.agreement import agreement
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.view_points import ViewPoints
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Points of a view, and points from which planes are tried in each round of RANSAC.
+_POINTS, _TRIED = 3000, 150
+# Angle between the normals of a point and of the plane that it lies on, rad.
+_SAME_WAY = 0.35
+# Sine of the angle that two normals must differ by to fix a rotation, and volume that three must
+# span to fix a point.
+_ACROSS, _SPANNED = 0.3, 0.15
+# Poses that what both images saw chooses from.
+_JUDGED = 15
+# A direction that the normals share less than this of (mean square) is not held.
+_HELD = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane ``normal . p = offset`` in a view.
+
+    Attributes
+    ----------
+    normal
+        (3,) unit, away from the camera.
+    offset
+        m, above 0.
+    share
+        Of the view's points, those on it.
+    rms_m
+        Distance of these from it.
+    """
+
+    normal: Float64
+    offset: float
+    share: float
+    rms_m: float
+
+
+@part("registration", "planes")
+@dataclass(frozen=True)
+class PlaneSets(Registrar):
+    """Planes that RANSAC finds in both images, matched by the angles between them.
+
+    Two pairs of planes give a rotation, by their normals; three give a translation, by their
+    offsets. Poses under which most planes match are told apart by what both images saw
+    (`agreement`). What the planes that match do not hold, as all of a corridor's are along it, is
+    named in `unobservable` and stays as in the guess.
+
+    Attributes
+    ----------
+    planes
+        Of each view, at most.
+    least_share
+        Of a view's points, that lie on a plane at least.
+    sigmas, thickness
+        How far from the plane a point on it may be: standard deviations, plus a share of its depth.
+    angle, offset
+        How far two planes may be apart that match: rad, and a share of the views' depth.
+    surface
+        How the depth and its noise are prepared.
+    """
+
+    planes: int = 8
+    least_share: float = 0.03
+    sigmas: float = 2.5
+    thickness: float = 0.005
+    angle: float = 0.1
+    offset: float = 0.03
+    surface: SurfaceOptions = SurfaceOptions()  # noqa: RUF009 - immutable
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.planes <= 20:
+            raise ValueError(f"planes is {self.planes}, not 1 to 20")
+        for name in ("least_share", "sigmas", "thickness", "angle", "offset"):
+            if not 0 < getattr(self, name) <= 100:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; points are the source's planes, correspondences those matched.
+
+        Raises
+        ------
+        RegistrationError
+            If a view has no plane, or the images contradict all poses.
+        """
+        s, t = self._prepared(source), self._prepared(target)
+        a, b = self.found(s, rng), self.found(t, rng)
+        for view, planes in ((source, a), (target, b)):
+            if not planes:
+                raise RegistrationError("has no planes", where=f"frame {view.index}")
+        depth = 0.5 * (s.depth + t.depth)
+        poses = _distinct(self._poses(a, b, guess, depth), depth)[:_JUDGED]
+        if not poses:
+            raise RegistrationError("no plane of one view matches one of the other")
+        said = [agreement(s, t, T).score for _, _, T in poses]
+        shares = [share + score for (share, _, _), score in zip(poses, said, strict=True)]
+        best = max(range(len(poses)), key=lambda k: shares[k])
+        if said[best] <= 0:
+            raise RegistrationError(
+                f"{len(poses[best][1])} planes match under a pose that what both images saw "
+                "contradicts"
+            )
+        rival = max((share for k, share in enumerate(shares) if k != best), default=0.0)
+        _, pairs, T = poses[best]
+        margin = shares[best] - max(rival, 0.0)
+        return self._told(a, b, pairs, T, len(poses), depth, margin)
+
+    def _prepared(self, view: Frame) -> SurfaceMap:
+        if not isinstance(view, RangeFrame):
+            raise RegistrationError("is no image", where=f"frame {view.index}")
+        return surface_map(view, self.surface)
+
+    def found(self, view: SurfaceMap, rng: np.random.Generator) -> list[Plane]:
+        """Planes of a view by RANSAC, the largest first.
+
+        A point and its normal make a plane; of those tried, that with the most points on it is
+        fitted to them, by weighted least squares, and taken away.
+        """
+        seen = ViewPoints.of(view, _POINTS)
+        p, n = seen.points.astype(float), seen.normals.astype(float)
+        within = self.sigmas * seen.sigma.astype(float) + self.thickness * p[:, 2]
+        weight = 1 / within**2
+        left = np.ones(len(p), bool)
+        planes: list[Plane] = []
+        while len(planes) < self.planes and left.sum() >= max(3, self.least_share * len(p)):
+            tried = rng.choice(np.flatnonzero(left), min(_TRIED, int(left.sum())), replace=False)
+            offsets = (p[tried] * n[tried]).sum(1)
+            on = _on(p, n, within, n[tried], offsets) & left
+            mine = on[int(np.argmax(on.sum(1)))]
+            for _ in range(3):
+                normal, offset = _fitted(p[mine], weight[mine])
+                mine = _on(p, n, within, normal[None], np.array([offset]))[0] & left
+                if mine.sum() < 3:
+                    break
+            if mine.sum() < max(3, self.least_share * len(p)):
+                break
+            left &= ~mine
+            rms = float(np.sqrt(((p[mine] @ normal - offset) ** 2).mean()))
+            planes.append(Plane(normal, offset, float(mine.mean()), rms))
+        return planes
+
+    def _poses(
+        self, a: list[Plane], b: list[Plane], guess: Float64, depth: float
+    ) -> list[tuple[float, list[tuple[int, int]], Float64]]:
+        """Share of what matches, the pairs that do, and the pose T_target_source; best first."""
+        found = []
+        normals = np.stack([plane.normal for plane in a]), np.stack([plane.normal for plane in b])
+        for R in _rotations(*normals, guess[:3, :3], self.angle):
+            cosine = (normals[0] @ R.T) @ normals[1].T
+            aligned = list(zip(*np.nonzero(cosine > np.cos(self.angle)), strict=True))
+            for some in _independent(aligned, normals[1]):
+                T = _pose(a, b, some, R, guess)
+                pairs = self._matching(a, b, T, depth)
+                if len(pairs) < len(some):
+                    continue
+                T = _pose(a, b, pairs, R, guess)
+                share = sum(min(a[i].share, b[j].share) for i, j in pairs)
+                found.append((float(share), pairs, T))
+        found.sort(key=lambda one: -one[0])
+        return found
+
+    def _matching(
+        self, a: list[Plane], b: list[Plane], T: Float64, depth: float
+    ) -> list[tuple[int, int]]:
+        """Pairs of planes that lie on each other, each plane in one pair at most."""
+        pairs: list[tuple[int, int]] = []
+        for i, plane in enumerate(a):
+            normal = T[:3, :3] @ plane.normal
+            offset = plane.offset + float(normal @ T[:3, 3])
+            best: int = -1
+            most: float = 1.0
+            for j, other in enumerate(b):
+                turned = float(np.arccos(np.clip(normal @ other.normal, -1, 1))) / self.angle
+                apart = max(turned, abs(offset - other.offset) / (self.offset * depth))
+                if apart < most and all(j != m for _, m in pairs):
+                    best, most = j, apart
+            if best >= 0:
+                pairs.append((i, best))
+        return pairs
+
+    def _told(
+        self,
+        a: list[Plane],
+        b: list[Plane],
+        pairs: list[tuple[int, int]],
+        T: Float64,
+        tried: int,
+        depth: float,
+        margin: float,
+    ) -> Registration:
+        normals = np.stack([a[i].normal for i, _ in pairs])
+        turned = normals @ T[:3, :3].T
+        offsets = np.array([a[i].offset for i, _ in pairs]) + turned @ T[:3, 3]
+        missed = offsets - np.array([b[j].offset for _, j in pairs])
+        # What planes that match may be apart is three standard deviations.
+        sigma_m, sigma_rad = self.offset * depth / 3, self.angle / 3
+        information = np.zeros((6, 6))
+        along, across = np.zeros((3, 3)), np.zeros((3, 3))
+        for n in normals:
+            along += np.outer(n, n)
+            across += np.eye(3) - np.outer(n, n)
+        information[:3, :3], information[3:, 3:] = along / sigma_m**2, across / sigma_rad**2
+        free = np.zeros((0, 6))
+        for matrix, place in ((along, slice(0, 3)), (across, slice(3, 6))):
+            values, vectors = np.linalg.eigh(matrix / len(normals))
+            loose = np.zeros((int((values < _HELD).sum()), 6))
+            loose[:, place] = vectors[:, values < _HELD].T
+            free = np.vstack([free, loose])
+        return Registration(
+            T_target_source=T,
+            converged=True,
+            iterations=tried,
+            correspondences=len(pairs),
+            points=len(a),
+            error=float(np.abs(missed).sum() / (len(a) * self.offset * depth)),
+            rms_m=float(np.sqrt((missed**2).mean())),
+            information=information,
+            unobservable=free,
+            margin=margin,
+        )
+
+
+def _on(p: Float64, n: Float64, within: Float64, normals: Float64, offsets: Float64) -> Bool:
+    """(K, N) which points lie on each of K planes."""
+    near = np.abs(normals @ p.T - offsets[:, None]) < within
+    return near & (normals @ n.T > np.cos(_SAME_WAY))
+
+
+def _fitted(p: Float64, weight: Float64) -> tuple[Float64, float]:
+    """Weighted least squares plane, its normal away from the camera."""
+    mean = weight @ p / weight.sum()
+    q = (p - mean) * np.sqrt(weight)[:, None]
+    normal = np.linalg.eigh(q.T @ q)[1][:, 0]
+    offset = float(mean @ normal)
+    return (normal, offset) if offset > 0 else (-normal, -offset)
+
+
+def _rotations(a: Float64, b: Float64, guess: Float64, tolerance: float) -> Iterator[Float64]:
+    """Rotations (3, 3) under which two normals of a (n, 3) lie on two of b (m, 3).
+
+    And those nearest to the guess under which one does, where there is nothing better.
+    """
+    between_a, between_b = (np.arccos(np.clip(x @ x.T, -1, 1)) for x in (a, b))
+    for i, k in combinations(range(len(a)), 2):
+        if np.sin(between_a[i, k]) < _ACROSS:
+            continue
+        for j, m in permutations(range(len(b)), 2):
+            if abs(between_a[i, k] - between_b[j, m]) < tolerance:
+                yield _aligned(np.stack([a[i], a[k]]), np.stack([b[j], b[m]]), guess)
+    for i in range(len(a)):
+        for j in range(len(b)):
+            yield _aligned(a[i : i + 1], b[j : j + 1], guess)
+
+
+def _aligned(a: Float64, b: Float64, near: Float64) -> Float64:
+    """(3, 3) the rotation that takes normals a (n, 3) to b (n, 3) best, `near` where they leave it.
+
+    Wahba's problem by the SVD (Arun et al. 1987); a little of `near` decides what is left.
+    """
+    H = b.T @ a + 1e-4 * near
+    U, _, Vt = np.linalg.svd(H)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.float64)
+
+
+def _independent(pairs: list[tuple[int, int]], normals: Float64) -> Iterator[list[tuple[int, int]]]:
+    """Pairs of planes that fix a translation: three, or two in part, or one where nothing else."""
+    found = False
+    for count in (3, 2, 1):
+        if count == 1 and found:
+            return
+        for some in combinations(pairs, count):
+            if len({i for i, _ in some}) < count or len({j for _, j in some}) < count:
+                continue
+            if _volume(normals[[j for _, j in some]]) > _SPANNED:
+                found = True
+                yield list(some)
+
+
+def _volume(normals: Float64) -> float:
+    """Volume, area or length that unit normals (n, 3) span."""
+    return float(np.sqrt(max(np.linalg.det(normals @ normals.T), 0.0)))
+
+
+def _pose(
+    a: list[Plane], b: list[Plane], pairs: list[tuple[int, int]], R: Float64, guess: Float64
+) -> Float64:
+    """(4, 4) least squares over pairs of planes, the guess where they leave it."""
+    weight = np.sqrt([min(a[i].share, b[j].share) for i, j in pairs])[:, None]
+    there, here = (
+        np.stack([planes[k].normal for k in which])
+        for planes, which in zip((a, b), zip(*pairs, strict=True), strict=True)
+    )
+    T = np.eye(4)
+    T[:3, :3] = _aligned(weight * there, weight * here, R)
+    normals = there @ T[:3, :3].T
+    # offset in the target = offset in the source + normal . t
+    apart = np.array([b[j].offset - a[i].offset for i, j in pairs])
+    start = guess[:3, 3]
+    missing = (apart - normals @ start)[:, None]
+    move = np.linalg.lstsq(weight * normals, weight * missing, rcond=np.sqrt(_HELD))[0][:, 0]
+    T[:3, 3] = start + move
+    return T
+
+
+def _distinct(
+    poses: list[tuple[float, list[tuple[int, int]], Float64]], depth: float
+) -> list[tuple[float, list[tuple[int, int]], Float64]]:
+    """The poses in their order, without those that are nearly a better one."""
+    distinct: list[tuple[float, list[tuple[int, int]], Float64]] = []
+    for one in poses:
+        gaps = [se3.inverse(other[2]) @ one[2] for other in distinct]
+        if all(np.linalg.norm(gap[:3, 3]) > 0.05 * depth or se3.angle(gap) > 0.1 for gap in gaps):
+            distinct.append(one)
+        if len(distinct) == _JUDGED:
+            break
+    return distinct
