@@ -1,0 +1,87 @@
+"""Whole reconstructions with gravity and odometry beside the images, and without."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.files.tables import write_columns
+from tofuse.files.trajectory import write_tum
+from tofuse.geometry import se3
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.outside import GravityEdges, OdometryEdges
+from tofuse.posegraph.refinement import Joint
+from tofuse.recordings.open import open_recording
+from tofuse.results.output import run_json
+from tofuse.results.types import Reconstruction
+
+BOTH = (GravityEdges(), OdometryEdges())
+
+
+@pytest.fixture(scope="module")
+def beside(room_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The simulated room with an accelerometer and odometry; of the latter one pose is missing."""
+    folder = tmp_path_factory.mktemp("beside") / "room"
+    shutil.copytree(room_recording, folder)
+    recording = open_recording(room_recording)
+    assert recording.reference is not None
+    times, poses = recording.timestamps, recording.reference
+    up = np.array([0.05, -0.99, 0.1])
+    felt = 9.81 * np.einsum("kji,j->ki", poses[:, :3, :3], up / np.linalg.norm(up))
+    columns = {"timestamp": times} | {f"a{axis}": felt[:, k] for k, axis in enumerate("xyz")}
+    write_columns(folder / "imu.csv", columns)
+    elsewhere = se3.exp(np.array([1.0, 2, 3, 0.3, 0.2, 0.1]))
+    keep = np.arange(len(times)) != 5
+    write_tum(folder / "odometry.txt", times[keep], (elsewhere @ poses)[keep])
+    return folder
+
+
+def made(folder: Path, *outside: object) -> Reconstruction:
+    config = replace(from_method("default"), outside=outside, refinement=Joint())
+    return reconstruct(open_recording(folder), config, threads=1)
+
+
+def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, room_recording):
+    alone, both = made(beside), made(beside, *BOTH)
+    told = {record.sensor: record for record in both.diagnostics.outside}
+    assert (told["gravity"].measured, told["gravity"].used) == (8, 8)
+    assert (told["odometry"].measured, told["odometry"].used) == (5, 5)
+    assert [s["sensor"] for s in run_json(both)["outside"]] == ["gravity", "odometry"]
+    assert len(both.graph.edges) == len(alone.graph.edges) + 5
+    assert both.graph.gravity is not None
+    np.testing.assert_array_equal(both.trajectory[0], np.eye(4))
+    reference = open_recording(room_recording).reference
+    assert reference is not None
+
+    def off(result: Reconstruction) -> float:
+        e = se3.log(se3.inverse(reference) @ result.trajectory)
+        return float(np.linalg.norm(e[:, 3:], axis=1).max())
+
+    assert 0 < np.abs(both.trajectory - alone.trajectory).max() < 0.02
+    assert off(both) < off(alone) + 0.001
+    # How loosely the path is held is told with them, but the verdict is that of the images.
+    assert both.diagnostics.verdict == alone.diagnostics.verdict
+    last = [r.diagnostics.frames[-1].covariance for r in (both, alone)]
+    assert last[0] is not None
+    assert last[1] is not None
+    assert np.trace(last[0][3:, 3:]) < np.trace(last[1][3:, 3:])
+
+
+def test_without_files_it_is_the_same_to_the_last_bit(room_recording):
+    asked, not_asked = made(room_recording, *BOTH), made(room_recording)
+    assert asked.diagnostics.outside == ()
+    np.testing.assert_array_equal(asked.trajectory, not_asked.trajectory)
+    np.testing.assert_array_equal(asked.graph.information, not_asked.graph.information)
+    np.testing.assert_array_equal(asked.cloud.points, not_asked.cloud.points)
+
+
+def test_a_turned_object_knows_nothing_of_gravity(tmp_path):
+    from tofuse.pipeline.run import Options, resolve
+
+    assert resolve(Options(tmp_path)).outside == (GravityEdges(),)
+    assert resolve(Options(tmp_path, object=True)).outside == ()
