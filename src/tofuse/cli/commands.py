@@ -161,6 +161,7 @@ def inspect(arguments: argparse.Namespace) -> int:
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
     from tofuse.recordings.convert import convert as convert_recording
+    from tofuse.recordings.layouts import convert_to
     from tofuse.recordings.open import open_recording
 
     recording = open_recording(
@@ -170,7 +171,10 @@ def convert(arguments: argparse.Namespace) -> int:
         topic=arguments.topic,
     )
     recording = recording.select(arguments.start, arguments.end, arguments.every)
-    done = convert_recording(recording, arguments.out)
+    if arguments.to == "native":
+        done = convert_recording(recording, arguments.out)
+    else:
+        done = convert_to(recording, arguments.out, arguments.to)
     console = _Output(highlight=False, soft_wrap=True)
     console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
     for warning in (*recording.warnings, *done.warnings):

@@ -179,6 +179,12 @@ def _convert(commands: Any) -> None:
     p = _command(commands, "convert", "write any recording as a native folder")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder for it")
+    p.add_argument(
+        "--to",
+        choices=("native", "tum", "open3d"),
+        default="native",
+        help="layout of the folder (native; the others lose what they have no place for)",
+    )
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
     p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")

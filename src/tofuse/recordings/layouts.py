@@ -1,0 +1,167 @@
+"""Any recording in the folder layouts of other programs: TUM RGB-D, and Open3D."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, OutputError, UnreadableFrameError
+from tofuse.files.atomic import make_folder, output_error, write_text
+from tofuse.files.images import write_png
+from tofuse.files.trajectory import write_log, write_tum
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.camera_file import SCHEMA, camera_fields
+from tofuse.recordings.convert import Conversion
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import Recording
+from tofuse.recordings.rectify import Rectifier, pinhole_of
+
+Layout = Literal["tum", "open3d"]
+COUNTS_PER_M: dict[Layout, int] = {"tum": 5000, "open3d": 1000}
+_MOST = 65535
+_BRIGHT = 99.0  # percentile of the amplitude that is shown as white
+
+
+def convert_to(
+    recording: Recording,
+    folder: str | Path,
+    layout: Layout,
+    progress: Callable[[int], None] | None = None,
+) -> Conversion:
+    """Write a recording's images for other programs.
+
+    Both layouts know nothing but pinhole cameras, z depth in counts of 0.2 mm (TUM) or 1 mm
+    (Open3D), and colour at the pixels of depth. So images are rectified; where there is no colour,
+    amplitude stands in as grey, as bright in every image. Confidence and noise are lost.
+
+    Parameters
+    ----------
+    recording
+        Range images.
+    folder
+        Must not be there, or be empty. It appears when all is done.
+    layout
+        Which.
+    progress
+        Called with the number of each frame that was written.
+
+    Raises
+    ------
+    InputError
+        If the recording holds clouds, or no frame can be read.
+    OutputError
+        If the folder isn't empty, or can't be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError("isn't empty", where=folder, remedy="choose a new folder")
+    make_folder(folder.absolute().parent)
+    try:
+        beside = Path(tempfile.mkdtemp(prefix=".tofuse-", dir=folder.absolute().parent))
+    except OSError as error:
+        raise output_error(error, folder) from error
+    try:
+        made = make_folder(beside / "made")
+        count, warnings = _write(recording, made, layout, progress)
+        if folder.exists():
+            folder.rmdir()
+        made.replace(folder)
+    except OSError as error:
+        raise output_error(error, folder) from error
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return Conversion(folder, count, tuple(warnings))
+
+
+def _write(
+    recording: Recording, folder: Path, layout: Layout, progress: Callable[[int], None] | None
+) -> tuple[int, list[str]]:
+    warnings: list[str] = []
+    colors = "rgb" if layout == "tum" else "color"
+    rectifier: Rectifier | None = None
+    white = 0.0
+    written: list[int] = []
+    beyond = 0
+    for k, item in enumerate(recording.read_all()):
+        if isinstance(item, UnreadableFrameError):
+            warnings.append(f"skipped: {item}")
+            continue
+        if not isinstance(item, RangeFrame):
+            raise InputError(
+                "holds clouds, which these layouts can't", where=recording.path,
+                remedy="convert it to the native folder",
+            )  # fmt: skip
+        if rectifier is None:
+            rectifier = Rectifier(pinhole_of(item.camera))
+            if rectifier.pinhole != item.camera:
+                warnings.append("images are rectified: these layouts know only pinhole cameras")
+            if item.color_image is None and item.amplitude_image is None:
+                warnings.append("there is neither colour nor amplitude: colour images are black")
+            elif item.amplitude_image is not None and item.amplitude_image.any():
+                lit = item.amplitude_image[item.amplitude_image > 0]
+                white = float(np.percentile(lit, _BRIGHT))
+        frame = rectifier(item)
+        counts = np.rint(frame.z.astype(float) * COUNTS_PER_M[layout])
+        beyond += int((counts >= _MOST).sum())
+        counts[counts >= _MOST] = 0
+        name = f"{_name(len(written), item.timestamp - float(recording.timestamps[0]))}.png"
+        write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
+        write_png(make_folder(folder / colors) / name, _color(frame, white))
+        written.append(k)
+        if progress is not None:
+            progress(len(written))
+    if rectifier is None:
+        raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
+    if beyond:
+        farthest = _MOST / COUNTS_PER_M[layout]
+        warnings.append(f"{beyond} pixels beyond {farthest:.1f} m don't fit, and are left out")
+    finish = _finish_tum if layout == "tum" else _finish_open3d
+    finish(recording, folder, rectifier.pinhole, written)
+    return len(written), warnings
+
+
+def _name(number: int, seconds: float) -> str:
+    """Name an image as Open3D's examples do: its number, and the microseconds since the first."""
+    return f"{number:06d}-{max(0, round(seconds * 1e6)):012d}"
+
+
+def _color(frame: RangeFrame, white: float) -> NDArray[np.uint8]:
+    if frame.color_image is not None:
+        return frame.color_image
+    grey = np.zeros(frame.depth.shape, np.uint8)
+    if frame.amplitude_image is not None and white > 0:
+        grey = (255 * np.sqrt((frame.amplitude_image / white).clip(0, 1))).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def _finish_tum(recording: Recording, folder: Path, camera: Pinhole, written: list[int]) -> None:
+    times = recording.timestamps[written]
+    for name in ("depth", "rgb"):
+        lines = [
+            f"{time:.6f} {name}/{_name(k, time - recording.timestamps[0])}.png\n"
+            for k, time in enumerate(times)
+        ]
+        write_text(folder / f"{name}.txt", "# timestamp filename\n" + "".join(lines))
+    if recording.reference is not None:
+        write_tum(folder / "groundtruth.txt", times, recording.reference[written])
+    # The layout has no place for the camera; this is what --camera takes.
+    about = {"schema": SCHEMA, **camera_fields(camera)}
+    about |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
+    write_text(folder / "lens.json", json.dumps(about, indent=1) + "\n")
+
+
+def _finish_open3d(recording: Recording, folder: Path, camera: Pinhole, written: list[int]) -> None:
+    columns = [camera.fx, 0.0, 0.0, 0.0, camera.fy, 0.0, camera.cx, camera.cy, 1.0]
+    about = {"width": camera.width, "height": camera.height, "intrinsic_matrix": columns}
+    write_text(folder / "camera_intrinsic.json", json.dumps(about, indent=1) + "\n")
+    if recording.reference is not None:
+        poses = recording.reference[written]
+        known = np.isfinite(poses[:, 0, 0])
+        write_log(folder / "trajectory.log", poses[known], np.flatnonzero(known))

@@ -1,0 +1,145 @@
+"""Images of any camera as a pinhole camera would have taken them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry.cameras import Camera, Pinhole
+from tofuse.recordings.frames import RangeFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Beyond this slope of a ray (60 degrees off the axis) a pinhole image is mostly stretched rim.
+STEEPEST = 1.75
+_INNER = 0.5  # share of the image that decides the focal length
+
+
+def pinhole_of(camera: Camera) -> Pinhole:
+    """Return a pinhole camera of the same size and resolution in the middle of the image.
+
+    The rim of a wide lens, beyond 60 degrees off the axis, may fall outside of it.
+    """
+    if type(camera) is Pinhole:
+        return camera
+    rays = camera.rays().astype(float)
+    height, width = rays.shape[:2]
+    rows, columns = (
+        slice(int(n * (1 - _INNER) / 2), int(np.ceil(n * (1 + _INNER) / 2)) + 1)
+        for n in (height, width)
+    )
+    dx = np.nanmedian(np.diff(rays[rows, columns, 0], axis=1))
+    dy = np.nanmedian(np.diff(rays[rows, columns, 1], axis=0))
+    near = np.nan_to_num(np.hypot(rays[..., 0], rays[..., 1]), nan=np.inf) < STEEPEST
+    x, y = rays[near].T
+    # As wide as what the camera sees, but no finer than it.
+    fx = min(1 / dx, (width - 1) / float(np.ptp(x)))
+    fy = min(1 / dy, (height - 1) / float(np.ptp(y)))
+    cx = (width - 1) / 2 - fx * float(x.min() + x.max()) / 2
+    cy = (height - 1) / 2 - fy * float(y.min() + y.max()) / 2
+    return Pinhole(width, height, float(fx), float(fy), cx, cy)
+
+
+def _sources(camera: Camera, pinhole: Pinhole) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Row and column (H, W, 2) of the pixel nearest to each pinhole pixel's ray, and whether."""
+    rays = pinhole.rays().astype(float)
+    points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+    uv = np.rint(camera.project(points))
+    inside = np.asarray(
+        np.isfinite(uv).all(-1)
+        & (uv >= 0).all(-1)
+        & (uv[..., 0] < camera.width)
+        & (uv[..., 1] < camera.height)
+    )
+    at = np.where(inside[..., None], uv, 0).astype(np.intp)[..., ::-1]
+    return at, inside
+
+
+class Rectifier:
+    """Turns frames into those of a pinhole camera, each pixel from its nearest.
+
+    The depth of a pixel is that at its own ray, on the plane through the nearest pixel's point
+    that its neighbours show; so flat things stay flat.
+    """
+
+    def __init__(self, pinhole: Pinhole) -> None:
+        self.pinhole = pinhole
+        self._camera: Camera | None = None
+        self._at: tuple[NDArray[np.intp], NDArray[np.bool_]] | None = None
+
+    def __call__(self, frame: RangeFrame) -> RangeFrame:
+        """Return a frame with z depth of the pinhole camera."""
+        if frame.camera == self.pinhole:
+            return _as_z(frame)
+        if self._at is None or frame.camera != self._camera:
+            self._camera, self._at = frame.camera, _sources(frame.camera, self.pinhole)
+        return _moved(frame, self.pinhole, *self._at)
+
+
+def _as_z(frame: RangeFrame) -> RangeFrame:
+    return replace(frame, depth=frame.z, depth_kind="z", sigma_image=None)
+
+
+def _moved(
+    frame: RangeFrame, pinhole: Pinhole, at: NDArray[np.intp], inside: NDArray[np.bool_]
+) -> RangeFrame:
+    rows, columns = at[..., 0], at[..., 1]
+
+    def taken(image: NDArray[Any] | None) -> NDArray[Any] | None:
+        if image is None:
+            return None
+        mask = inside if image.ndim == 2 else inside[..., None]
+        return np.where(mask, image[rows, columns], np.zeros((), image.dtype))
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(frame.valid, 1 / frame.z, np.nan)
+        slopes = _slopes(inverse, frame.camera.rays())
+        off = pinhole.rays() - frame.camera.rays()[rows, columns]
+        moved = inverse[rows, columns] + (slopes[rows, columns] * off).sum(-1)
+        z = np.where(inside & (moved > 0), 1 / moved, 0)
+    return RangeFrame(
+        frame.index,
+        frame.timestamp,
+        pinhole,
+        np.nan_to_num(z, posinf=0.0).astype(np.float32),
+        "z",
+        taken(frame.amplitude_image),
+        taken(frame.confidence_image),
+        taken(frame.color_image),
+        amplitude_kind=frame.amplitude_kind,
+        ambiguity_m=frame.ambiguity_m,
+    )
+
+
+def _slopes(inverse: Float32, rays: Float32) -> Float32:
+    """Change (H, W, 2) of inverse depth with the ray's x and y; 0 next to jumps and holes."""
+    along_u, along_v = (_smaller_step(inverse, rays, axis) for axis in (1, 0))
+    # A step to the next pixel changes both slopes of the ray where the lens distorts.
+    (du, xu, yu), (dv, xv, yv) = along_u, along_v
+    det = xu * yv - xv * yu
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out = np.stack([(du * yv - dv * yu) / det, (dv * xu - du * xv) / det], axis=-1)
+    return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+
+
+def _smaller_step(inverse: Float32, rays: Float32, axis: int) -> tuple[Float64, Float64, Float64]:
+    """Steps of inverse depth, x and y to that neighbour whose depth differs less.
+
+    On a surface both neighbours differ alike; across a jump the other one is the surface's own.
+    """
+    values = np.concatenate([inverse[..., None], rays], axis=-1).astype(np.float64)
+    step = np.diff(values, axis=axis)
+    shape = list(values.shape)
+    shape[axis] = 1
+    gap = np.full(shape, np.nan)
+    before = np.concatenate([gap, step], axis=axis)
+    after = np.concatenate([step, gap], axis=axis)
+    size_before, size_after = (
+        np.nan_to_num(np.abs(s[..., 0]), nan=np.inf) for s in (before, after)
+    )
+    chosen = np.where((size_before < size_after)[..., None], before, after)
+    return chosen[..., 0], chosen[..., 1], chosen[..., 2]

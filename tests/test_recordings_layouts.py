@@ -1,0 +1,146 @@
+"""Recordings in the layouts of TUM RGB-D and Open3D, and images as a pinhole camera sees them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.cli import main
+from tofuse.errors import InputError, OutputError
+from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, RayTable, points_from_z
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.layouts import convert_to
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.recordings.rectify import Rectifier, pinhole_of
+
+BARREL = BrownConrady(96, 72, 70.0, 71.0, 46.0, 37.0, k1=-0.25, k2=0.06, p1=0.002)
+WIDE = Fisheye(96, 72, 36.0, 36.0, 47.5, 35.5, k1=0.02)
+NORMAL, DISTANCE = np.array([0.2, -0.1, 0.97]), 1.8
+
+
+def plane_depth(camera: object) -> np.ndarray:
+    """z of a tilted plane at each pixel."""
+    rays = camera.rays().astype(float)  # type: ignore[attr-defined]
+    slope = rays @ NORMAL[:2] + NORMAL[2]
+    z = DISTANCE / slope
+    return np.where(np.isfinite(z) & (z > 0) & (z < 20), z, 0).astype(np.float32)
+
+
+@pytest.mark.parametrize("camera", [BARREL, WIDE, RayTable(np.array(BARREL.rays()))])
+def test_a_plane_stays_a_plane(camera: object) -> None:
+    frame = RangeFrame(0, 0.0, camera, plane_depth(camera))  # type: ignore[arg-type]
+    pinhole = pinhole_of(camera)  # type: ignore[arg-type]
+    out = Rectifier(pinhole)(frame)
+    points = points_from_z(pinhole, out.z)[out.valid].astype(float)
+    assert len(points) > 0.8 * out.depth.size
+    # Taken from the nearest pixel without regard of its slope this would be centimetres.
+    assert np.abs(points @ NORMAL - DISTANCE).max() < 1e-3
+
+
+def test_a_pinhole_stays_what_it_is() -> None:
+    pinhole = Pinhole(64, 48, 50.0, 50.0, 31.5, 23.5)
+    assert pinhole_of(pinhole) is pinhole
+    depth = np.random.default_rng(5).uniform(1, 3, (48, 64)).astype(np.float32)
+    frame = RangeFrame(0, 0.0, pinhole, depth, "range")
+    out = Rectifier(pinhole)(frame)
+    assert out.depth_kind == "z"
+    np.testing.assert_array_equal(out.z, frame.z)
+
+
+def test_jumps_are_not_smeared() -> None:
+    depth = np.full((72, 96), 1.0, np.float32)
+    depth[:, 50:] = 3.0
+    depth[10:20, 10:20] = 0
+    out = Rectifier(pinhole_of(BARREL))(RangeFrame(0, 0.0, BARREL, depth))
+    z = out.z[out.valid]
+    assert (np.minimum(np.abs(z - 1), np.abs(z - 3)) < 0.02).all()
+    assert (~out.valid).sum() >= 80
+
+
+def test_a_wide_lens_is_cut_at_sixty_degrees() -> None:
+    pinhole = pinhole_of(WIDE)
+    assert np.abs(pinhole.rays()).max() < 2.0
+    assert np.abs(pinhole.rays()[..., 0]).max() > 1.0
+
+
+def turned(frames: int = 4) -> Recording:
+    rng = np.random.default_rng(6)
+    made, poses = [], []
+    for k in range(frames):
+        amplitude = rng.uniform(10, 900, (72, 96)).astype(np.float32)
+        made.append(RangeFrame(k, 100.0 + k / 10, BARREL, plane_depth(BARREL), "z", amplitude))
+        T = np.eye(4)
+        T[0, 3] = 0.1 * k
+        poses.append(T)
+    reference = np.array(poses)
+    reference[2] = np.nan
+    return Recording.of(ArraySource(made, reference), "made", "made")
+
+
+def test_tum_is_read_back(tmp_path: Path) -> None:
+    recording = turned()
+    done = convert_to(recording, tmp_path / "out", "tum")
+    assert done.frames == 4
+    assert any("rectified" in w for w in done.warnings)
+    back = tofuse.open(tmp_path / "out", camera=tmp_path / "out" / "lens.json")
+    assert (back.format, len(back)) == ("tum", 4)
+    assert back.timestamps == pytest.approx(recording.timestamps)
+    expected = Rectifier(pinhole_of(BARREL))(recording[1])  # type: ignore[arg-type]
+    frame = back[1]
+    assert isinstance(frame, RangeFrame)
+    assert np.abs(frame.z - expected.z).max() < 1.1e-4
+    assert frame.camera == pinhole_of(BARREL)
+    assert frame.color_image is not None
+    assert frame.color_image.max() == 255
+    assert recording.reference is not None
+    assert back.reference is not None
+    assert np.allclose(back.reference[[0, 1, 3]], recording.reference[[0, 1, 3]])
+    assert np.isnan(back.reference[2]).all()
+
+
+def test_open3d_is_read_back(tmp_path: Path) -> None:
+    recording = turned()
+    convert_to(recording, tmp_path / "out", "open3d")
+    back = tofuse.open(tmp_path / "out")
+    assert back.format == "redwood"
+    frame = back[3]
+    assert isinstance(frame, RangeFrame)
+    expected = Rectifier(pinhole_of(BARREL))(recording[3])  # type: ignore[arg-type]
+    assert np.abs(frame.z - expected.z).max() < 6e-4
+    assert frame.camera == pinhole_of(BARREL)
+    assert np.diff(back.timestamps) == pytest.approx(0.1, abs=1e-5)
+    assert back.reference is not None
+    assert np.allclose(back.reference[3][:3, 3], [0.3, 0, 0])
+
+
+def test_what_can_not_be_converted(tmp_path: Path) -> None:
+    cloud = Recording.of(ArraySource([CloudFrame.of(np.ones((5, 3)))]), "made", "made")
+    with pytest.raises(InputError, match="holds clouds"):
+        convert_to(cloud, tmp_path / "a", "tum")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "mine").write_text("x")
+    with pytest.raises(OutputError, match="isn't empty"):
+        convert_to(turned(), tmp_path / "a", "tum")
+
+
+def test_far_pixels_are_left_out_and_counted(tmp_path: Path) -> None:
+    camera = Pinhole(32, 24, 20.0, 20.0, 15.5, 11.5)
+    depth = np.full((24, 32), 2.0, np.float32)
+    depth[:3] = 14.0  # beyond the 13.1 m of 16 bits of 0.2 mm
+    recording = Recording.of(ArraySource([RangeFrame(0, 0.0, camera, depth)]), "made", "made")
+    done = convert_to(recording, tmp_path / "a", "tum")
+    assert any("96 pixels beyond 13.1 m" in w for w in done.warnings)
+    frame = tofuse.open(tmp_path / "a", camera=tmp_path / "a" / "lens.json")[0]
+    assert isinstance(frame, RangeFrame)
+    assert not frame.valid[:3].any()
+
+
+def test_convert_command(room_recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "o3d"
+    assert main(["convert", str(room_recording), "--out", str(out), "--to", "open3d"]) == 0
+    assert (out / "camera_intrinsic.json").is_file()
+    assert len(list((out / "depth").iterdir())) == len(tofuse.open(room_recording))
