@@ -49,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         guess=arguments.guess,
         loops=arguments.loops,
         object=arguments.object,
+        texture=arguments.texture,
         overwrite=arguments.overwrite,
     )
     with progress_for(as_json=arguments.json) as progress:

@@ -81,6 +81,9 @@ def _run(commands: Any) -> None:
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the result")
     p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
     p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+    p.add_argument(
+        "--texture", action="store_true", help="a texture on the surface, in mesh.glb and mesh.obj"
+    )
     _processing(p)
     g = p.add_argument_group("what to read")
     g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")

@@ -14,6 +14,11 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 UInt8 = NDArray[np.uint8]
 
+# A place is held at its middle by so much of what the planes around it hold.
+_HELD = 0.02
+# Two vertices of which one faces away from the other are on different sides of something.
+_BEHIND = -0.3
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -81,10 +86,66 @@ class Mesh:
         _, piece = connected_components(links, directed=False)
         return self.rows((np.bincount(piece)[piece] >= least)[self.faces[:, 0]])
 
-    def simplified(self, cell_m: float) -> Mesh:
-        """Return the mesh with the vertices in each cube of a grid put together at their mean.
+    def without_holes(self, longest_m: float) -> Mesh:
+        """Return the mesh with the holes closed whose border is no longer than `longest_m`.
 
-        The vertex clustering of Rossignac and Borrel (1993): quick, and good enough to look at.
+        Each gets a new vertex in its middle, which no view saw, and whose `sigma` is the hole's
+        radius. Borders around a piece of surface are no holes.
+        """
+        ends = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+        border = ends[~np.isin(ends @ [len(self), 1], ends @ [1, len(self)])]
+        vertices: list[tuple[NDArray[np.int64], Float64, float]] = []
+        faces: list[NDArray[np.int64]] = []
+        for rim in _loops(border):
+            p = self.vertices[rim].astype(float)
+            length = float(np.linalg.norm(p - np.roll(p, -1, 0), axis=1).sum())
+            middle = p.mean(0)
+            fan = np.cross(np.roll(p, -1, 0) - middle, p - middle).sum(0)
+            if length > longest_m or fan @ self.normals[rim].sum(0) <= 0:
+                continue
+            new = np.full(len(rim), len(self) + len(vertices))
+            faces.append(np.stack([np.roll(rim, -1), rim, new], -1))
+            vertices.append((rim, middle, length))
+        if not vertices:
+            return self
+        normals = np.array([self.normals[loop].sum(0, dtype=float) for loop, _, _ in vertices])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        color = self.color
+        if color is not None:
+            means = [np.round(color[loop].mean(0)) for loop, _, _ in vertices]
+            color = np.concatenate([color, np.array(means).astype(np.uint8)])
+        radii = [length / (2 * np.pi) for _, _, length in vertices]
+        return replace(
+            self,
+            vertices=np.concatenate(
+                [self.vertices, np.array([m for _, m, _ in vertices], np.float32)]
+            ),
+            faces=np.concatenate([self.faces, *faces]).astype(np.int32),
+            normals=np.concatenate([self.normals, normals.astype(np.float32)]),
+            color=color,
+            sigma=np.concatenate([self.sigma, np.array(radii, np.float32)]),
+            views=np.concatenate([self.views, np.zeros(len(vertices), np.int32)]),
+        )
+
+    def decimated(self, faces: int) -> Mesh:
+        """Return the mesh simplified to about `faces` triangles at most."""
+        if len(self.faces) <= faces:
+            return self
+        corners = self.vertices[self.faces].astype(float)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = 0.5 * float(np.linalg.norm(across, axis=1).sum())
+        cell = float(np.sqrt(2 * area / faces))  # two triangles a cell, if it is flat
+        while True:
+            small = self.simplified(cell)
+            if len(small.faces) <= faces:
+                return small
+            cell *= float(np.clip(np.sqrt(len(small.faces) / faces), 1.02, 2.0))
+
+    def simplified(self, cell_m: float) -> Mesh:
+        """Return the mesh with the vertices in each cube of a grid put together, on either side.
+
+        The vertex clustering of Rossignac and Borrel (1993), at the place nearest to the planes of
+        the triangles around (Lindstrom 2000): edges and corners stay sharp.
         """
         if len(self) == 0:
             return self
@@ -92,7 +153,10 @@ class Mesh:
         cell -= cell.min(0)
         extent = cell.max(0) + 1
         key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-        _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+        _, first, cube = np.unique(key, return_index=True, return_inverse=True)
+        # The two sides of a thin sheet stay two.
+        behind = np.einsum("ni,ni->n", self.normals, self.normals[first[cube]]) < _BEHIND
+        _, group, count = np.unique(2 * cube + behind, return_inverse=True, return_counts=True)
 
         def mean(values: NDArray[np.generic]) -> Float64:
             columns = values.reshape(len(values), -1).astype(float).T
@@ -110,7 +174,7 @@ class Mesh:
         most = np.zeros(len(count), np.int32)
         np.maximum.at(most, group, self.views)
         merged = Mesh(
-            mean(self.vertices).astype(np.float32),
+            self._near_planes(group, mean(self.vertices), cell_m).astype(np.float32),
             faces,
             normals.astype(np.float32),
             None if self.color is None else np.round(mean(self.color)).astype(np.uint8),
@@ -119,3 +183,52 @@ class Mesh:
             self.offset,
         )
         return merged.rows(np.ones(len(faces), bool))
+
+    def _near_planes(self, group: NDArray[np.intp], middles: Float64, cell_m: float) -> Float64:
+        """Where each group's place (G, 3) is nearest to the planes of its triangles.
+
+        Directions that these don't hold stay at the middle, and no place is beyond half a cell.
+        """
+        corners = self.vertices[self.faces].astype(float)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(across, axis=1)
+        n = across / np.maximum(area, 1e-12)[:, None]
+        A = np.zeros((len(middles), 3, 3))
+        b = np.zeros((len(middles), 3))
+        for k in range(3):
+            of = group[self.faces[:, k]]
+            # Distance of the middle from the plane, along its normal.
+            height = ((corners[:, k] - middles[of]) * n).sum(1)
+            for i in range(3):
+                b[:, i] += np.bincount(of, area * n[:, i] * height, len(middles))
+                for j in range(i, 3):
+                    A[:, i, j] += np.bincount(of, area * n[:, i] * n[:, j], len(middles))
+        A += np.triu(A, 1).transpose(0, 2, 1)
+        trace = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-12)
+        step = np.linalg.solve(A + _HELD * trace[:, None, None] * np.eye(3), b[..., None])[..., 0]
+        return middles + step.clip(-0.5 * cell_m, 0.5 * cell_m)
+
+
+def _loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Loops of directed edges (K, 2); where several pass one vertex, they are told apart there."""
+    follow: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        follow.setdefault(a, []).append(b)
+    found = []
+    for start in list(follow):
+        path, place = [start], {start: 0}
+        while path:
+            if not follow.get(path[-1]):
+                del place[path.pop()]
+                continue
+            following = follow[path[-1]].pop()
+            if following in place:
+                loop = path[place[following] :]
+                found.append(np.array(loop))
+                for vertex in loop[1:]:
+                    del place[vertex]
+                del path[place[following] + 1 :]
+            else:
+                place[following] = len(path)
+                path.append(following)
+    return [loop for loop in found if len(loop) > 2]

@@ -112,9 +112,15 @@ class ModelBuilder:
         at = np.array([poses[view.index] for view in views], float)
         mesh = fuse_surface(views, at, self._options, advance)
         if len(mesh):
-            return Model(mesh.cloud(), mesh)
+            return Model(mesh.cloud(), self._finished(mesh))
         clouds = [view.as_cloud() for view in views]
         return Model(self._average(clouds, poses, self._range_voxel), mesh)
+
+    def _finished(self, mesh: Mesh) -> Mesh:
+        """The surface without its small holes, and with as many triangles as asked for."""
+        if self._options.holes_m:
+            mesh = mesh.without_holes(self._options.holes_m)
+        return mesh.decimated(self._options.faces) if self._options.faces else mesh
 
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
         """Return points of the model at other poses, to be looked at: without normals for images.

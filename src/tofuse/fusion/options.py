@@ -27,6 +27,12 @@ class Fusion:
         Most memory for the views that are kept for fusion; where it does not do, every second view
         is dropped, again and again. As much may go to the voxels: where it does not do, they are
         made larger.
+    holes_m
+        Holes in the surface with a border no longer than this are closed; 0 closes none.
+    faces
+        At most so many triangles; 0 keeps all. The cloud keeps all points.
+    texture
+        Edge of the texture of the surface, in texels; 0 makes none.
     """
 
     voxel_m: float | None = None
@@ -35,6 +41,9 @@ class Fusion:
     reach: float = 3.0
     island: int = 100
     memory_mb: int = 600
+    holes_m: float = 0.0
+    faces: int = 0
+    texture: int = 0
 
     def __post_init__(self) -> None:
         if self.voxel_m is not None and not 1e-5 < self.voxel_m < 100:
@@ -47,5 +56,11 @@ class Fusion:
             raise ValueError(f"reach is {self.reach}, not 1.5 to 100 voxels")
         if self.island < 0:
             raise ValueError(f"island is {self.island}, not 0 or more")
+        if not 0 <= self.holes_m < 1e6:
+            raise ValueError(f"holes_m is {self.holes_m}, not 0 or more")
+        if self.faces < 0:
+            raise ValueError(f"faces is {self.faces}, not 0 or more")
+        if self.texture and not 64 <= self.texture <= 8192:
+            raise ValueError(f"texture is {self.texture}, not 0 or 64 to 8192")
         if not 1 <= self.memory_mb <= 1_000_000:
             raise ValueError(f"memory_mb is {self.memory_mb}, not 1 or more")

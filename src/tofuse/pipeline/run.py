@@ -15,6 +15,7 @@ from tofuse.parts import name_of
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.learn import learnt
+from tofuse.pipeline.paint import paint
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import (
     fitted,
@@ -33,6 +34,7 @@ from tofuse.results.output import OutputFolder, is_result, plain, read_run_json,
 from tofuse.results.types import Reconstruction
 
 _THUMBNAILS = 12
+_TEXTURE = 2048  # texels, where no size is given
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Options:
     guess: Literal["identity", "previous", "odometry"] | None = None
     loops: Path | None = None
     object: bool = False
+    texture: bool = False
     overwrite: bool = False
 
 
@@ -98,8 +101,12 @@ def run(
             progress=progress,
             stages=kept,
         )
+        size = config.fusion.texture
+        texture = paint(recording, result, size, options.threads, progress) if size else None
+        if size and texture is None:
+            progress.note("no texture: there is no surface, or neither colour nor amplitude")
         progress.stage("writing")
-        write_result(result, folder, lambda r, f: _report(recording, config, r, f))
+        write_result(result, folder, lambda r, f: _report(recording, config, r, f), texture)
     except BaseException as error:
         kept.give_up(error)
         raise
@@ -141,6 +148,8 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
     if options.guess:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
+    if options.texture and not config.fusion.texture:
+        config = changed(config, {"fusion": {"texture": _TEXTURE}}, where="--texture")
     front: list[dict[str, Any]] = []
     if options.min_depth is not None or options.max_depth is not None:
         low = options.min_depth or 0.0

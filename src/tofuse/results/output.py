@@ -18,9 +18,12 @@ from tofuse._version import __version__
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import write_text
 from tofuse.files.glb import write_glb
+from tofuse.files.images import png_bytes
+from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
 from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.texture import Textured
 from tofuse.fusion.upright import upright
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
@@ -230,8 +233,11 @@ def write_result(
     result: Reconstruction,
     folder: OutputFolder,
     report: Callable[[Reconstruction, Path], None] | None = None,
+    texture: Textured | None = None,
 ) -> None:
     """Write every file of the contract; `report` writes `report.html` into the folder it gets.
+
+    With a `texture`, `mesh.glb` has it, and so has `mesh.obj`, which is written then.
 
     Raises
     ------
@@ -252,14 +258,14 @@ def write_result(
             | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
         )
         if result.mesh is not None:
-            _write_mesh(result.mesh, result, staging)
+            _write_mesh(result.mesh, result, staging, texture)
         if report is not None:
             report(result, staging)
         text = json.dumps(run_json(result), indent=1, allow_nan=False)
         (staging / "run.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path) -> None:
+def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
     """Write `mesh.ply`, in the world frame, and `mesh.glb`, which stands upright."""
     write_ply(
         folder / "mesh.ply",
@@ -270,14 +276,31 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path) -> None:
         faces=mesh.faces,
     )
     R = upright(mesh, result.trajectory)
+    generator = f"tofuse {__version__}"
+    if texture is None:
+        write_glb(
+            folder / "mesh.glb",
+            mesh.vertices @ R.T,
+            mesh.faces,
+            normals=mesh.normals @ R.T,
+            color=mesh.color,
+            generator=generator,
+        )
+        return
+    atlas, image = texture.atlas, png_bytes(texture.image)
+    points, normals = (
+        values[atlas.vertices] @ R.T for values in (texture.mesh.vertices, texture.mesh.normals)
+    )
     write_glb(
         folder / "mesh.glb",
-        mesh.vertices @ R.T,
-        mesh.faces,
-        normals=mesh.normals @ R.T,
-        color=mesh.color,
-        generator=f"tofuse {__version__}",
+        points,
+        atlas.faces,
+        normals=normals,
+        uv=atlas.uv,
+        texture=image,
+        generator=generator,
     )
+    write_obj(folder / "mesh.obj", points, atlas.faces, normals=normals, uv=atlas.uv, texture=image)
 
 
 def run_json(result: Reconstruction) -> dict[str, Any]:

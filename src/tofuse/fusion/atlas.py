@@ -1,0 +1,102 @@
+"""Where each triangle of a surface lies in its texture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.mesh import Mesh
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+
+MARGIN = 1.4  # texels around each triangle that are painted too
+_PADDING = 3  # texels between pieces
+_LEAST_CELL = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """A flat layout of a mesh.
+
+    Attributes
+    ----------
+    vertices
+        (N,) rows of the mesh's vertices; one that lies in several pieces is there more than once.
+    faces
+        (M, 3) rows of `vertices`.
+    places
+        (N, 2) column and row in the texture, centres of texels at whole numbers.
+    size
+        Edge of the texture.
+    """
+
+    vertices: Int32
+    faces: Int32
+    places: Float32
+    size: int
+
+    @property
+    def uv(self) -> Float32:
+        """(N, 2) places from the upper left corner, 0 to 1."""
+        return np.asarray((self.places + 0.5) / self.size, np.float32)
+
+
+def unwrap(mesh: Mesh, size: int) -> Atlas:
+    """Lay a mesh out flat: in large pieces by the library of the extra `texture`, else plainly."""
+    try:
+        import xatlas
+    except ImportError:
+        return plain_atlas(mesh, size)
+    return _by_xatlas(xatlas, mesh, size)
+
+
+def plain_atlas(mesh: Mesh, size: int) -> Atlas:
+    """Give each triangle half of a square cell, its longest edge along the diagonal.
+
+    The texture is no larger than gives every cell 16 texels, and cells are never smaller than 6:
+    a mesh of very many triangles gets a larger one than asked for.
+    """
+    count = len(mesh.faces)
+    columns = max(1, int(np.ceil(np.sqrt((count + 1) // 2))))
+    cell = int(np.clip(size // columns, _LEAST_CELL, 16))
+    size = columns * cell
+    p = mesh.vertices[mesh.faces].astype(float)
+    edges = np.linalg.norm(p[:, [2, 0, 1]] - p[:, [1, 2, 0]], axis=2)  # opposite each corner
+    first = np.argmax(edges, axis=1)  # its corner is the right angle
+    order = (first[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(mesh.faces, order, 1)
+    number = np.arange(count)
+    at = np.stack([number // 2 % columns, number // 2 // columns], -1) * cell
+    low, high = 1.0, cell - 4.0
+    lower = np.array([[low, low], [high, low], [low, high]])
+    corners = np.where((number % 2 == 0)[:, None, None], lower, cell - 1 - lower)
+    places = (at[:, None] + corners).reshape(-1, 2).astype(np.float32)
+    rows = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    back = np.argsort(order, axis=1)  # the corners as the mesh has them
+    rows = np.take_along_axis(rows, back, 1)
+    return Atlas(faces.reshape(-1).astype(np.int32), rows, places, size)
+
+
+def _by_xatlas(xatlas: Any, mesh: Mesh, size: int) -> Atlas:
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(mesh.vertices, mesh.faces.astype(np.uint32), mesh.normals)
+    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
+    charts.max_iterations = 1
+    packing.resolution = size - 2 * _PADDING
+    packing.padding = _PADDING
+    packing.bilinear = True
+    atlas.generate(charts, packing)
+    rows, faces, uv = atlas[0]
+    extent = np.array([atlas.width, atlas.height], float)
+    size = int(max(extent))
+    places = (np.asarray(uv, float) * extent - 0.5).clip(0, size - 1)
+    return Atlas(
+        np.asarray(rows, np.int32),
+        np.asarray(faces, np.int32),
+        places.astype(np.float32),
+        size,
+    )

@@ -1,0 +1,236 @@
+"""The texture of a surface, from the views that see each place best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.atlas import MARGIN, Atlas, unwrap
+from tofuse.fusion.cloud import grey_of
+from tofuse.fusion.mesh import Mesh
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.kernels.atlas import NOBODY, draw_triangles, see
+from tofuse.kernels.threads import run_chunks
+from tofuse.maps.surface_map import Projection
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+# How far a surface may be from what a view sees there: m, and as a share of the depth.
+_SLACK, _SLACK_SHARE = 0.02, 0.02
+_BORDER = 0.08  # of the image's height
+# How much more the best view counts: places that two see equally well get the mean of both.
+_POWER = 4.0
+_CHUNKS = 16
+_SAMPLED = 20_000  # vertices at which exposures are compared
+_ROBUST, _ROUNDS = 0.15, 4  # of the logarithm of light
+_MOST_GAIN = 1.0
+# A tenth of what is seen at least, so that black does not weigh without limit.
+_DARK = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Textured:
+    """A surface with a texture.
+
+    Attributes
+    ----------
+    mesh
+        The surface.
+    atlas
+        Where its triangles lie.
+    image
+        (H, W, 3) uint8 RGB.
+    gains
+        (V, C) factor by which each view's light was multiplied.
+    seen
+        Share of the texture that views saw; the rest has the colours of the vertices.
+    """
+
+    mesh: Mesh
+    atlas: Atlas
+    image: UInt8
+    gains: Float64
+    seen: float
+
+
+@dataclass(frozen=True, eq=False)
+class LitView:
+    """What of a view colours a surface.
+
+    Attributes
+    ----------
+    z
+        (H, W) m, 0 where unknown.
+    light
+        (H, W, 3) RGB, or (H, W, 1) albedo in counts times m^2; negative where unknown.
+    projection
+        Where points land.
+    """
+
+    z: Float32
+    light: Float32
+    projection: Projection
+
+    @classmethod
+    def of(cls, frame: RangeFrame) -> LitView | None:
+        """Take the colour of a view, or its amplitude; None where it has neither."""
+        z = np.asarray(frame.z, np.float32)
+        projection = Projection.of(frame.camera, 1)
+        if frame.color_image is not None:
+            light = frame.color_image.astype(np.float32)
+            light[~frame.color_image.any(-1)] = -1  # the colour camera didn't see it
+            return cls(z, np.ascontiguousarray(light), projection)
+        if frame.amplitude_image is None:
+            return None
+        amplitude = frame.amplitude_image
+        unknown = ~(amplitude > 0) | (amplitude >= SATURATED_AMPLITUDE) | (z <= 0)
+        if frame.amplitude_kind != "range_compensated":
+            amplitude = amplitude * np.square(z * ray_lengths(frame.camera))
+        light = np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
+        return cls(z, np.ascontiguousarray(light[..., None]), projection)
+
+
+def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) -> Textured:
+    """Paint a surface with what views see of it.
+
+    Each place gets the mean of the views that see it, of which those that are near and see it
+    straight count by far the most. Exposures are made the same beforehand.
+
+    Parameters
+    ----------
+    mesh
+        With faces.
+    views
+        With colour, or with amplitude, one at least.
+    poses
+        (V, 4, 4) T_world_camera.
+    size
+        Edge of the texture.
+    """
+    atlas = unwrap(mesh, size)
+    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    places = np.zeros((atlas.size, atlas.size, 2), np.float32)
+    draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
+    painted = owner != NOBODY
+    corners = atlas.vertices[atlas.faces[owner[painted]]]
+    b, c = places[painted].T[:, :, None]
+
+    def at_texels(values: NDArray[np.generic]) -> Float32:
+        of = values[corners].astype(np.float32)
+        return of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
+
+    points = at_texels(mesh.vertices)
+    normals = at_texels(mesh.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    gains = exposures(mesh, views, poses)
+    channels = views[0].light.shape[2]
+    sums = np.zeros((len(points), channels), np.float32)
+    weights = np.zeros(len(points), np.float32)
+    for view, T, gain in zip(views, poses, gains, strict=True):
+        _see(view, T, points, normals, sums, weights, gain)
+    seen = weights > 0
+    light = sums[seen] / weights[seen, None]
+    if channels == 3:
+        rgb = np.round(light.clip(0, 255)).astype(np.uint8)
+    else:
+        rgb = grey_of(light[:, 0].astype(float))
+    colors = np.full((len(points), 3), 128, np.uint8)
+    if mesh.color is not None:
+        colors = np.round(at_texels(mesh.color).clip(0, 255)).astype(np.uint8)
+    colors[seen] = rgb
+    image = np.zeros((atlas.size, atlas.size, 3), np.uint8)
+    image[painted] = colors
+    return Textured(
+        mesh, atlas, _spread(image, painted), gains, float(seen.mean()) if len(seen) else 0.0
+    )
+
+
+def exposures(mesh: Mesh, views: Sequence[LitView], poses: Float64) -> Float64:
+    """Factors (V, C) by which the views' light is best multiplied, so that they agree.
+
+    Of every two views that see a place, the logarithms of the light there should differ by that of
+    their factors; the least squares of all differences, those beyond a limit counting less. The
+    mean of the logarithms is 0.
+    """
+    step = max(1, len(mesh) // _SAMPLED)
+    points = np.ascontiguousarray(mesh.vertices[::step])
+    normals = np.ascontiguousarray(mesh.normals[::step])
+    count, channels = len(views), views[0].light.shape[2]
+    logs = np.zeros((count, len(points), channels))
+    weights = np.zeros((count, len(points)))
+    top = max(float(np.percentile(view.light, 99)) for view in views)
+    for k, (view, T) in enumerate(zip(views, poses, strict=True)):
+        sums, weight = (
+            np.zeros((len(points), channels), np.float32),
+            np.zeros(len(points), np.float32),
+        )
+        _see(view, T, points, normals, sums, weight, np.ones(channels))
+        seen = weight > 0
+        light = sums[seen] / weight[seen, None]
+        # What is nearly black or white tells little.
+        usable = (light > _DARK * top).all(1) & ((light < 250).all(1) if channels == 3 else True)
+        logs[k, seen] = np.log(np.maximum(light, _DARK * top))
+        weights[k, seen] = usable
+    return np.stack([_gains(logs[..., c], weights) for c in range(channels)], -1)
+
+
+def _gains(logs: Float64, weights: Float64) -> Float64:
+    """Factors (V,) for the logarithms (V, N) of light, where weights (V, N) are not 0."""
+    gain = np.zeros(len(logs))
+    w = weights
+    for _ in range(_ROUNDS):
+        total = np.maximum(w.sum(0), 1e-9)
+        mean = (w * logs).sum(0) / total
+        # The places' own light eliminated: normal equations of the views alone.
+        A = np.diag(w.sum(1)) - (w / total) @ w.T
+        b = (w * (mean - logs)).sum(1)
+        A += np.eye(len(A)) * (1e-3 * max(np.trace(A) / len(A), 1.0)) + 1e-3
+        gain = np.linalg.solve(A, b)
+        gain -= gain.mean()
+        fitted = logs + gain[:, None]
+        rest = np.abs(fitted - (w * fitted).sum(0) / total)
+        w = weights * np.minimum(1, _ROBUST / np.maximum(rest, 1e-9))
+    return np.asarray(np.exp(gain.clip(-_MOST_GAIN, _MOST_GAIN)), np.float64)
+
+
+def _see(
+    view: LitView,
+    T_world_camera: Float64,
+    points: Float32,
+    normals: Float32,
+    sums: Float32,
+    weights: Float32,
+    gain: Float64,
+) -> None:
+    light = np.where(view.light < 0, view.light, view.light * gain.astype(np.float32))
+    T = se3.inverse(T_world_camera)
+    border = max(2.0, _BORDER * view.z.shape[0])
+    projection = view.projection
+    run_chunks(
+        lambda a, b: see(
+            points, normals, T, view.z, light, projection.lookup, projection.frame, _SLACK,
+            _SLACK_SHARE, border, _POWER, sums, weights, a, b,
+        ),
+        len(points),
+        _CHUNKS,
+    )  # fmt: skip
+
+
+def _spread(image: UInt8, painted: NDArray[np.bool_]) -> UInt8:
+    """Fill what nobody owns with the nearest colour, so that smaller copies don't darken."""
+    if painted.all() or not painted.any():
+        return image
+    _, label = cv2.distanceTransformWithLabels(
+        (~painted).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros((int(label.max()) + 1, 3), np.uint8)
+    of_label[label[painted]] = image[painted]
+    return of_label[label]

@@ -1,0 +1,81 @@
+"""The texture of a finished model, from frames that are read once more."""
+
+from __future__ import annotations
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.errors import UnreadableFrameError
+from tofuse.fusion.texture import LitView, Textured, textured
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads as use_threads
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import Recording
+from tofuse.results.types import Reconstruction
+
+# Views that give their colours, and triangles that are painted at most: more of either are hardly
+# seen, and take long to lay out.
+_VIEWS, _FACES = 60, 60_000
+# One radian of motion blurs as much as so many metres.
+_METRES_A_RADIAN = 1.0
+
+
+def paint(
+    recording: Recording,
+    result: Reconstruction,
+    size: int,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Textured | None:
+    """Make the texture of a model's surface; None where there is no surface, or nothing to see.
+
+    Parameters
+    ----------
+    size
+        Edge of the texture, in texels.
+    threads
+        How many to use; None: all cores. The result does not depend on it.
+    """
+    mesh = result.mesh
+    if mesh is None or not len(mesh.faces):
+        return None
+    chosen = steady(result)
+    progress = progress or Silent()
+    progress.stage("painting", len(chosen))
+    views: list[LitView] = []
+    poses = []
+    for k in chosen:
+        progress.advance()
+        try:
+            frame = recording[int(k)]
+        except UnreadableFrameError:
+            continue
+        view = LitView.of(frame) if isinstance(frame, RangeFrame) else None
+        if view is not None and (not views or view.light.shape == views[0].light.shape):
+            views.append(view)
+            poses.append(result.trajectory[k])
+    if not views:
+        return None
+    # BLAS sums differ with its number of threads; ours don't.
+    with use_threads(threads), threadpool_limits(1):
+        return textured(mesh.decimated(_FACES), views, np.array(poses), size)
+
+
+def steady(result: Reconstruction, most: int = _VIEWS) -> list[int]:
+    """Return frames that were tracked, spread evenly, and of each stretch the one that moved least.
+
+    Motion blurs; the first frame of the recording is number 0, whatever its index.
+    """
+    tracked = [k for k, f in enumerate(result.diagnostics.frames) if f.status == "tracked"]
+    posed = np.array([k for k in tracked if result.has_pose[k]], np.intp)
+    if len(posed) <= most:
+        return [int(k) for k in posed]
+    motion = se3.log(se3.inverse(result.trajectory[posed[:-1]]) @ result.trajectory[posed[1:]])
+    step = np.linalg.norm(motion[:, :3], axis=1)
+    step += _METRES_A_RADIAN * np.linalg.norm(motion[:, 3:], axis=1)
+    speed = np.maximum(np.r_[step[:1], step], np.r_[step, step[-1:]])
+    return [
+        int(part[np.argmin(speed[np.searchsorted(posed, part)])])
+        for part in np.array_split(posed, most)
+    ]

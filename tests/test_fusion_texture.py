@@ -1,0 +1,299 @@
+"""Textures: layout, content, files; and what is done to meshes before."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.cli import main
+from tofuse.files.glb import write_glb
+from tofuse.files.images import png_bytes
+from tofuse.files.obj import write_obj
+from tofuse.fusion import atlas as atlas_module
+from tofuse.fusion.atlas import MARGIN, plain_atlas, unwrap
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.texture import LitView, exposures, textured
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels.atlas import NOBODY, draw_triangles
+from tofuse.pipeline import paint
+from tofuse.pipeline import run as run_module
+from tofuse.recordings.frames import RangeFrame
+
+CAMERA = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
+
+
+def sheet(columns: int, rows: int, step: float, z: float = 2.0) -> Mesh:
+    """A wall across the first camera's view, facing it, centred on its axis."""
+    x, y = np.meshgrid(np.arange(columns) * step, np.arange(rows) * step)
+    p = np.stack([x - x.mean(), y - y.mean(), np.full_like(x, z)], -1).reshape(-1, 3)
+    k = (np.arange(columns - 1) + columns * np.arange(rows - 1)[:, None]).ravel()
+    lower = np.stack([k, k + columns, k + 1], 1)
+    upper = np.stack([k + 1, k + columns, k + columns + 1], 1)
+    return mesh_of(p, np.concatenate([lower, upper]), np.tile([0, 0, -1.0], (len(p), 1)))
+
+
+def mesh_of(points, faces, normals) -> Mesh:
+    count = len(points)
+    return Mesh(
+        np.asarray(points, np.float32),
+        np.asarray(faces, np.int32),
+        np.asarray(normals, np.float32),
+        np.full((count, 3), 9, np.uint8),
+        np.full(count, 0.001, np.float32),
+        np.full(count, 5, np.int32),
+        np.zeros(3),
+    )
+
+
+def pattern(points: np.ndarray) -> np.ndarray:
+    """Colours (N, 3), smooth over the wall."""
+    x, y = points[..., 0], points[..., 1]
+    waves = [np.sin(9 * x), np.cos(7 * y), np.sin(5 * x + 6 * y)]
+    return 120 + 40 * np.stack(waves, -1)
+
+
+def look(T: np.ndarray, gain: float, *, hidden: float | None = None, lamp: bool = False):
+    """An image of the wall at z = 2 m; nearer by 0.5 m where its x is beyond `hidden`."""
+    rays = np.concatenate([CAMERA.rays(), np.ones((60, 80, 1))], -1)
+    away = rays @ T[:3, :3].T
+    z = (2.0 - T[2, 3]) / away[..., 2]
+    at = away * z[..., None] + T[:3, 3]
+    light = pattern(at) * gain
+    if hidden is not None:
+        front = at[..., 0] > hidden
+        z, light = np.where(front, z - 0.5, z), np.where(front[..., None], 255, light)
+    if not lamp:
+        color = np.round(light).clip(1, 255).astype(np.uint8)
+        return RangeFrame(0, 0.0, CAMERA, z.astype(np.float32), color_image=color)
+    square = (rays**2).sum(-1) * z * z
+    amplitude = (light[..., 0] / square).astype(np.float32)
+    return RangeFrame(0, 0.0, CAMERA, z.astype(np.float32), amplitude_image=amplitude)
+
+
+POSES = np.stack(
+    [np.eye(4), se3.exp([0.2, 0, 0, 0, -0.1, 0]), se3.exp([-0.25, 0.1, 0.3, 0.05, 0.1, 0])]
+)
+
+
+def test_triangles_are_drawn_where_they_are() -> None:
+    rng = np.random.default_rng(0)
+    corners = rng.uniform(-3, 33, (12, 3, 2)).astype(np.float32)
+    owner = np.full((30, 30), NOBODY, np.int32)
+    places = np.zeros((30, 30, 2), np.float32)
+    draw_triangles(corners, 1.4, owner, places)
+    for v in range(30):
+        for u in range(30):
+            inside, near = [], []
+            for m, (a, b, c) in enumerate(corners.astype(float)):
+                s, t = np.linalg.solve(np.stack([b - a, c - a], 1), [u - a[0], v - a[1]])
+                edges = [(b, c, 1 - s - t), (c, a, s), (a, b, t)]
+                area = abs(np.linalg.det(np.stack([b - a, c - a])))
+                out = max(-w * area / np.linalg.norm(q - p) for p, q, w in edges)
+                low, high = corners[m].min(0) - 1, corners[m].max(0) + 1
+                boxed = (low <= [u, v]).all() and ([u, v] <= high).all()
+                near += [m] if boxed and out <= 1.4 - 1e-4 else []
+                inside += [m] if out < -1e-4 else []
+                if owner[v, u] == m:
+                    np.testing.assert_allclose(places[v, u], [s, t], atol=1e-3)
+                    assert out <= 1.4 + 1e-4
+            if inside:
+                assert owner[v, u] >= max(inside)
+            elif near:
+                assert owner[v, u] != NOBODY
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_layouts_hold_every_triangle_once(plain: bool, monkeypatch) -> None:
+    mesh = sheet(9, 7, 0.1)
+    if plain:
+        monkeypatch.setitem(sys.modules, "xatlas", None)
+    else:
+        pytest.importorskip("xatlas")
+    atlas = unwrap(mesh, 256)
+    np.testing.assert_array_equal(
+        np.sort(np.sort(atlas.vertices[atlas.faces], 1), 0),
+        np.sort(np.sort(mesh.faces, 1), 0),
+    )
+    # In the same direction, so that outside stays outside.
+    np.testing.assert_array_equal(
+        {tuple(np.roll(f, -np.argmin(f))) for f in atlas.vertices[atlas.faces].tolist()},
+        {tuple(np.roll(f, -np.argmin(f))) for f in mesh.faces.tolist()},
+    )
+    corners = atlas.places[atlas.faces]
+    assert atlas.size <= 300
+    assert corners.min() >= 0
+    assert corners.max() <= atlas.size - 1
+    # No texel within one triangle is taken by another.
+    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    places = np.zeros((atlas.size, atlas.size, 2), np.float32)
+    for order in (slice(None), slice(None, None, -1)):
+        owner[:] = NOBODY
+        draw_triangles(np.ascontiguousarray(corners[order]), 0.0, owner, places)
+        number = np.arange(len(corners))[order]
+        found = np.where(owner == NOBODY, -1, number[owner])
+        if order == slice(None):
+            first = found
+    shared = (places.min(-1) > 1e-3) & (places.sum(-1) < 1 - 1e-3)
+    np.testing.assert_array_equal(found[shared], first[shared])
+    across = np.linalg.det(corners[:, 1:].astype(float) - corners[:, :1])
+    assert np.abs(across).min() > 20  # texels
+    if plain:
+        assert atlas_module.plain_atlas(mesh, 64).size < atlas.size
+
+
+def test_a_texture_shows_what_is_there_at_one_exposure() -> None:
+    mesh = sheet(25, 17, 0.05)
+    gains = np.array([1.0, 1.3, 0.8])
+    views = [LitView.of(look(T, g)) for T, g in zip(POSES, gains, strict=True)]
+    found = exposures(mesh, views, POSES)
+    expected = np.exp(np.log(gains).mean()) / gains
+    np.testing.assert_allclose(found, np.tile(expected[:, None], 3), rtol=0.01)
+    made = textured(mesh, views, POSES, 256)
+    assert made.seen > 0.99
+    atlas = made.atlas
+    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    places = np.zeros((atlas.size, atlas.size, 2), np.float32)
+    draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
+    inside = (owner != NOBODY) & (places.min(-1) >= 0) & (places.sum(-1) <= 1)
+    p = mesh.vertices[atlas.vertices[atlas.faces[owner[inside]]]]
+    b, c = places[inside].T[:, :, None]
+    at = p[:, 0] * (1 - b - c) + p[:, 1] * b + p[:, 2] * c
+    truth = pattern(at) * np.exp(np.log(gains).mean())
+    error = np.abs(made.image[inside] - truth)
+    assert error.mean() < 1.0
+    assert np.quantile(error, 0.99) < 4.0
+    # As exposures were, the best view alone would be off by 20 % and more.
+    assert np.abs(pattern(at) * 1.3 - truth).mean() > 20
+
+
+def test_amplitude_is_made_albedo_and_then_grey() -> None:
+    mesh = sheet(25, 17, 0.05)
+    views = [LitView.of(look(T, g, lamp=True)) for T, g in zip(POSES, (1, 2, 1), strict=True)]
+    found = exposures(mesh, views, POSES)
+    np.testing.assert_allclose(found[:, 0] / found[0, 0], [1, 0.5, 1], rtol=0.02)
+    made = textured(mesh, views, POSES, 128)
+    assert (np.ptp(made.image.astype(int), axis=-1) == 0).all()
+    assert np.ptp(made.image) > 200
+
+
+def test_what_is_hidden_is_not_painted_by_what_hides_it() -> None:
+    mesh = sheet(25, 17, 0.05)
+    view = LitView.of(look(np.eye(4), 1.0, hidden=0.2))
+    made = textured(mesh, [view], POSES[:1], 256)
+    corners = made.atlas.places[made.atlas.faces].mean(1).round().astype(int)
+    x = mesh.vertices[made.atlas.vertices[made.atlas.faces]].mean(1)[:, 0]
+    shown = made.image[corners[:, 1], corners[:, 0]]
+    assert (shown[x > 0.3] == 9).all()  # the vertices' own colour
+    assert (shown[x < 0.05] > 60).all()
+    assert (shown != 255).any(1).all()
+    # From behind, nothing is seen.
+    turned = mesh_of(mesh.vertices, mesh.faces[:, ::-1], -mesh.normals)
+    assert textured(turned, [view], POSES[:1], 256).seen == 0
+
+
+def test_frames_without_light_give_no_view() -> None:
+    assert LitView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
+
+
+def test_textures_come_back_from_files(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    mesh = sheet(5, 4, 0.2)
+    made = textured(mesh, [LitView.of(look(np.eye(4), 1.0))], POSES[:1], 128)
+    atlas, image = made.atlas, png_bytes(made.image)
+    points, normals = mesh.vertices[atlas.vertices], mesh.normals[atlas.vertices]
+    for write, name in ((write_glb, "m.glb"), (write_obj, "m.obj")):
+        path = tmp_path / name
+        write(path, points, atlas.faces, normals=normals, uv=atlas.uv, texture=image)
+        (read,) = trimesh.load_scene(path, process=False).geometry.values()
+        np.testing.assert_allclose(read.triangles, points[atlas.faces], atol=1e-6)
+        material = read.visual.material
+        shown = material.baseColorTexture if name == "m.glb" else material.image
+        np.testing.assert_array_equal(np.asarray(shown.convert("RGB")), made.image)
+        # Their v goes up from the lower edge.
+        uv = np.asarray(read.visual.uv)[read.faces] * [1, -1] + [0, 1]
+        np.testing.assert_allclose(uv, atlas.uv[atlas.faces], atol=1e-5)
+    assert {p.name for p in tmp_path.iterdir()} == {"m.glb", "m.obj", "m.mtl", "m.png"}
+
+
+def test_holes_are_closed_and_borders_are_not() -> None:
+    mesh = sheet(12, 10, 0.05)
+    centre = mesh.vertices[mesh.faces].mean(1)
+    small = np.linalg.norm(centre[:, :2] - [0.1, 0.05], axis=1) < 0.06
+    large = np.linalg.norm(centre[:, :2] + [0.12, 0.0], axis=1) < 0.12
+    torn = mesh.rows(~(small | large))
+    patched = torn.without_holes(0.7)
+    assert len(patched) == len(torn) + 1
+    added = patched.vertices[-1]
+    np.testing.assert_allclose(added, [0.1, 0.05, 2.0], atol=0.03)
+    assert patched.views[-1] == 0
+    assert 0.03 < patched.sigma[-1] < 0.1
+    np.testing.assert_allclose(patched.normals[-1], [0, 0, -1])
+    assert (patched.color[-1] == 9).all()
+    a, b, c = np.moveaxis(patched.vertices[patched.faces].astype(float), 1, 0)
+    across = 0.5 * np.cross(b - a, c - a)
+    assert (across[:, 2] < 0).all()  # all still face the camera
+    removed = (0.05**2 / 2) * large.sum()
+    np.testing.assert_allclose(-across[:, 2].sum(), 0.55 * 0.45 - removed, rtol=1e-5)
+    assert len(torn.without_holes(10.0)) == len(torn) + 2  # the outer border is no hole
+    assert torn.without_holes(0.05) is torn
+    np.testing.assert_array_equal(mesh.without_holes(10.0).faces, mesh.faces)
+
+
+def test_decimation_keeps_edges_sharp_and_sides_apart() -> None:
+    front, top = sheet(41, 41, 0.01), sheet(41, 41, 0.01)
+    # A ledge: a wall, and from its upper edge a plane away from the camera; cells are cut anyhow.
+    upper = top.vertices[:, [0, 2, 1]] * [1, 0, 1] + [0, -0.2, 2.2]
+    ledge = mesh_of(
+        np.concatenate([front.vertices, upper]) + 0.0037,
+        np.concatenate([front.faces, top.faces + len(front)]),
+        np.concatenate([front.normals, np.tile([0, -1.0, 0], (len(top), 1))]),
+    )
+    small = ledge.decimated(700)
+    assert 200 < len(small.faces) <= 700
+    p = small.vertices.astype(float) - 0.0037
+    off = np.minimum(np.abs(p[:, 2] - 2.0), np.abs(p[:, 1] + 0.2))
+    assert off.max() < 0.002
+    assert ledge.decimated(10**6) is ledge
+    # A board of 1 cm, seen from both sides: cells of 5 cm do not make it one.
+    back = sheet(41, 41, 0.01, 2.01)
+    board = mesh_of(
+        np.concatenate([front.vertices, back.vertices]),
+        np.concatenate([front.faces, back.faces[:, ::-1] + len(front)]),
+        np.concatenate([front.normals, -back.normals]),
+    )
+    thin = board.simplified(0.05)
+    z = thin.vertices[:, 2].astype(float)
+    assert np.abs(np.minimum(np.abs(z - 2.0), np.abs(z - 2.01))).max() < 1e-3
+    np.testing.assert_array_equal(z > 2.005, thin.normals[:, 2] > 0)
+
+
+def test_plain_cells_get_smaller_with_more_triangles() -> None:
+    many = plain_atlas(sheet(60, 60, 0.01), 256)
+    assert 256 < many.size <= 60 * 6
+
+
+def test_a_run_with_a_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setattr(
+        run_module, "_report", lambda *a: (a[-1] / "report.html").write_text("report")
+    )
+    monkeypatch.setattr(run_module, "_TEXTURE", 256)
+    monkeypatch.setattr(paint, "_FACES", 3000)
+    words = ["run", str(room_recording), "--every", "7", "--out"]
+    for threads, name in (("1", "a"), ("2", "b")):
+        out = str(tmp_path / name)
+        assert main([*words, out, "--texture", "--threads", threads]) == 0
+    a, b = tmp_path / "a", tmp_path / "b"
+    for name in ("mesh.glb", "mesh.obj", "mesh.mtl", "mesh.png"):
+        assert (a / name).read_bytes() == (b / name).read_bytes()
+    (mesh,) = trimesh.load_scene(a / "mesh.glb", process=False).geometry.values()
+    image = np.asarray(mesh.visual.material.baseColorTexture.convert("L"))
+    assert np.ptp(image) > 100
+    # Without one, what was there goes away.
+    assert main([*words, str(a), "--overwrite"]) == 0
+    assert not (a / "mesh.obj").exists()
+    assert not (a / "mesh.png").exists()
