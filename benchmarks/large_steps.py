@@ -1,10 +1,14 @@
-"""Large steps between views: how often the search finds the pose, how fast, and what it tells.
+"""Large steps between views: how often the pose is found, by which method, and what that tells.
 
-Neighbours of recordings of which only every so many-th view is taken are searched for without a
-hint, beside pairs that share nothing: views of different scenes, and views of one scene that look
-elsewhere. What is right is known from the reference: within 0.15 m and 4 degrees.
+`steps` takes pairs of views that are turned against each other by 10 to 60 degrees, and gives them
+to every method that needs no guess: the exhaustive search, SIFT, ORB and FAST features, planes, and
+histograms of normals. `search` looks at the exhaustive search alone: neighbours of recordings of
+which only every so many-th view is taken are searched for without a hint, beside pairs that share
+nothing, which are views of different scenes, and views of one scene that look elsewhere. What is
+right is known from the reference: within 0.15 m and 4 degrees.
 
-    python benchmarks/large_steps.py [--sequences kinect kitchen room] [--mode auto both]
+    python benchmarks/large_steps.py steps [--sequences room kitchen] [--pairs 8]
+    python benchmarks/large_steps.py search [--sequences kinect kitchen room] [--mode auto both]
 """
 
 from __future__ import annotations
@@ -22,11 +26,16 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import sequences
+from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Recovery
+from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import agreement
+from tofuse.registration.features import Features
+from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.plane_sets import PlaneSets
 from tofuse.registration.search import SearchOptions, search
 
 Float64 = NDArray[np.float64]
@@ -108,9 +117,7 @@ def look(
         return Outcome(False, 0.0, 0.0, False, seconds)
     right = False
     if true is not None:
-        off = se3.inverse(true) @ found.T_target_source
-        near = np.linalg.norm(off[:3, 3]) < RIGHT_M
-        right = bool(near and np.degrees(se3.angle(off)) < RIGHT_DEG)
+        right = is_right(found.T_target_source, true)
     return Outcome(right, found.score, found.margin, Recovery().believes(found), seconds)
 
 
@@ -167,20 +174,115 @@ def print_table(title: str, outcomes: list[Outcome]) -> None:
     )
 
 
+# Turns between the views of a pair, degrees, and what a pair may be off.
+TURNS, TURN_SLACK = (10, 20, 30, 40, 50, 60), 4.0
+
+Method = Callable[[RangeFrame, RangeFrame], Float64 | None]
+
+
+def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
+    """The pose that the exhaustive search finds, if it is believed."""
+    options = SurfaceOptions()
+    found = search(surface_map(source, options), surface_map(target, options))
+    believed = found is not None and Recovery().believes(found)
+    return found.T_target_source if found is not None and believed else None
+
+
+def by_part(part: Features | Fpfh | PlaneSets) -> Method:
+    """The pose that a part finds, if it finds any."""
+
+    def found(source: RangeFrame, target: RangeFrame) -> Float64 | None:
+        try:
+            return part.register(
+                source, target, np.eye(4), np.random.default_rng(0)
+            ).T_target_source
+        except RegistrationError:
+            return None
+
+    return found
+
+
+METHODS: dict[str, Method] = {
+    "exhaustive search": searched,
+    "SIFT": by_part(Features("sift")),
+    "ORB": by_part(Features("orb")),
+    "FAST": by_part(Features("fast")),
+    "planes": by_part(PlaneSets()),
+    "FPFH": by_part(Fpfh()),
+}
+
+
+def turned(reference: Float64, degrees: float, most: int) -> list[tuple[int, int]]:
+    """Pairs of views turned against each other by about so much, evenly over the recording."""
+    found = []
+    for k in range(len(reference)):
+        angles = np.degrees(se3.angle(se3.inverse(reference[k]) @ reference[k + 1 :]))
+        near = np.flatnonzero(np.abs(angles - degrees) < TURN_SLACK)
+        if len(near):
+            found.append((k, k + 1 + int(near[0])))
+    return found[:: max(1, -(-len(found) // most))]
+
+
+def print_steps(name: str, data: Path, frames: int | None, most: int) -> None:
+    """Of each method and turn: poses that are right, those that are wrong, and how many pairs."""
+    sequence = sequences.load(name, data, frames)
+    pairs = {degrees: turned(sequence.reference, degrees, most) for degrees in TURNS}
+    print(f"\n{sequence.title}\n")
+    print(f"| Method | {' | '.join(f'{d} degrees' for d in TURNS)} | s a pair, one core |")
+    print(f"|---|{'---|' * (len(TURNS) + 1)}")
+    T = sequence.reference
+    for title, method in METHODS.items():
+        cells, seconds = [], []
+        method(sequence.frames[0], sequence.frames[1])  # warm
+        for degrees in TURNS:
+            right = wrong = 0
+            for i, j in pairs[degrees]:
+                with threads(1):
+                    start = time.process_time()
+                    found = method(sequence.frames[j], sequence.frames[i])
+                    seconds.append(time.process_time() - start)
+                if found is not None:
+                    good = is_right(found, se3.inverse(T[i]) @ T[j])
+                    right, wrong = right + good, wrong + (not good)
+            cells.append(f"{right} of {len(pairs[degrees])}" + f", {wrong} wrong" * (wrong > 0))
+        print(f"| {title} | {' | '.join(cells)} | {np.median(seconds):.2f} |", flush=True)
+
+
+def is_right(found: Float64, true: Float64) -> bool:
+    off = se3.inverse(true) @ found
+    near = np.linalg.norm(off[:3, 3]) < RIGHT_M
+    return bool(near and np.degrees(se3.angle(off)) < RIGHT_DEG)
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["steps", "search"])
     parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--sequences", nargs="*", default=["kinect", "kitchen", "room"])
+    parser.add_argument("--sequences", nargs="*", default=None)
+    parser.add_argument("--frames", type=int, default=None, help="of each sequence, in 'steps'")
+    parser.add_argument("--pairs", type=int, default=8, help="of each turn, in 'steps'")
     parser.add_argument("--mode", nargs="*", default=["auto", "both"])
     given = parser.parse_args(arguments)
+    if given.what == "steps":
+        for name in given.sequences or ["room", "empty-room", "kitchen"]:
+            try:
+                print_steps(name, given.data, given.frames, given.pairs)
+            except FileNotFoundError:
+                print(f"{name}: no data")
+        return
+    print_search(given.sequences or ["kinect", "kitchen", "room"], given.data, given.mode)
+
+
+def print_search(names: list[str], data: Path, modes: list[str]) -> None:
+    """How often the exhaustive search is right, and what its figures are worth."""
     taken = []
     for steps in TAKEN:
-        if steps.sequence in given.sequences:
+        if steps.sequence in names:
             try:
-                taken.append(load(steps, given.data))
+                taken.append(load(steps, data))
             except FileNotFoundError:
                 print(f"{steps.sequence}: no data")
-    for mode in given.mode:
+    for mode in modes:
         options = SearchOptions(mode=mode)
         print(f"\nMode {mode}\n")
         print("| Views | Right | Believed and right | Believed and wrong | s a pair, one core |")

@@ -41,6 +41,8 @@ _POLISHED = 20
 _SHORTEST = 4.0
 # Pairs that grow a motion together from one that leads (SC2-PCR: nearest in compatibility).
 _TOGETHER = 20
+# Pairs that are compared with each other, which takes memory by their square.
+_MOST_COMPARED = 2000
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 
@@ -254,6 +256,8 @@ def _alike(pairs: Pairs, triples: Int64, sigmas: float) -> Bool:
 
 def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generator) -> Float64:
     """Motions (k, 4, 4) of pairs that agree with each other about their distances."""
+    if len(pairs) > _MOST_COMPARED:
+        pairs = pairs.some(np.linspace(0, len(pairs) - 1, _MOST_COMPARED).astype(np.int64))
     p, q = pairs.source, pairs.target
     one, other = (np.linalg.norm(x[:, None] - x, axis=2) for x in (p, q))
     sigma = np.sqrt(pairs.variance[:, None] + pairs.variance)
