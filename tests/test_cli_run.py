@@ -113,6 +113,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "frames",
         "loops",
         "optimiser",
+        "outside",
         "refinement",
         "filters",
     }
@@ -350,6 +351,7 @@ def test_loops_from_a_file(room_recording, tmp_path) -> None:
         "overlap",
         "rms_m",
         "free_space_violation",
+        "margin",
     }
     assert len(read_g2o(tmp_path / "out/pose_graph.g2o").edges) == 8
 
