@@ -61,11 +61,11 @@ def packed(points, normals, sigma, photo):
 def accumulate(view, of, T=MOTION, *, exposure=0.0, scale_g=1.0, scale_p=SCALE_P, slack=0.01,
                min_cosine=0.5, robust=ROBUST, start=0, stop=None):  # fmt: skip
     planes, variance, photo, projection = of
-    points = view if isinstance(view, np.ndarray) else packed(*view)
+    points = (view if isinstance(view, np.ndarray) else packed(*view))[start:stop]
     return kernels.accumulate(
         points, kernels.make_target(projection.rays, planes, variance, photo), projection.lookup,
         projection.frame, np.ascontiguousarray(T), exposure, scale_g, scale_p, slack, robust,
-        min_cosine, start, len(points) if stop is None else stop,
+        min_cosine,
     )  # fmt: skip
 
 

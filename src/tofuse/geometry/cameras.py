@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,8 +46,26 @@ class Camera(Protocol):
 
 def ray_lengths(camera: Camera) -> Float32:
     """Length (H, W) of the rays (x/z, y/z, 1): the ratio of radial range to z depth (eq 2.3)."""
-    rays = camera.rays()
-    return np.sqrt(1 + (rays * rays).sum(-1))
+    return _derived(camera)[0]
+
+
+def unknown_rays(camera: Camera) -> NDArray[np.bool_] | None:
+    """(H, W) whether a pixel's ray is unknown; None if no pixel's is."""
+    return _derived(camera)[1]
+
+
+# What is computed once for a camera, as every frame asks for it.
+_computed: WeakKeyDictionary[Camera, tuple[Float32, NDArray[np.bool_] | None]] = WeakKeyDictionary()
+
+
+def _derived(camera: Camera) -> tuple[Float32, NDArray[np.bool_] | None]:
+    found = _computed.get(camera)
+    if found is None:
+        rays = camera.rays()
+        unknown = ~np.isfinite(rays).all(-1)
+        lengths = _frozen(np.sqrt(1 + (rays * rays).sum(-1)))
+        found = _computed[camera] = lengths, unknown if unknown.any() else None
+    return found
 
 
 def z_from_range(camera: Camera, radial_range: ArrayLike) -> Float32:

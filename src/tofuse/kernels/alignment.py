@@ -60,9 +60,21 @@ HISTOGRAM = 67
 BINS = 96
 SIZE = HISTOGRAM + BINS
 
-# Residuals wait in blocks, each weighted by the root of its w: a column of J (7), r, and D (6).
-_BLOCK = 32
-_J, _R, _D, _COLUMN = 0, 7, 8, 14
+# Points that are compared wait in blocks, the numbers of each in a column, so that the processor
+# works on several at a time. Rows of a block: the point, where it came to be (x/z, y/z and z in the
+# target), the target's pixel, whether it is an inlier; then the residual's derivatives J (7), r, and
+# D (6), each weighted by the root of its w; and what is summed of each column.
+_LANES = 128
+_NEAREST = 0.02  # m; what comes nearer to the target's camera is not compared
+_XN, _YN, _Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
+_SEEN = _PIXEL + PIXEL_SIZE
+_FITS = _SEEN + 1
+_J = _FITS + 1
+_R, _D = _J + 7, _J + 8
+_STAT = _D + 6  # as from INLIERS to SQUARES_M
+_STATS = SQUARES_M + 1 - INLIERS
+_RATIO = _STAT + _STATS
+_ROWS = _RATIO + 1
 
 
 @kernel
@@ -78,10 +90,8 @@ def accumulate(
     slack: float,
     robust: float,
     min_cosine: float,
-    start: int,
-    stop: int,
 ) -> Float64:
-    """Sum the normal equations over the points start..stop.
+    """Sum the normal equations over points.
 
     Parameters
     ----------
@@ -104,110 +114,220 @@ def accumulate(
         Smallest cosine between the normals.
     """
     out = np.zeros(SIZE)
-    rows, columns = target.shape[0], target.shape[1]
-    inverse_limit2 = 1 / (robust * robust)
-    per_p = 1 / scale_p if scale_p > 0 else 0.0
-    scale_g2 = scale_g * scale_g
-    slack2 = slack * slack
-    block = np.empty((_COLUMN, _BLOCK))
-    sums = np.zeros((LANDED, _BLOCK))
-    waiting = 0
+    block = np.zeros(_ROWS * _LANES, np.float32)
+    sums = np.zeros((LANDED + _STATS, _LANES))
+    for first in range(0, len(points), _LANES):
+        count = min(_LANES, len(points) - first)
+        for k in range(count):
+            for c in range(POINT_SIZE):
+                block[c * _LANES + k] = points[first + k, c]
+        _move(block, T)
+        out[LANDED] += _land(block, count, target, lookup, lookup_frame)
+        _distances(block, T, scale_g, slack, robust, min_cosine)
+        _add_products(sums, block)
+        if scale_p > 0:
+            _albedos(block, T, exposure, scale_p, robust)
+            _add_products(sums, block)
+        for c in range(_STATS):
+            total, row = sums[LANDED + c], block[(_STAT + c) * _LANES : (_STAT + c + 1) * _LANES]
+            for k in range(_LANES):
+                total[k] += row[k]
+        for k in range(count):
+            if block[_SEEN * _LANES + k] > 0:
+                out[COMPARED] += 1
+                out[HISTOGRAM + histogram_bin(block[_RATIO * _LANES + k])] += 1
+    width = _LANES
+    while width > 1:
+        width //= 2
+        for q in range(len(sums)):
+            low, high = sums[q, :width], sums[q, width:]
+            for k in range(width):
+                low[k] += high[k]
+    out[:LANDED] = sums[:LANDED, 0]
+    out[INLIERS : INLIERS + _STATS] = sums[LANDED:, 0]
+    return out
+
+
+@kernel
+def _move(block: Float32, T: Float64) -> None:
+    """Say where the points of a block come to be in the target."""
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    for k in range(start, stop):
-        if waiting > _BLOCK - 2:
-            _add_block(sums, block, waiting)
-            waiting = 0
-        px = np.float64(points[k, POINT])
-        py = np.float64(points[k, POINT + 1])
-        pz = np.float64(points[k, POINT + 2])
+    for k in range(_LANES):
+        px = block[POINT * _LANES + k]
+        py = block[(POINT + 1) * _LANES + k]
+        pz = block[(POINT + 2) * _LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
-        if z <= 0.02:
-            continue
-        x = r00 * px + r01 * py + r02 * pz + t0
-        y = r10 * px + r11 * py + r12 * pz + t1
         per_z = 1 / z
-        xn = x * per_z
-        yn = y * per_z
-        u, v, iu, _ = landing(xn, yn, lookup, lookup_frame)
-        if iu < 0:
+        block[_XN * _LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
+        block[_YN * _LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
+        block[_Z * _LANES + k] = z
+
+
+@kernel
+def _land(
+    block: Float32, count: int, target: Float32, lookup: Float32, lookup_frame: Float64
+) -> int:
+    """Find the target's pixels of the points of a block; returns how many land on one."""
+    rows, columns = target.shape[0], target.shape[1]
+    landed = 0
+    for k in range(_LANES):
+        block[_SEEN * _LANES + k] = 0
+        if k >= count or not block[_Z * _LANES + k] > _NEAREST:
             continue
-        if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+        u, v, iu, _ = landing(
+            block[_XN * _LANES + k], block[_YN * _LANES + k], lookup, lookup_frame
+        )
+        if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
+        landed += 1
         pixel = target[int(v + 0.5), int(u + 0.5)]
-        out[LANDED] += 1
-        distance = np.float64(pixel[DISTANCE])
-        if distance == 0:
-            continue
-        out[COMPARED] += 1
-        n0 = np.float64(pixel[PLANE])
-        n1 = np.float64(pixel[PLANE + 1])
-        n2 = np.float64(pixel[PLANE + 2])
-        across = n0 * x + n1 * y + n2 * z
-        r = across - distance
-        # How an error along the source's ray, relative to z, moves the point across the plane.
-        along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(points[k, SIGMA])
-        own = along * along + np.float64(pixel[VARIANCE])
-        r2 = r * r
-        out[HISTOGRAM + histogram_bin(r2 / own)] += 1
-        per_variance = 1 / (scale_g2 * own + slack2)
-        e2 = r2 * per_variance * inverse_limit2
-        if e2 >= 1:
-            # Nearer than what the target saw there: it looked through this point.
-            if r < 0 and e2 > 4:
-                out[IN_FRONT] += 1
-            continue
+        if pixel[DISTANCE] > 0:
+            block[_SEEN * _LANES + k] = 1
+            for c in range(PIXEL_SIZE):
+                block[(_PIXEL + c) * _LANES + k] = pixel[c]
+    return landed
+
+
+@kernel
+def _distances(
+    block: Float32,
+    T: Float64,
+    scale_g: float,
+    slack: float,
+    robust: float,
+    min_cosine: float,
+) -> None:
+    """Compare the points of a block with the planes that they fell on."""
+    r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
+    r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
+    r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
+    scale_g2, slack2 = np.float32(scale_g * scale_g), np.float32(slack * slack)
+    per_limit2, least = np.float32(1 / (robust * robust)), np.float32(min_cosine)
+    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
+    for k in range(_LANES):
+        px = block[POINT * _LANES + k]
+        py = block[(POINT + 1) * _LANES + k]
+        pz = block[(POINT + 2) * _LANES + k]
+        s0 = block[NORMAL * _LANES + k]
+        s1 = block[(NORMAL + 1) * _LANES + k]
+        s2 = block[(NORMAL + 2) * _LANES + k]
+        n0 = block[(_PIXEL + PLANE) * _LANES + k]
+        n1 = block[(_PIXEL + PLANE + 1) * _LANES + k]
+        n2 = block[(_PIXEL + PLANE + 2) * _LANES + k]
+        z = block[_Z * _LANES + k]
+        r = z * (n0 * block[_XN * _LANES + k] + n1 * block[_YN * _LANES + k] + n2)
+        r -= block[(_PIXEL + DISTANCE) * _LANES + k]
         # m = R^T n, the target's normal in the source frame (away from the camera).
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
-        s0 = np.float64(points[k, NORMAL])
-        s1 = np.float64(points[k, NORMAL + 1])
-        s2 = np.float64(points[k, NORMAL + 2])
-        if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
-            continue
-        weight = (1 - e2) * (1 - e2)
-        out[INLIERS] += 1
-        out[SQUARES_M] += r2
-        out[WEIGHT_G] += weight
-        out[SQUARES_G] += weight * r2 * per_variance
-        root = (1 - e2) * np.sqrt(per_variance)
-        _put(block, waiting, root, r, 0.0, px, py, pz, m0, m1, m2, s0, s1, s2)
-        waiting += 1
-
-        tx = np.float64(pixel[ALBEDO_SLOPE])
-        level = np.float64(points[k, LIGHT])
-        if per_p == 0 or np.isnan(tx) or np.isnan(level):
-            continue
-        ty = np.float64(pixel[ALBEDO_SLOPE + 1])
-        r = np.float64(pixel[ALBEDO]) + tx * xn + ty * yn - level - exposure
-        out[COUNT_P] += 1
+        # How an error along the source's ray, relative to z, moves the point across the plane.
+        along = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * _LANES + k]
+        own = along * along + block[(_PIXEL + VARIANCE) * _LANES + k]
         r2 = r * r
-        e2 = r2 * per_p * per_p * inverse_limit2
-        if e2 >= 1:
-            continue
-        weight = (1 - e2) * (1 - e2)
-        out[WEIGHT_P] += weight
-        out[SQUARES_P] += weight * r2
+        block[_RATIO * _LANES + k] = r2 / own
+        per_variance = one / (scale_g2 * own + slack2)
+        e2 = r2 * per_variance * per_limit2
+        seen = block[_SEEN * _LANES + k] > none
+        fits = seen & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= least)
+        # Nearer than what the target saw there: it looked through this point.
+        in_front = seen & (r < none) & (e2 > np.float32(4))
+        weight = (one - e2) * (one - e2) if fits else none
+        root = (one - e2) * np.sqrt(per_variance) if fits else none
+        block[_FITS * _LANES + k] = one if fits else none
+        block[(_STAT + INLIERS - INLIERS) * _LANES + k] = one if fits else none
+        block[(_STAT + IN_FRONT - INLIERS) * _LANES + k] = one if in_front else none
+        block[(_STAT + WEIGHT_G - INLIERS) * _LANES + k] = weight
+        block[(_STAT + SQUARES_G - INLIERS) * _LANES + k] = r2 * root * root
+        block[(_STAT + SQUARES_M - INLIERS) * _LANES + k] = r2 if fits else none
+        a0, a1, a2 = half * root * (m0 + s0), half * root * (m1 + s1), half * root * (m2 + s2)
+        block[_J * _LANES + k] = a0
+        block[(_J + 1) * _LANES + k] = a1
+        block[(_J + 2) * _LANES + k] = a2
+        block[(_J + 3) * _LANES + k] = py * a2 - pz * a1
+        block[(_J + 4) * _LANES + k] = pz * a0 - px * a2
+        block[(_J + 5) * _LANES + k] = px * a1 - py * a0
+        block[(_J + 6) * _LANES + k] = none
+        block[_R * _LANES + k] = root * r if fits else none
+        a0, a1, a2 = half * root * (m0 - s0), half * root * (m1 - s1), half * root * (m2 - s2)
+        block[_D * _LANES + k] = a0
+        block[(_D + 1) * _LANES + k] = a1
+        block[(_D + 2) * _LANES + k] = a2
+        block[(_D + 3) * _LANES + k] = py * a2 - pz * a1
+        block[(_D + 4) * _LANES + k] = pz * a0 - px * a2
+        block[(_D + 5) * _LANES + k] = px * a1 - py * a0
+
+
+@kernel
+def _albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust: float) -> None:
+    """Compare the albedo of the points of a block that fit with that of where they fell."""
+    r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
+    r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
+    r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
+    per_p, change = np.float32(1 / scale_p), np.float32(exposure)
+    per_limit2 = np.float32(1 / (scale_p * scale_p * robust * robust))
+    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
+    for k in range(_LANES):
+        px = block[POINT * _LANES + k]
+        py = block[(POINT + 1) * _LANES + k]
+        pz = block[(POINT + 2) * _LANES + k]
+        xn, yn = block[_XN * _LANES + k], block[_YN * _LANES + k]
+        tx = block[(_PIXEL + ALBEDO_SLOPE) * _LANES + k]
+        ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * _LANES + k]
+        r = block[(_PIXEL + ALBEDO) * _LANES + k] + tx * xn + ty * yn
+        r -= block[LIGHT * _LANES + k] + change
+        # Where either is unknown, so is r, and no comparison holds.
+        known = (block[_FITS * _LANES + k] > none) & (r * r < np.float32(np.inf))
+        e2 = r * r * per_limit2
+        fits = known & (e2 < one)
+        weight = (one - e2) * (one - e2) if fits else none
+        root = (one - e2) * per_p if fits else none
+        r = r if fits else none
+        tx, ty = tx if fits else none, ty if fits else none
+        s0 = block[LIGHT_SLOPE * _LANES + k] if fits else none
+        s1 = block[(LIGHT_SLOPE + 1) * _LANES + k] if fits else none
+        s2 = block[(LIGHT_SLOPE + 2) * _LANES + k] if fits else none
+        block[(_STAT + COUNT_P - INLIERS) * _LANES + k] = one if known else none
+        block[(_STAT + WEIGHT_P - INLIERS) * _LANES + k] = weight
+        block[(_STAT + SQUARES_P - INLIERS) * _LANES + k] = weight * r * r
         # d(x/z, y/z) by the moved point, then back into the source frame.
-        d0 = tx * per_z
-        d1 = ty * per_z
-        d2 = -(tx * xn + ty * yn) * per_z
+        per_z = one / block[_Z * _LANES + k]
+        d0, d1, d2 = tx * per_z, ty * per_z, -(tx * xn + ty * yn) * per_z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        s0 = np.float64(points[k, LIGHT_SLOPE])
-        s1 = np.float64(points[k, LIGHT_SLOPE + 1])
-        s2 = np.float64(points[k, LIGHT_SLOPE + 2])
-        root = (1 - e2) * per_p
-        _put(block, waiting, root, r, -1.0, px, py, pz, m0, m1, m2, s0, s1, s2)
-        waiting += 1
-    _add_block(sums, block, waiting)
-    for q in range(LANDED):
-        for lane in range(_BLOCK):
-            out[q] += sums[q, lane]
-    return out
+        a0, a1, a2 = half * root * (m0 + s0), half * root * (m1 + s1), half * root * (m2 + s2)
+        block[_J * _LANES + k] = a0
+        block[(_J + 1) * _LANES + k] = a1
+        block[(_J + 2) * _LANES + k] = a2
+        block[(_J + 3) * _LANES + k] = py * a2 - pz * a1
+        block[(_J + 4) * _LANES + k] = pz * a0 - px * a2
+        block[(_J + 5) * _LANES + k] = px * a1 - py * a0
+        block[(_J + 6) * _LANES + k] = -root
+        block[_R * _LANES + k] = root * r
+        a0, a1, a2 = half * root * (m0 - s0), half * root * (m1 - s1), half * root * (m2 - s2)
+        block[_D * _LANES + k] = a0
+        block[(_D + 1) * _LANES + k] = a1
+        block[(_D + 2) * _LANES + k] = a2
+        block[(_D + 3) * _LANES + k] = py * a2 - pz * a1
+        block[(_D + 4) * _LANES + k] = pz * a0 - px * a2
+        block[(_D + 5) * _LANES + k] = px * a1 - py * a0
+
+
+@kernel
+def _add_products(sums: Float64, block: Float32) -> None:
+    """Add the products of the rows of J and r, and of those of D, column by column."""
+    q = 0
+    for p in range(14):
+        a = block[(_J + p) * _LANES : (_J + p + 1) * _LANES]
+        for o in range(p, 8 if p < 8 else 14):
+            b = block[(_J + o) * _LANES : (_J + o + 1) * _LANES]
+            total = sums[q]
+            for k in range(_LANES):
+                total[k] += a[k] * b[k]
+            q += 1
 
 
 @kernel
@@ -222,50 +342,6 @@ def histogram_bin(ratio: float) -> int:
 def bin_edge(place: int) -> float:
     """Squared distance, in unscaled variances, at which a bin of the histogram begins."""
     return 2.0 ** ((place >> 2) - 8) * (1 + (place & 3) / 4) if place > 0 else 0.0
-
-
-@kernel
-def _put(
-    block: Float64,
-    k: int,
-    root: float,
-    r: float,
-    j6: float,
-    px: float,
-    py: float,
-    pz: float,
-    m0: float,
-    m1: float,
-    m2: float,
-    s0: float,
-    s1: float,
-    s2: float,
-) -> None:
-    """Write a residual into column k of a block, weighted; m and s are the sides' directions."""
-    half = 0.5 * root
-    a0, a1, a2 = half * (m0 + s0), half * (m1 + s1), half * (m2 + s2)
-    block[_J, k], block[_J + 1, k], block[_J + 2, k] = a0, a1, a2
-    block[_J + 3, k] = py * a2 - pz * a1
-    block[_J + 4, k] = pz * a0 - px * a2
-    block[_J + 5, k] = px * a1 - py * a0
-    block[_J + 6, k] = root * j6
-    block[_R, k] = root * r
-    a0, a1, a2 = half * (m0 - s0), half * (m1 - s1), half * (m2 - s2)
-    block[_D, k], block[_D + 1, k], block[_D + 2, k] = a0, a1, a2
-    block[_D + 3, k] = py * a2 - pz * a1
-    block[_D + 4, k] = pz * a0 - px * a2
-    block[_D + 5, k] = px * a1 - py * a0
-
-
-@kernel
-def _add_block(sums: Float64, block: Float64, count: int) -> None:
-    """Add the products of a block's rows, lane by lane: several at a time in the processor."""
-    q = 0
-    for p in range(_COLUMN):
-        for o in range(p, _D if p < _D else _COLUMN):
-            for lane in range(count):
-                sums[q, lane] += block[p, lane] * block[o, lane]
-            q += 1
 
 
 @kernel

@@ -67,6 +67,20 @@ def moved(T: Float64, xi: Float64) -> Float64:
 
 
 @kernel
+def composed(A: Float64, B: Float64) -> Float64:
+    """A B, (4, 4), of two rigid motions."""
+    out = np.zeros((4, 4))
+    for i in range(3):
+        out[i, 3] = A[i, 3]
+        for k in range(3):
+            out[i, 3] += A[i, k] * B[k, 3]
+            for j in range(3):
+                out[i, j] += A[i, k] * B[k, j]
+    out[3, 3] = 1
+    return out
+
+
+@kernel
 def twist_between(A: Float64, B: Float64) -> Float64:
     """Logarithm (6,) of A^-1 B, for rotations well below half a turn."""
     R = np.zeros((3, 3))

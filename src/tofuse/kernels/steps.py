@@ -1,4 +1,4 @@
-"""One step of an alignment: from summed normal equations to the next pose."""
+"""An alignment's steps: from summed normal equations to the next pose, until it settles."""
 
 from __future__ import annotations
 
@@ -6,11 +6,132 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.kernels import alignment as sums
-from tofuse.kernels.alignment import bin_edge, normal_equations
+from tofuse.kernels.alignment import accumulate, bin_edge, normal_equations
+from tofuse.kernels.doubt import faked_information
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.motion import moved, twist_between
+from tofuse.kernels.motion import composed, moved, twist_between
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+
+# Points from which it is told how much information can be faked.
+SOME_POINTS = 500
+# What an alignment guesses, and goes on with: log albedo of the targets minus the source's, scale
+# of the sigmas of distances, sigma of the log albedo (0 if it takes no part).
+EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
+
+
+@kernel
+def settle(
+    points: Float32,
+    targets: tuple[Float32, ...],
+    lookups: tuple[Float32, ...],
+    lookup_frames: Float64,
+    T_targets: Float64,
+    T: Float64,
+    T_predicted: Float64,
+    guessed: Float64,
+    most: float,
+    iterations: int,
+    slack: float,
+    photo_slack: float,
+    robust: float,
+    min_cosine: float,
+    judged: bool,
+    tilt: float,
+    slope: float,
+    sharing: float,
+    held: float,
+    prior: Float64,
+    units: Float64,
+    tolerance: float,
+) -> tuple[Float64, Float64, Float64, float, int]:
+    """Go through the iterations of one level.
+
+    Parameters
+    ----------
+    points, targets, lookups, lookup_frames
+        Of the source and of each target, as `accumulate` takes them; lookup_frames is (n, 4).
+    T_targets
+        (n, 4, 4) T_target_world of each target.
+    T, guessed
+        (4, 4) T_world_source and (3,) what is guessed; both are written to.
+    T_predicted, prior, units
+        As `advance` takes them.
+    most
+        What the scale of the sigmas may become.
+    slack, photo_slack
+        Added to the sigmas of distances, m, and of the log albedo.
+    robust, min_cosine
+        As `accumulate` takes them.
+    judged
+        Whether directions that the data does not hold stay at the prediction. If not, all move.
+    tilt, slope
+        As `faked_information` takes them.
+    sharing, held
+        As `chance_information` and `weak_directions` take them.
+    tolerance
+        The last step is smaller, in `units`, unless there are no more iterations.
+
+    Returns
+    -------
+    The last sums; (6, 6) information that may be false; (k, 6) weak directions; the size of the
+    last step in `units`; and how many there were.
+    """
+    total = np.zeros(sums.SIZE)
+    weak = np.zeros((0, 6))
+    doubt = np.zeros((6, 6))
+    size = np.inf
+    done = 0
+    while done < iterations and size >= tolerance:
+        total[:] = 0.0
+        for k in range(len(targets)):
+            total += accumulate(
+                points,
+                targets[k],
+                lookups[k],
+                lookup_frames[k],
+                composed(T_targets[k], T),
+                guessed[EXPOSURE],
+                guessed[SCALE_G],
+                guessed[SCALE_P],
+                slack,
+                robust,
+                min_cosine,
+            )
+        if judged:
+            if done == 0:
+                doubt = total[sums.INLIERS] * faked_information(
+                    points,
+                    max(1, len(points) // SOME_POINTS),
+                    guessed[SCALE_G],
+                    slack,
+                    guessed[SCALE_P] ** 2,
+                    tilt,
+                    slope,
+                )
+                doubt += chance_information(total, sharing)
+            weak = weak_directions(cross_information(total) - doubt, units, held)
+        T[:], step = advance(total, T, T_predicted, weak, prior, units)
+        done += 1
+        size = 0.0
+        for p in range(6):
+            size = max(size, abs(step[p] / units[p]))
+        if guessed[SCALE_P] > 0:
+            guessed[EXPOSURE] += step[6]
+        _rescale(total, guessed, most, photo_slack)
+    return total, doubt, weak, size, done
+
+
+@kernel
+def _rescale(total: Float64, guessed: Float64, most: float, photo_slack: float) -> None:
+    """Take the sigmas from the residuals: the views show only their own noise, not their bias."""
+    seen = scale_of_distances(total[sums.HISTOGRAM :])
+    if not np.isnan(seen):
+        guessed[SCALE_G] = min(max(seen, 0.7), most)
+    if guessed[SCALE_P] > 0 and total[sums.WEIGHT_P] > 0:
+        variance = total[sums.SQUARES_P] / total[sums.WEIGHT_P] / 0.72
+        guessed[SCALE_P] = min(max(np.sqrt(variance + photo_slack**2), 0.005), 0.5)
 
 
 @kernel
@@ -34,6 +155,25 @@ def information(total: Float64) -> Float64:
 def cross_information(total: Float64) -> Float64:
     """(6, 6) symmetrised product of the Jacobians of target and source, over the pose."""
     return _without_exposure(normal_equations(total)[2])
+
+
+@kernel
+def chance_information(total: Float64, sharing: float) -> Float64:
+    """(6, 6) what noise leaves in the cross-information by chance: two standard deviations.
+
+    Were both Jacobians noise alone, independent and as large as half their difference tells, the
+    sum of their products over n points would be n / sqrt(n) of that of their squares, where n counts
+    those that do not share their noise: `sharing` points have one and the same.
+    """
+    points = max(total[sums.INLIERS], 1.0)
+    chance = 4 * np.sqrt(max(sharing, 1.0) / points)
+    out = np.empty((6, 6))
+    q = sums.D
+    for p in range(6):
+        for o in range(p, 6):
+            out[p, o] = out[o, p] = chance * total[q]
+            q += 1
+    return out
 
 
 @kernel

@@ -7,6 +7,8 @@ images, so windows can be as wide as the noise asks for and the surface allows.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,7 @@ from tofuse.kernels.jit import kernel
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-SUMS = 11  # weight, x, y, w, xx, xy, yy, xw, yw, ww, count
+_SUMS = 11  # weight, x, y, w, xx, xy, yy, xw, yw, ww, count
 
 
 @kernel
@@ -79,58 +81,10 @@ def halve(
 
 
 @kernel
-def weighted_sums(
-    w: Float32, rays: Float32, weight: Float32, sums: Float64, start: int, stop: int
-) -> None:
-    """Running sums along rows start..stop of the weighted moments of inverse depth.
-
-    sums is (H + 1, W + 1, SUMS); row i + 1 gets the sums of row i alone. `add_rows` then makes an
-    integral image of it.
-    """
-    columns = w.shape[1]
-    t = np.empty(SUMS)
-    for i in range(start, stop):
-        t[:] = 0.0
-        for j in range(columns):
-            g = np.float64(weight[i, j])
-            if g > 0:
-                x = np.float64(rays[i, j, 0])
-                y = np.float64(rays[i, j, 1])
-                v = np.float64(w[i, j])
-                gx = g * x
-                gy = g * y
-                gv = g * v
-                t[0] += g
-                t[1] += gx
-                t[2] += gy
-                t[3] += gv
-                t[4] += gx * x
-                t[5] += gx * y
-                t[6] += gy * y
-                t[7] += gv * x
-                t[8] += gv * y
-                t[9] += gv * v
-                t[10] += 1.0
-            for k in range(SUMS):
-                sums[i + 1, j + 1, k] = t[k]
-
-
-@kernel
-def add_rows(sums: Float64) -> None:
-    """Turn sums along rows into an integral image, in place."""
-    rows, columns, depth = sums.shape
-    for i in range(1, rows):
-        for j in range(columns):
-            for k in range(depth):
-                sums[i, j, k] += sums[i - 1, j, k]
-
-
-@kernel
 def fit_planes(
     w: Float32,
     rays: Float32,
     weight: Float32,
-    sums: Float64,
     radii: NDArray[np.int64],
     limit: float,
     fill: float,
@@ -158,8 +112,23 @@ def fit_planes(
     the noise, that is, with weights 1 / variance.
     """
     rows, columns = w.shape
-    s = np.empty(SUMS)
+    # Rows of an integral image that begins where the first window does: as many as a window needs.
+    most = radii[-1]
+    kept = 2 * most + 2
+    sums = np.empty((kept, columns + 1, _SUMS))
+    summed = max(start - most, 0)
+    sums[summed % kept] = 0.0
+    s = np.empty(_SUMS)
     for i in range(start, stop):
+        while summed < min(i + most + 1, rows):
+            _add_row(
+                w[summed],
+                rays[summed],
+                weight[summed],
+                sums[summed % kept],
+                sums[(summed + 1) % kept],
+            )
+            summed += 1
         for j in range(columns):
             planes[i, j, 0] = 0
             planes[i, j, 1] = 0
@@ -175,17 +144,12 @@ def fit_planes(
             # jumps over a gap that a smaller one has seen.
             for q in range(len(radii)):
                 r = radii[q]
-                top = max(i - r, 0)
-                bottom = min(i + r + 1, rows)
+                above = sums[max(i - r, 0) % kept]
+                below = sums[min(i + r + 1, rows) % kept]
                 left = max(j - r, 0)
                 right = min(j + r + 1, columns)
-                for k in range(SUMS):
-                    s[k] = (
-                        sums[bottom, right, k]
-                        - sums[top, right, k]
-                        - sums[bottom, left, k]
-                        + sums[top, left, k]
-                    )
+                for k in range(_SUMS):
+                    s[k] = below[right, k] - above[right, k] - below[left, k] + above[left, k]
                 n = s[10]
                 side = 2 * r + 1
                 if n < fill * side * side or n < 6:
@@ -229,13 +193,45 @@ def fit_planes(
 
 
 @kernel
-def albedo_image(
-    planes: Float32, rays: Float32, light: Float32, power: float, own_lamp: bool, out: Float32
-) -> None:
-    """Logarithm of the albedo, up to a constant: light * range^power / cos(incidence).
+def _add_row(w: Float32, rays: Float32, weight: Float32, above: Float64, below: Float64) -> None:
+    """Write a row of the integral image of the weighted moments, from the row above it.
 
-    `power` is 2 where the light falls off with the square of the range, 0 where that has been
-    compensated. Without a lamp of its own a camera sees surfaces as bright from any side, and the
+    Both are (W + 1, _SUMS): sums over all pixels to the left. Pixels without weight count nothing,
+    whatever they hold.
+    """
+    t = np.zeros(_SUMS)
+    below[0] = above[0]
+    for j in range(len(w)):
+        g = np.float64(weight[j])
+        if g > 0:
+            x = np.float64(rays[j, 0])
+            y = np.float64(rays[j, 1])
+            v = np.float64(w[j])
+            gx = g * x
+            gy = g * y
+            gv = g * v
+            t[0] += g
+            t[1] += gx
+            t[2] += gy
+            t[3] += gv
+            t[4] += gx * x
+            t[5] += gx * y
+            t[6] += gy * y
+            t[7] += gv * x
+            t[8] += gv * y
+            t[9] += gv * v
+            t[10] += 1.0
+        for k in range(_SUMS):
+            below[j + 1, k] = above[j + 1, k] + t[k]
+
+
+@kernel
+def albedo_image(
+    planes: Float32, rays: Float32, light: Float32, falls: bool, own_lamp: bool, out: Float32
+) -> None:
+    """Logarithm of the albedo, up to a constant: light * range^2 / cos(incidence).
+
+    Light `falls` with the square of the range unless that has been compensated. Without a lamp of its own a camera sees surfaces as bright from any side, and the
     cosine is left out. NaN where there is no plane, no light, or the surface is seen too slantwise.
     """
     rows, columns = light.shape
@@ -256,7 +252,8 @@ def albedo_image(
             if cosine < 0.15:
                 continue
             shade = cosine if own_lamp else 1.0
-            out[i, j] = np.log(light[i, j] / shade) + 0.5 * power * np.log(length2 / (v * v))
+            apart = length2 / (v * v)  # the squared range
+            out[i, j] = np.log(light[i, j] / shade * (apart if falls else 1.0))
 
 
 @kernel
@@ -331,28 +328,35 @@ def _box_means(image: Float32, rays: Float32, radius: int, above: int, out: Floa
     """
     rows, columns = image.shape
     full = (2 * radius + 1) * (2 * radius + 1)
+    known = np.empty(columns)
+    # Sums over the box's rows, with a margin of zeros, and over its columns as well.
+    down = np.zeros((4, columns + 2 * radius))
+    box = np.empty((4, columns))
     for k in range(out.shape[0]):
         i = above + k
+        down[:, radius : radius + columns] = 0.0
+        for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
+            line = image[a]
+            for j in range(columns):
+                known[j] = 0.0 if np.isnan(line[j]) else 1.0
+            _add_known(down[0, radius:], line, known)
+            _add_known(down[1, radius:], known, known)
+            _add_known(down[2, radius:], rays[a, :, 0], known)
+            _add_known(down[3, radius:], rays[a, :, 1], known)
+        box[:] = 0.0
+        for c in range(4):
+            for b in range(2 * radius + 1):
+                total, part = box[c], down[c, b : b + columns]
+                for j in range(columns):
+                    total[j] += part[j]
         for j in range(columns):
-            total = 0.0
-            count = 0
-            for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
-                for b in range(max(j - radius, 0), min(j + radius + 1, columns)):
-                    value = image[a, b]
-                    if not np.isnan(value):
-                        total += value
-                        count += 1
-            out[k, j, 0] = total / count if count else np.nan
-            if count == full:
-                out[k, j, 1] = rays[i, j, 0]
-                out[k, j, 2] = rays[i, j, 1]
-                continue
-            x = 0.0
-            y = 0.0
-            for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
-                for b in range(max(j - radius, 0), min(j + radius + 1, columns)):
-                    if not np.isnan(image[a, b]):
-                        x += rays[a, b, 0]
-                        y += rays[a, b, 1]
-            out[k, j, 1] = x / max(count, 1)
-            out[k, j, 2] = y / max(count, 1)
+            count = box[1, j]
+            out[k, j, 0] = box[0, j] / count
+            out[k, j, 1] = rays[i, j, 0] if count == full else box[2, j] / count
+            out[k, j, 2] = rays[i, j, 1] if count == full else box[3, j] / count
+
+
+@kernel
+def _add_known(total: Float64, values: NDArray[np.floating[Any]], known: Float64) -> None:
+    for j in range(len(known)):
+        total[j] += values[j] if known[j] > 0 else 0.0

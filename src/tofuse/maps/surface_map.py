@@ -14,13 +14,10 @@ from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels.alignment import make_target
 from tofuse.kernels.middle import median
 from tofuse.kernels.surface import (
-    SUMS,
-    add_rows,
     albedo_image,
     fit_planes,
     halve,
     smooth_and_slope,
-    weighted_sums,
 )
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -248,7 +245,7 @@ class SurfaceMap:
     def depth(self) -> float:
         """Median z in m; 1 where nothing is valid."""
         valid = self.z[self.z > 0]
-        return float(np.median(valid)) if len(valid) else 1.0
+        return median(valid) if len(valid) else 1.0
 
     @cached_property
     def target(self) -> Float32:
@@ -280,20 +277,17 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         jump = max(options.edge_jump, options.edge_sigmas * _typical_noise(w, weight))
         weight[_near_edges(w, jump, options.edge_margin)] = 0
     rows, columns = z.shape
-    sums = np.zeros((rows + 1, columns + 1, SUMS))
-    run_chunks(lambda a, b: weighted_sums(w, rays, weight, sums, a, b), rows, _CHUNKS)
-    add_rows(sums)
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
     scale = max(
-        _noise_scale(w, rays, weight, sums, options.radii[0]),
+        _noise_scale(w, rays, weight, options.radii[0]),
         _scale_at(_LEAST_NOISE, z, sigma) if own is None else 1.0,
     )
     radii = np.array(options.radii, np.int64)
     limit = options.misfit * max(scale, _scale_at(options.flatness, z, sigma))
     run_chunks(
         lambda a, b: fit_planes(
-            w, rays, weight, sums, radii, limit, options.fill, options.offset, planes, quality, a, b
+            w, rays, weight, radii, limit, options.fill, options.offset, planes, quality, a, b
         ),
         rows,
         _CHUNKS,
@@ -302,8 +296,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     has_photo = light is not None
     if light is not None:
         albedo = np.empty((rows, columns), np.float32)
-        power = 2.0 if lit and frame.amplitude_kind == "raw" else 0.0
-        albedo_image(planes, rays, light, power, lit, albedo)
+        falls = lit and frame.amplitude_kind == "raw"
+        albedo_image(planes, rays, light, falls, lit, albedo)
         run_chunks(
             lambda a, b: smooth_and_slope(
                 albedo, planes, rays, options.photo_radius, 0.05, photo, a, b
@@ -312,7 +306,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
             _CHUNKS,
         )
     variance = quality[..., 1] * np.float32(scale)
-    shared = _shared_sigma(frame, rays)
+    shared = _shared_sigma(frame, projection.lengths2)
     own_variance = variance
     if shared is not None:
         once = (shared * planes[..., 3] ** 2) ** 2
@@ -386,17 +380,17 @@ def _own_variance(frame: RangeFrame) -> Float32 | None:
     return np.asarray(sigma * sigma, np.float32)
 
 
-def _shared_sigma(frame: RangeFrame, rays: Float32) -> Float32 | None:
-    """Sigma of z (H, W) in m that pixels share, at the resolution of rays (H, W, 2)."""
+def _shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
+    """Sigma of z (H, W) in m that pixels share, where rays have these squared lengths (H, W)."""
     image = frame.shared_sigma_image
     if image is None:
         return None
-    rows, columns = rays.shape[:2]
+    rows, columns = lengths2.shape
     step = image.shape[1] // columns
     # It varies slowly: a pixel of each block will do.
     picked = image[step // 2 :: step, step // 2 :: step][:rows, :columns]
     known = np.isfinite(picked) & (picked > 0)
-    return np.where(known, picked, 0) / np.sqrt(np.float32(1) + (rays * rays).sum(-1))
+    return np.where(known, picked, np.float32(0)) / np.sqrt(lengths2)
 
 
 def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
@@ -469,7 +463,7 @@ def _scale_at(share: float, z: Float32, sigma: Float32) -> float:
     return median(share * z[known] / sigma[known]) ** 2
 
 
-def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radius: int) -> float:
+def _noise_scale(w: Float32, rays: Float32, weight: Float32, radius: int) -> float:
     """Median misfit of the smallest windows on a sparse set of rows: the variance's true scale."""
     rows, columns = w.shape
     planes = np.empty((rows, columns, 4), np.float32)
@@ -477,7 +471,7 @@ def _noise_scale(w: Float32, rays: Float32, weight: Float32, sums: Float64, radi
     values = []
     radii = np.array([radius], np.int64)
     for i in range(radius, rows - radius, max(1, rows // 16)):
-        fit_planes(w, rays, weight, sums, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
+        fit_planes(w, rays, weight, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
         values.append(quality[i, :, 0])
     found = np.concatenate(values) if values else np.zeros(0)
     found = found[np.isfinite(found)]

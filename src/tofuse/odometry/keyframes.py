@@ -73,7 +73,7 @@ class Acceptance:
     inlier_share: float = 0.75
     overlap: float = 0.2
     in_front: float = 0.1
-    inliers: int = 150
+    inliers: int = 40
     rms_m: float = 0.03
     fit: float = 0.5
     albedo: float = 0.1
@@ -281,9 +281,9 @@ class _KeyframeTracker(Tracker):
         if len(frame) < options.minimum_points:
             reason = f"{len(frame)} valid points, {options.minimum_points} are needed"
             return self._lose(reason)
-        depths = frame.depth[frame.valid]
-        if depths.min() == depths.max():
-            return self._lose(f"every depth is {depths[0]:.3g} m")
+        first = frame.depth.flat[np.argmax(frame.valid)]
+        if not np.any((frame.depth != first) & frame.valid):
+            return self._lose(f"every depth is {first:.3g} m")
         view = surface_map(frame, options.surface)
         if np.count_nonzero(view.planes[..., 3]) < options.minimum_points:
             return self._lose("nearly no surface in what is left of the image")

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
-from tofuse.geometry.cameras import Camera, points_from_z, range_from_z, z_from_range
+from tofuse.geometry.cameras import (
+    Camera,
+    points_from_z,
+    range_from_z,
+    unknown_rays,
+    z_from_range,
+)
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -158,7 +164,8 @@ class RangeFrame:
     @cached_property
     def valid(self) -> Bool:
         """(H, W) mask of pixels with a measurement and a known ray."""
-        return (self.depth > 0) & np.isfinite(self.camera.rays()).all(-1)
+        unknown = unknown_rays(self.camera)
+        return self.depth > 0 if unknown is None else (self.depth > 0) & ~unknown
 
     @cached_property
     def z(self) -> Float32:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels import steps
-from tofuse.kernels.doubt import faked_information
 from tofuse.kernels.middle import median
-from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 
 Float32 = NDArray[np.float32]
@@ -26,9 +24,6 @@ Float64 = NDArray[np.float64]
 
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
-# Points from which means over the view are told: how much information can be faked, exposure.
-_SOME_POINTS = 500
-_CHUNK_POINTS = 6000
 
 
 @dataclass(frozen=True)
@@ -75,6 +70,9 @@ class ProjectiveOptions:
     common_tilt, common_slope
         Errors fixed to the camera, which bend both views alike and so fake information: standard
         deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
+    sharing
+        Pixels that share the noise of a slope, as their windows overlap. Where few are left, noise
+        in the cross-information cancels only so far.
     most_sigma_m
         What the sigma of a typical distance may become where the views disagree, m. Noise that
         neighbouring pixels share is not seen by the fits of planes, but by this.
@@ -87,8 +85,7 @@ class ProjectiveOptions:
     levels: tuple[Level, ...] = (
         Level(4, 6, 0.03, 0.1),
         Level(4, 2, 0.005, 0.02),
-        Level(2, 1, 0.0, 0.0),
-        Level(1, 1, 0.0, 0.0),
+        Level(2, 2, 0.0, 0.0),
     )
     robust: float = 3.5
     max_angle: float = 0.7
@@ -98,6 +95,7 @@ class ProjectiveOptions:
     held: float = 1.0
     common_tilt: float = 0.03
     common_slope: float = 0.1
+    sharing: float = 120.0
     most_sigma_m: float = 0.02
     tolerance: float = 0.01
     settled: float = 0.1
@@ -108,7 +106,7 @@ class ProjectiveOptions:
         for name in ("robust", "prior_m", "prior_rad", "held", "most_sigma_m"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("max_angle", "common_tilt", "common_slope", "tolerance", "settled"):
+        for name in ("max_angle", "common_tilt", "common_slope", "sharing", "tolerance", "settled"):
             if not 0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -196,18 +194,6 @@ class Aligned:
         return self.landed / self.points if self.points else 0.0
 
 
-@dataclass
-class _State:
-    """What changes from one iteration to the next."""
-
-    T: Float64
-    exposure: float = 0.0
-    scale_g: float = 1.0
-    scale_p: float = 0.1
-    most: float = 10.0  # what scale_g may become
-    total: Float64 = field(default_factory=lambda: np.zeros(kernels.SIZE))
-
-
 def align(
     source: SurfaceMap,
     targets: Sequence[Target],
@@ -230,50 +216,61 @@ def align(
     """
     T_world_predicted = np.ascontiguousarray(T_world_predicted)
     T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
-    state = _State(T0.copy())
     photometric = (
         options.photometric and source.has_photo and all(t.view.has_photo for t in targets)
     )
-    iterations = 0
-    converged = False
-    weak = np.zeros((0, 6))
     prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3)
     points = points_of(source, options.levels[0].stride)
+    guessed = np.array([0.0, 1.0, 0.1 if photometric else 0.0])
     if photometric:
-        state.exposure = _seen_exposure(points, targets, T0) if exposure is None else exposure
+        guessed[steps.EXPOSURE] = (
+            _seen_exposure(points, targets, T0) if exposure is None else exposure
+        )
+    most = 10.0  # times the sigmas that the views claim
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
-        state.most = max(3.0, options.most_sigma_m / median(sigma))
+        most = max(3.0, options.most_sigma_m / median(sigma))
+    views = tuple(t.view.target for t in targets)
+    lookups = tuple(t.view.projection.lookup for t in targets)
+    lookup_frames = np.stack([t.view.projection.frame for t in targets])
+    T_targets = np.stack([t.T_target_world for t in targets])
+    T = T0.copy()
+    iterations = 0
     for number, level in enumerate(options.levels):
         if number and level.stride != options.levels[number - 1].stride:
             points = points_of(source, level.stride)
-        doubt = None
-        for _ in range(level.iterations):
-            state.total = _sum(points, targets, state, level, options, photometric)
-            iterations += 1
-            if number > 0:  # at the coarsest level the views are not yet where they belong
-                if doubt is None:
-                    doubt = _doubt(points, state, level, options, photometric)
-                cross = steps.cross_information(state.total) - doubt
-                weak = steps.weak_directions(cross, UNITS, options.held)
-            state.T, step = steps.advance(
-                state.total, state.T, T_world_predicted, weak, prior, UNITS
-            )
-            if photometric:
-                state.exposure += step[6]
-            _rescale(state, level, photometric)
-            size = np.abs(step[:6] / UNITS).max()
-            converged = bool(size < options.settled)
-            if size < options.tolerance:
-                break
-    total = state.total
+        total, doubt, weak, size, done = steps.settle(
+            points,
+            views,
+            lookups,
+            lookup_frames,
+            T_targets,
+            T,
+            T_world_predicted,
+            guessed,
+            most,
+            level.iterations,
+            level.slack_m,
+            level.photo_slack,
+            options.robust,
+            math.cos(options.max_angle),
+            number > 0,  # at the coarsest level the views are not yet where they belong
+            options.common_tilt,
+            options.common_slope,
+            options.sharing / level.stride**2,
+            options.held,
+            prior,
+            UNITS,
+            options.tolerance,
+        )
+        iterations += done
     inliers = total[kernels.INLIERS]
     return Aligned(
-        T_world_source=state.T,
-        converged=converged,
+        T_world_source=T,
+        converged=size < options.settled,
         iterations=iterations,
         information=steps.information(total),
-        cross=steps.cross_information(total) - (np.zeros((6, 6)) if doubt is None else doubt),
+        cross=steps.cross_information(total) - doubt,
         unobservable=weak,
         points=len(points) * len(targets),
         landed=int(total[kernels.LANDED]),
@@ -281,9 +278,9 @@ def align(
         inliers=int(inliers),
         in_front=int(total[kernels.IN_FRONT]),
         rms_m=float(np.sqrt(total[kernels.SQUARES_M] / inliers)) if inliers else np.inf,
-        scale=state.scale_g,
-        photo_scale=state.scale_p,
-        exposure=state.exposure,
+        scale=float(guessed[steps.SCALE_G]),
+        photo_scale=float(guessed[steps.SCALE_P]),
+        exposure=float(guessed[steps.EXPOSURE]),
         photometric=photometric and bool(total[kernels.COUNT_P] > 0),
         score=float(
             (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
@@ -292,44 +289,9 @@ def align(
     )
 
 
-def _sum(
-    points: Float32,
-    targets: Sequence[Target],
-    state: _State,
-    level: Level,
-    options: ProjectiveOptions,
-    photometric: bool,
-) -> Float64:
-    total = np.zeros(kernels.SIZE)
-    for target in targets:
-        view = target.view
-        T = np.ascontiguousarray(target.T_target_world @ state.T)
-
-        def work(a: int, b: int, view: SurfaceMap = view, T: Float64 = T) -> Float64:
-            return kernels.accumulate(
-                points,
-                view.target,
-                view.projection.lookup,
-                view.projection.frame,
-                T,
-                state.exposure,
-                state.scale_g,
-                state.scale_p if photometric else 0.0,
-                level.slack_m,
-                options.robust,
-                math.cos(options.max_angle),
-                a,
-                b,
-            )
-
-        for part in run_chunks(work, len(points), max(1, len(points) // _CHUNK_POINTS)):
-            total += part
-    return total
-
-
 def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:
     """Median difference in log albedo, from some of the points, before they are aligned."""
-    every = max(1, len(points) // _SOME_POINTS)
+    every = max(1, len(points) // steps.SOME_POINTS)
     seen = []
     for target in targets:
         view = target.view
@@ -340,30 +302,3 @@ def _seen_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> fl
         )
     both = np.concatenate(seen) if seen else np.zeros(0)
     return median(both) if len(both) else 0.0
-
-
-def _doubt(
-    points: Float32, state: _State, level: Level, options: ProjectiveOptions, photometric: bool
-) -> Float64:
-    """(6, 6) information that errors fixed to the camera can fake; from some of the points."""
-    faked = faked_information(
-        points,
-        max(1, len(points) // _SOME_POINTS),
-        state.scale_g,
-        level.slack_m,
-        state.scale_p**2 if photometric else 0.0,
-        options.common_tilt,
-        options.common_slope,
-    )
-    return faked * state.total[kernels.INLIERS]
-
-
-def _rescale(state: _State, level: Level, photometric: bool) -> None:
-    """Take the sigmas from the residuals: the views show only their own noise, not their bias."""
-    t = state.total
-    seen = steps.scale_of_distances(t[kernels.HISTOGRAM :])
-    if not math.isnan(seen):
-        state.scale_g = min(max(seen, 0.7), state.most)
-    if photometric and t[kernels.WEIGHT_P] > 0:
-        seen = math.sqrt(t[kernels.SQUARES_P] / t[kernels.WEIGHT_P] / 0.72)
-        state.scale_p = min(max(math.hypot(seen, level.photo_slack), 0.005), 0.5)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.kernels.surface import SUMS, add_rows, fit_planes, weighted_sums
+from tofuse.kernels.surface import fit_planes
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 
@@ -29,15 +29,12 @@ def with_rough_planes(view: SurfaceMap) -> SurfaceMap:
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
     weight = np.divide(1, (_ROUGH * w) ** 2, out=np.zeros_like(z), where=z > 0)
     rows, columns = z.shape
-    sums = np.zeros((rows + 1, columns + 1, SUMS))
-    run_chunks(lambda a, b: weighted_sums(w, view.rays, weight, sums, a, b), rows, _CHUNKS)
-    add_rows(sums)
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
     radii = np.array([max(2, round(_WINDOW * columns))], np.int64)
     run_chunks(
         lambda a, b: fit_planes(
-            w, view.rays, weight, sums, radii, 1.0, 0.7, 0.2, planes, quality, a, b
+            w, view.rays, weight, radii, 1.0, 0.7, 0.2, planes, quality, a, b
         ),
         rows,
         _CHUNKS,
