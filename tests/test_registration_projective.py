@@ -215,7 +215,6 @@ def test_points_lie_on_the_fitted_surface(room):
         {"held": 0.0},
         {"common_tilt": -1.0},
         {"common_slope": float("inf")},
-        {"sharing": -1.0},
         {"most_sigma_m": 0.0},
         {"tolerance": -1.0},
         {"settled": float("nan")},

@@ -144,7 +144,7 @@ def _made_patches(means, weights, change=0.0):
     J = np.concatenate([rng.normal(size=(n, 6)), np.zeros((n, 1))], 1)
     H = (J * weights[:, None]).T @ J
     return Patches(
-        H, np.zeros((7, 7)), H, places, weights, means, J * weights[:, None], change, 2.0, 2, 1
+        H, np.zeros((7, 7)), H, places, weights, means, J * weights[:, None], change, 2.0, 2
     )
 
 

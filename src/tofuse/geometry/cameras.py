@@ -62,9 +62,10 @@ def _derived(camera: Camera) -> tuple[Float32, NDArray[np.bool_] | None]:
     found = _computed.get(camera)
     if found is None:
         rays = camera.rays()
-        unknown = ~np.isfinite(rays).all(-1)
+        unknown: NDArray[np.bool_] = np.isnan(rays.sum(-1))
         lengths = _frozen(np.sqrt(1 + (rays * rays).sum(-1)))
-        found = _computed[camera] = lengths, unknown if unknown.any() else None
+        found = (lengths, unknown if unknown.any() else None)
+        _computed[camera] = found
     return found
 
 

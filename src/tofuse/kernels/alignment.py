@@ -61,9 +61,10 @@ BINS = 96
 SIZE = HISTOGRAM + BINS
 
 # Points that are compared wait in blocks, the numbers of each in a column, so that the processor
-# works on several at a time. Rows of a block: the point, where it came to be (x/z, y/z and z in the
-# target), the target's pixel, whether it is an inlier; then the residual's derivatives J (7), r, and
-# D (6), each weighted by the root of its w; and what is summed of each column.
+# works on several at a time. Rows of a block: the point, where it came to be (x/z, y/z and z in
+# the target), the target's pixel, whether there is a plane and whether it is an inlier; then the
+# residual's derivatives J (7), r, and D (6), each weighted by the root of its w; what is summed of
+# each column; and its squared distance in unscaled variances.
 _LANES = 128
 _NEAREST = 0.02  # m; what comes nearer to the target's camera is not compared
 _XN, _YN, _Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3

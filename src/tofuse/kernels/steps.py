@@ -40,7 +40,6 @@ def settle(
     judged: bool,
     tilt: float,
     slope: float,
-    sharing: float,
     held: float,
     prior: Float64,
     units: Float64,
@@ -68,14 +67,14 @@ def settle(
         Whether directions that the data does not hold stay at the prediction. If not, all move.
     tilt, slope
         As `faked_information` takes them.
-    sharing, held
-        As `chance_information` and `weak_directions` take them.
+    held
+        As `weak_directions` takes it.
     tolerance
         The last step is smaller, in `units`, unless there are no more iterations.
 
     Returns
     -------
-    The last sums; (6, 6) information that may be false; (k, 6) weak directions; the size of the
+    The last sums; (6, 6) information that can be faked; (k, 6) weak directions; the size of the
     last step in `units`; and how many there were.
     """
     total = np.zeros(sums.SIZE)
@@ -110,7 +109,6 @@ def settle(
                     tilt,
                     slope,
                 )
-                doubt += chance_information(total, sharing)
             weak = weak_directions(cross_information(total) - doubt, units, held)
         T[:], step = advance(total, T, T_predicted, weak, prior, units)
         done += 1
@@ -155,25 +153,6 @@ def information(total: Float64) -> Float64:
 def cross_information(total: Float64) -> Float64:
     """(6, 6) symmetrised product of the Jacobians of target and source, over the pose."""
     return _without_exposure(normal_equations(total)[2])
-
-
-@kernel
-def chance_information(total: Float64, sharing: float) -> Float64:
-    """(6, 6) what noise leaves in the cross-information by chance: two standard deviations.
-
-    Were both Jacobians noise alone, independent and as large as half their difference tells, the
-    sum of their products over n points would be n / sqrt(n) of that of their squares, where n counts
-    those that do not share their noise: `sharing` points have one and the same.
-    """
-    points = max(total[sums.INLIERS], 1.0)
-    chance = 4 * np.sqrt(max(sharing, 1.0) / points)
-    out = np.empty((6, 6))
-    q = sums.D
-    for p in range(6):
-        for o in range(p, 6):
-            out[p, o] = out[o, p] = chance * total[q]
-            q += 1
-    return out
 
 
 @kernel

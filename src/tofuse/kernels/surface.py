@@ -231,8 +231,9 @@ def albedo_image(
 ) -> None:
     """Logarithm of the albedo, up to a constant: light * range^2 / cos(incidence).
 
-    Light `falls` with the square of the range unless that has been compensated. Without a lamp of its own a camera sees surfaces as bright from any side, and the
-    cosine is left out. NaN where there is no plane, no light, or the surface is seen too slantwise.
+    Light `falls` with the square of the range unless that has been compensated. Without a lamp of
+    its own a camera sees surfaces as bright from any side, and the cosine is left out. NaN where
+    there is no plane, no light, or the surface is seen too slantwise.
     """
     rows, columns = light.shape
     for i in range(rows):

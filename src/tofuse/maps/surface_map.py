@@ -390,7 +390,7 @@ def _shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
     # It varies slowly: a pixel of each block will do.
     picked = image[step // 2 :: step, step // 2 :: step][:rows, :columns]
     known = np.isfinite(picked) & (picked > 0)
-    return np.where(known, picked, np.float32(0)) / np.sqrt(lengths2)
+    return np.asarray(np.where(known, picked, 0) / np.sqrt(lengths2), np.float32)
 
 
 def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:

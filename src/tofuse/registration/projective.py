@@ -70,9 +70,6 @@ class ProjectiveOptions:
     common_tilt, common_slope
         Errors fixed to the camera, which bend both views alike and so fake information: standard
         deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
-    sharing
-        Pixels that share the noise of a slope, as their windows overlap. Where few are left, noise
-        in the cross-information cancels only so far.
     most_sigma_m
         What the sigma of a typical distance may become where the views disagree, m. Noise that
         neighbouring pixels share is not seen by the fits of planes, but by this.
@@ -95,7 +92,6 @@ class ProjectiveOptions:
     held: float = 1.0
     common_tilt: float = 0.03
     common_slope: float = 0.1
-    sharing: float = 120.0
     most_sigma_m: float = 0.02
     tolerance: float = 0.01
     settled: float = 0.1
@@ -106,7 +102,7 @@ class ProjectiveOptions:
         for name in ("robust", "prior_m", "prior_rad", "held", "most_sigma_m"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("max_angle", "common_tilt", "common_slope", "sharing", "tolerance", "settled"):
+        for name in ("max_angle", "common_tilt", "common_slope", "tolerance", "settled"):
             if not 0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -257,7 +253,6 @@ def align(
             number > 0,  # at the coarsest level the views are not yet where they belong
             options.common_tilt,
             options.common_slope,
-            options.sharing / level.stride**2,
             options.held,
             prior,
             UNITS,

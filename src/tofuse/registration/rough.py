@@ -33,9 +33,7 @@ def with_rough_planes(view: SurfaceMap) -> SurfaceMap:
     quality = np.empty((rows, columns, 2), np.float32)
     radii = np.array([max(2, round(_WINDOW * columns))], np.int64)
     run_chunks(
-        lambda a, b: fit_planes(
-            w, view.rays, weight, radii, 1.0, 0.7, 0.2, planes, quality, a, b
-        ),
+        lambda a, b: fit_planes(w, view.rays, weight, radii, 1.0, 0.7, 0.2, planes, quality, a, b),
         rows,
         _CHUNKS,
     )

@@ -41,7 +41,7 @@ _LEAST_TILES = 6
 # In units of 1 cm and 1 degree: keeps what a still camera gives invertible.
 _LEAST_SIGMA = 1e-3
 # Pixels that are looked at, about: what more would say is noise that neighbours share.
-_PIXELS = 1584
+_PIXELS = 6336
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ class Patches:
         How much the view has changed: the angle in rad, and the way as a share of the depth.
     depth
         Median depth, m.
-    stride, aligned_stride
-        Every how manieth pixel, along either axis, is summed up here, and took part in the end.
+    stride
+        Every how manieth pixel, along either axis, took part.
     """
 
     geometry: Float64
@@ -123,7 +123,6 @@ class Patches:
     change: float
     depth: float
     stride: int
-    aligned_stride: int
 
 
 def patches(
@@ -194,17 +193,15 @@ def patches(
         float(np.mean(changes)) if changes else 0.0,
         depth,
         stride,
-        alignment.levels[-1].stride,
     )
 
 
 def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
     """(6, 6) covariance in m and rad of the right perturbation, from what the patches say."""
     bread = _bounded_inverse(found.cross, options.loosest)
-    # Of the pixels that the alignment took, one in so many was looked at.
-    aligned, looked_at = found.aligned_stride**2, found.stride**2
-    B = max(aligned, options.noise_pixels) / looked_at * found.geometry
-    B += max(aligned, options.photo_noise_pixels) / looked_at * found.photo
+    per_pixel = found.stride**2
+    B = max(1.0, options.noise_pixels / per_pixel) * found.geometry
+    B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
     if len(found.weights) >= _LEAST_TILES:
         apart = np.linalg.norm(found.places[:, None] - found.places[None], axis=-1)
         alike = np.exp(-apart / options.reach)
