@@ -3,45 +3,115 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
+from collections import deque
+from collections.abc import Callable
 from time import perf_counter
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, Literal, Self, TextIO
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Column
 
 from tofuse.results.types import FrameRecord
 
+# The last steps, whose pace tells how long the others will take.
+_WINDOW = 30
+_GOOD_SHARE = 0.8  # of the points that fit
+_WIDE = 92  # columns, with which there is room for a bar
+
+
+class Pace:
+    """How fast a stage goes, by its last steps: the first ones compile and load."""
+
+    def __init__(self, total: int | None = None, clock: Callable[[], float] = perf_counter) -> None:
+        self.done, self.total = 0, total or None
+        self._clock = clock
+        self._start = clock()
+        self._times = deque([self._start], maxlen=_WINDOW)
+
+    def step(self) -> None:
+        """Finish a step."""
+        self.done += 1
+        self._times.append(self._clock())
+
+    @property
+    def seconds(self) -> float:
+        """Since the stage began."""
+        return self._clock() - self._start
+
+    @property
+    def per_second(self) -> float | None:
+        """Steps in a second; None before there are any."""
+        passed = self._times[-1] - self._times[0]
+        return (len(self._times) - 1) / max(passed, 1e-3) if self.done else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Until the stage is done; None where that can't be told."""
+        rate = self.per_second
+        if rate is None or self.total is None:
+            return None
+        return max(0, self.total - self.done) / rate
+
+
+class Health:
+    """How tracking goes, in a few words."""
+
+    def __init__(self) -> None:
+        self._without = 0  # frames without a pose
+        self._in_a_row = 0
+        self._words, self._color = "", "green"
+
+    def see(self, record: FrameRecord) -> None:
+        """Take in what became of the next frame."""
+        gone = record.status in ("lost", "skipped")
+        self._without += gone
+        self._in_a_row = self._in_a_row + 1 if gone else 0
+        if record.status == "lost":
+            self._words, self._color = f"lost for {_frames(self._in_a_row)}", "red"
+        elif record.status == "skipped":
+            self._words, self._color = "unreadable", "yellow"
+        elif record.status == "predicted":
+            self._words, self._color = "guessing", "yellow"
+        else:
+            share = record.inlier_share
+            self._words = "tracking" if share is None else f"{share:.0%} fits"
+            self._color = "green" if share is None or share >= _GOOD_SHARE else "yellow"
+
+    @property
+    def markup(self) -> str:
+        """For a terminal."""
+        if not self._words:
+            return ""
+        more = f", {self._without} without a pose" if self._without > self._in_a_row else ""
+        return f"[{self._color}]{self._words}[/]{more}"
+
 
 class TerminalProgress:
-    """A progress bar on a terminal, with frames a second and how tracking goes."""
+    """The stages on a terminal: those done with their times, and one bar that goes on.
+
+    When the job is done all of it goes away, and what came out is said in its place.
+    """
 
     def __init__(self, stream: TextIO = sys.stderr) -> None:
         self._console = Console(file=stream, highlight=False)
+        self._tick = "[green]\u2713[/]" if self._console.encoding.startswith("utf") else "+"
+        wide = self._console.width >= _WIDE
         self._bar = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description:<13}"),
-            BarColumn(bar_width=28),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[health]}"),
+            _column("{task.fields[mark]} {task.description}", 15),
+            *([BarColumn(bar_width=20)] if wide else []),
+            _column("{task.fields[count]}", 9, "right"),
+            _column("{task.fields[pace]}", 19),
+            _column("{task.fields[health]}", 8),
             console=self._console,
             transient=True,
         )
         self._task: TaskID | None = None
-        self._start = 0.0
-        self._done = 0
-        self._lost = 0
+        self._pace = Pace()
+        self._health = Health()
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -55,21 +125,34 @@ class TerminalProgress:
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage."""
         if self._task is not None:
-            self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(name, total=total or None, rate="", health="")
-        self._start, self._done, self._lost = perf_counter(), 0, 0
+            whole = self._pace.done or 1
+            self._bar.update(
+                self._task,
+                mark=self._tick,
+                total=whole,
+                completed=whole,
+                count=f"{self._pace.done}" if self._pace.done else "",
+                pace=f"{_duration(self._pace.seconds)}",
+            )
+        self._pace, self._health = Pace(total), Health()
+        count = f"0/{total}" if total else ""
+        self._task = self._bar.add_task(
+            name, total=total or None, mark=" ", count=count, pace="", health=""
+        )
 
     def advance(self, record: FrameRecord | None = None) -> None:
         """Finish one step."""
         if self._task is None:
             return
-        self._done += 1
-        rate = f"{self._done / max(perf_counter() - self._start, 1e-3):.1f}/s"
-        health = ""
+        pace = self._pace
+        pace.step()
+        words = f"{pace.per_second:.1f}/s" if pace.per_second else ""
+        if pace.seconds_left is not None:
+            words += f", {_duration(pace.seconds_left)} left"
         if record is not None:
-            self._lost += record.status in ("lost", "skipped")
-            health = f"[red]{self._lost} without a pose" if self._lost else "[green]tracking"
-        self._bar.update(self._task, advance=1, rate=rate, health=health)
+            self._health.see(record)
+        count = f"{pace.done}/{pace.total}" if pace.total else f"{pace.done}"
+        self._bar.update(self._task, advance=1, count=count, pace=words, health=self._health.markup)
 
     def note(self, text: str) -> None:
         """Print a line above the bar."""
@@ -87,21 +170,32 @@ class JsonProgress:
     ) -> None:
         """Nothing to put away."""
 
+    def __init__(self) -> None:
+        self._pace = Pace()
+
     def stage(self, name: str, total: int | None = None) -> None:
         """Tell the stage."""
+        self._pace = Pace(total)
         emit({"event": "stage", "stage": name, "total": total})
 
     def advance(self, record: FrameRecord | None = None) -> None:
-        """Tell what became of a frame."""
-        if record is not None:
-            emit(
-                {
-                    "event": "frame",
-                    "index": record.index,
-                    "status": record.status,
-                    "reason": record.reason,
-                }
-            )
+        """Tell what became of a frame, and how far the stage is."""
+        self._pace.step()
+        if record is None:
+            return
+        emit(
+            {
+                "event": "frame",
+                "index": record.index,
+                "status": record.status,
+                "reason": record.reason,
+                "inlier_share": _rounded(record.inlier_share, 4),
+                "done": self._pace.done,
+                "total": self._pace.total,
+                "per_second": _rounded(self._pace.per_second, 3),
+                "seconds_left": _rounded(self._pace.seconds_left, 2),
+            }
+        )
 
     def note(self, text: str) -> None:
         """Tell a warning."""
@@ -148,6 +242,32 @@ def progress_for(*, as_json: bool) -> TerminalProgress | JsonProgress | QuietPro
 def emit(data: dict[str, Any]) -> None:
     """Print one JSON line at once."""
     print(json.dumps(data, allow_nan=False), flush=True)
+
+
+def _column(text: str, width: int, justify: Literal["left", "right"] = "left") -> TextColumn:
+    """A column of one line that is not narrower than that, as long as others can be."""
+    column = Column(min_width=width, no_wrap=True, overflow="ellipsis")
+    return TextColumn(text, justify=justify, table_column=column)
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(float(value), digits)
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'' if count == 1 else 's'}"
+
+
+def _duration(seconds: float) -> str:
+    """A time in few characters: 0.4 s, 12 s, 3:07, 1:02:45."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
 def _escaped(text: str) -> str:

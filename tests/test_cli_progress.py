@@ -1,0 +1,170 @@
+"""What is seen while a job runs: on a terminal, in a log, and by a program."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tofuse.cli import progress as module
+from tofuse.cli.progress import (
+    Health,
+    JsonProgress,
+    Pace,
+    QuietProgress,
+    TerminalProgress,
+    progress_for,
+)
+from tofuse.results.types import FrameRecord
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_pace_is_that_of_the_last_steps() -> None:
+    clock = Clock()
+    pace = Pace(200, clock)
+    assert (pace.per_second, pace.seconds_left) == (None, None)
+    clock.now += 30  # compiling
+    pace.step()
+    assert pace.per_second == pytest.approx(1 / 30)
+    for _ in range(99):
+        clock.now += 0.1
+        pace.step()
+    assert pace.per_second == pytest.approx(10)
+    assert pace.seconds_left == pytest.approx(10)
+    assert pace.seconds == pytest.approx(39.9)
+    for _ in range(101):
+        pace.step()
+    assert pace.seconds_left == 0
+    unknown = Pace(None, clock)
+    unknown.step()
+    assert unknown.per_second == pytest.approx(1000)
+    assert unknown.seconds_left is None
+
+
+def test_health_tells_of_the_newest_frame_and_of_what_was_lost() -> None:
+    health = Health()
+    assert health.markup == ""
+    seen = []
+    for status, share in (
+        ("tracked", 0.97),
+        ("tracked", 0.6),
+        ("lost", None),
+        ("lost", None),
+        ("tracked", 0.9),
+        ("predicted", 0.5),
+        ("skipped", None),
+        ("tracked", None),
+    ):
+        health.see(FrameRecord(0, 0.0, status, inlier_share=share))
+        seen.append(health.markup)
+    assert seen == [
+        "[green]97% fits[/]",
+        "[yellow]60% fits[/]",
+        "[red]lost for 1 frame[/]",
+        "[red]lost for 2 frames[/]",
+        "[green]90% fits[/], 2 without a pose",
+        "[yellow]guessing[/], 2 without a pose",
+        "[yellow]unreadable[/], 3 without a pose",
+        "[green]tracking[/], 3 without a pose",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.04, "0.0 s"), (9.94, "9.9 s"), (9.96, "10 s"), (59.4, "59 s"), (59.6, "1:00"),
+     (187, "3:07"), (3765, "1:02:45")],
+)  # fmt: skip
+def test_durations_are_short(seconds: float, words: str) -> None:
+    assert module._duration(seconds) == words
+
+
+def test_who_looks_decides(monkeypatch) -> None:
+    assert isinstance(progress_for(as_json=True), JsonProgress)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    assert isinstance(progress_for(as_json=False), QuietProgress)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert isinstance(progress_for(as_json=False), TerminalProgress)
+
+
+def test_programs_hear_how_far_it_is(capsys) -> None:
+    with JsonProgress() as progress:
+        progress.stage("tracking", 2)
+        progress.advance(FrameRecord(4, 0.0, "tracked", inlier_share=0.912345))
+        progress.advance(FrameRecord(6, 0.1, "lost", "why", inlier_share=float("nan")))
+        progress.stage("fusing", 3)
+        progress.advance()
+        progress.note("words")
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["event"] for line in lines] == ["stage", "frame", "frame", "stage", "note"]
+    first, last = lines[1:3]
+    assert (first["index"], first["status"], first["inlier_share"]) == (4, "tracked", 0.9123)
+    assert (first["done"], first["total"], last["done"]) == (1, 2, 2)
+    assert first["per_second"] > 0
+    assert first["seconds_left"] >= 0
+    assert (last["seconds_left"], last["inlier_share"], last["reason"]) == (0, None, "why")
+
+
+_SHOW = """
+import time
+from tofuse.cli.progress import progress_for
+from tofuse.results.types import FrameRecord
+with progress_for(as_json=False) as progress:
+    progress.stage("tracking", 40)
+    progress.note("read [this]")
+    for k in range(40):
+        time.sleep(0.01)
+        progress.advance(FrameRecord(k, 0.0, "lost" if k == 5 else "tracked", inlier_share=0.93))
+    progress.stage("refining")
+    time.sleep(0.2)
+print("done")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals of other systems")
+@pytest.mark.parametrize("columns", [50, 100])
+def test_a_terminal_shows_stages_and_is_clean_afterwards(columns: int) -> None:
+    import pty
+
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": str(columns)}
+    job = subprocess.Popen(
+        [sys.executable, "-c", _SHOW], stdout=theirs, stderr=theirs, env=environment
+    )
+    os.close(theirs)
+    data, deadline = b"", time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            chunk = os.read(ours, 65536)
+        except OSError:  # Linux says so when the other end is closed
+            break
+        if not chunk:
+            break
+        data += chunk
+    os.close(ours)
+    assert job.wait(60) == 0
+    text = data.decode()
+    words = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+    lines = [line.rstrip() for line in re.split(r"[\r\n]+", words)]
+    assert max(map(len, lines)) <= columns
+    assert any("note: read [this]" in line for line in lines)
+    assert any(re.match(r"  tracking .*\d+/40", line) for line in lines)
+    assert any(re.match(r"\u2713 tracking ", line) for line in lines)
+    assert any(line.startswith("  refining") for line in lines)
+    health = "93% fits, 1 without a pose" if columns == 100 else "93%"
+    pattern = rf"\d/40 +\d+\.\d/s, \d+\.\d s left +{health}"
+    assert any(re.search(pattern, line) for line in lines), lines
+    # What was shown is wiped out line by line before the last word.
+    assert lines[-2:] == ["done", ""] or lines[-1] == "done"
+    assert re.search(r"\x1b\[2K[^a-zA-Z0-9]*done", text)
