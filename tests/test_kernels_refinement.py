@@ -10,14 +10,14 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import refinement as kernels
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.maps.surface_map import Smoothed, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.projective import points_of
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 KNOWN = np.ones(kernels.ERRORS, np.int64)
 # No plane bends round the edges of the corner, so that what fits, fits exactly.
-SHARP = SurfaceOptions(radii=(2,), flatness=1e-5)
+SHARP = SurfaceOptions(radii=(2,), flatness=1e-5, smoothed=Smoothed(noise=0))
 SETTINGS = (0.05, 1.0, 0.1, 0.01, 4.0, 0.5)  # exposure, scales, slack, robust, cosine
 
 

@@ -10,13 +10,20 @@ import pytest
 
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable, ray_lengths
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import Projection, SurfaceMap, SurfaceOptions, surface_map
+from tofuse.maps.surface_map import (
+    Projection,
+    Smoothed,
+    SurfaceMap,
+    SurfaceOptions,
+    surface_map,
+)
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
 PLANE = np.array([0.1, -0.15, 0.5])  # a X + b Y + c Z = 1
 OPTIONS = SurfaceOptions()
+NEVER = Smoothed(noise=0)
 
 
 def wall(camera=CAMERA, sigma=0.0, seed=0, *, kind="z", amplitude="raw", spread=0.0, texture=0.0):
@@ -263,7 +270,7 @@ def smoothed(sigma, seed):
 
 def test_a_curved_surface_counts_where_its_noise_is_stated_though_not_shown():
     frame = smoothed(0.01, 1)
-    strict = replace(OPTIONS, flatness=0.0)
+    strict = replace(OPTIONS, flatness=0.0, smoothed=NEVER)
     blind = surface_map(frame, strict)
     told = surface_map(replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict)
     waves = np.s_[4:-4, 60:-4]
@@ -276,10 +283,31 @@ def test_a_nearly_flat_surface_is_one_however_little_noise_it_shows():
     frame = smoothed(0.0005, 1)
     waves = np.s_[4:-4, 60:-4]
     strict, default = (
-        (surface_map(frame, replace(OPTIONS, flatness=f)).planes[waves][..., 3] > 0).mean()
+        (surface_map(frame, replace(OPTIONS, flatness=f, smoothed=NEVER)).planes[waves][..., 3] > 0).mean()
         for f in (0.0, 0.002)
     )
     assert strict < 0.75 < 0.95 < default
+
+
+def test_small_shapes_stand_where_the_camera_smoothed_its_noise_away():
+    """A bar of five pixels before a wall has planes of its own there, and nothing under noise."""
+    frame = smoothed(0.0005, 1)
+    depth = frame.depth.copy()
+    depth[:, 20:25] = 1.2
+    noise = np.random.default_rng(2).normal(size=depth.shape) * 0.004
+    quiet, never, noisy = (
+        surface_map(replace(frame, depth=(depth + n).astype(np.float32)), options)
+        for n, options in (
+            (0 * noise, OPTIONS),
+            (0 * noise, replace(OPTIONS, smoothed=NEVER)),
+            (noise, OPTIONS),
+        )
+    )
+    bar = np.s_[8:-8, 21:24]
+    for view, least, most in ((quiet, 0.9, 1.0), (never, 0.0, 0.0), (noisy, 0.0, 0.0)):
+        assert least <= (view.planes[bar][..., 3] > 0).mean() <= most
+    z = 1 / quiet.planes[bar][..., 3]
+    np.testing.assert_allclose(z[:, 1], 1.2, atol=1e-3)
 
 
 def test_noise_is_no_edge():

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -45,6 +46,55 @@ _SHARE_ERROR = 100.0
 _MEDIAN_OF_NORMAL = 0.6745
 
 
+class _Windows(Protocol):
+    """Options of the windows of plane fits."""
+
+    @property
+    def radii(self) -> tuple[int, ...]: ...
+    @property
+    def edge_margin(self) -> int: ...
+    @property
+    def fill(self) -> float: ...
+
+
+def _check_windows(options: _Windows) -> None:
+    radii = options.radii
+    if not radii or list(radii) != sorted(set(radii)):
+        raise ValueError(f"radii is {radii}; give ascending half widths")
+    if not 1 <= radii[0] <= radii[-1] <= 50:
+        raise ValueError(f"radii is {radii}, not 1 to 50 pixels")
+    if not 0 <= options.edge_margin <= 20:
+        raise ValueError(f"edge_margin is {options.edge_margin}, not 0 to 20 pixels")
+    if not 0 < options.fill <= 1:
+        raise ValueError(f"fill is {options.fill}, not above 0 and up to 1")
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """How views are prepared whose noise the camera has smoothed away: finely, as it can be.
+
+    What is left there are shapes, and the few that hold the camera are small.
+
+    Attributes
+    ----------
+    noise
+        A view is one of those if its neighbouring pixels differ by less noise than this share of
+        the depth.
+    radii, edge_margin, fill
+        Take the place of the fields of `SurfaceOptions`.
+    """
+
+    noise: float = 0.001
+    radii: tuple[int, ...] = (1, 2)
+    edge_margin: int = 0
+    fill: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.noise <= 1:
+            raise ValueError(f"noise is {self.noise}, not 0 to 1")
+        _check_windows(self)
+
+
 @dataclass(frozen=True)
 class SurfaceOptions:
     """How a view is prepared.
@@ -70,6 +120,8 @@ class SurfaceOptions:
         share of its squared spread.
     photo_radius
         Half width of the box that smooths the albedo, pixels.
+    smoothed
+        What is different for views that have hardly any noise.
     """
 
     columns: int = 320
@@ -82,17 +134,15 @@ class SurfaceOptions:
     fill: float = 0.7
     offset: float = 0.2
     photo_radius: int = 1
+    smoothed: Smoothed = Smoothed()
 
     def __post_init__(self) -> None:
         if not 16 <= self.columns <= 4096:
             raise ValueError(f"columns is {self.columns}, not 16 to 4096")
-        if not self.radii or list(self.radii) != sorted(set(self.radii)):
-            raise ValueError(f"radii is {self.radii}; give ascending half widths")
-        if not 1 <= self.radii[0] <= self.radii[-1] <= 50:
-            raise ValueError(f"radii is {self.radii}, not 1 to 50 pixels")
-        if not 0 <= self.edge_margin <= 20 or not 0 <= self.photo_radius <= 20:
-            raise ValueError("edge_margin and photo_radius must be 0 to 20 pixels")
-        for name in ("edge_jump", "fill", "offset"):
+        _check_windows(self)
+        if not 0 <= self.photo_radius <= 20:
+            raise ValueError(f"photo_radius is {self.photo_radius}, not 0 to 20 pixels")
+        for name in ("edge_jump", "offset"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
         if not 0 <= self.edge_sigmas < 1e3:
@@ -101,6 +151,13 @@ class SurfaceOptions:
             raise ValueError(f"flatness is {self.flatness}, not 0 to 1")
         if not 0 < self.misfit < 1e6:
             raise ValueError(f"misfit is {self.misfit}, not above 0")
+
+    def for_noise(self, noise: float) -> SurfaceOptions:
+        """Return what to do with a view whose neighbouring pixels differ by this share."""
+        s = self.smoothed
+        if noise >= s.noise:
+            return self
+        return replace(self, radii=s.radii, edge_margin=s.edge_margin, fill=s.fill)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,8 +330,10 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     sigma = _noise_law(frame, z, light if lit else None, projection) if own is None else own
     # d(1/z) = dz / z^2
     weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
+    noise = _typical_noise(w, weight)
+    options = options.for_noise(noise)
     if options.edge_margin:
-        jump = max(options.edge_jump, options.edge_sigmas * _typical_noise(w, weight))
+        jump = max(options.edge_jump, options.edge_sigmas * noise)
         weight[_near_edges(w, jump, options.edge_margin)] = 0
     rows, columns = z.shape
     planes = np.empty((rows, columns, 4), np.float32)
