@@ -268,6 +268,7 @@ class SurfaceMap:
     projection: Projection
     has_photo: bool = field(default=False)
     pixel_variance: Float32 | None = None
+    _thinned: dict[int, SurfaceMap] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def normals(self) -> Float32:
@@ -281,11 +282,14 @@ class SurfaceMap:
     def thinned(self, columns: int) -> SurfaceMap:
         """Return the view at every n-th pixel, so that it has at most so many columns.
 
-        A plane fits beyond its own pixel, so for comparing views few pixels are enough.
+        A plane fits beyond its own pixel, so for comparing views few pixels are enough. All who
+        ask for as many get one object, so that it is kept once.
         """
         step = -(-self.z.shape[1] // columns)
         if step == 1:
             return self
+        if step in self._thinned:
+            return self._thinned[step]
         first = step // 2
         kept = (slice(first, None, step),) * 2
         z, sigma, planes, variance, photo = (
@@ -294,9 +298,10 @@ class SurfaceMap:
         )
         projection = self.projection.thinned(step)
         rays = projection.rays
-        return SurfaceMap(
+        self._thinned[step] = SurfaceMap(
             self.index, rays, z, sigma, planes, variance, photo, projection, self.has_photo
         )
+        return self._thinned[step]
 
     @cached_property
     def depth(self) -> float:
