@@ -187,7 +187,7 @@ def test_what_can_not_be_kept_stops_no_run(tmp_path: Path, monkeypatch) -> None:
         raise OSError(28, "No space left on device")
 
     other = Checkpoints(tmp_path, "a", notes.append)
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "replace", full)
     other.save("fusion", [1])
     assert "no space left" in notes[1]
     assert os.listdir(tmp_path) == []
@@ -227,8 +227,8 @@ def test_digest_tells_what_decides(tmp_path: Path) -> None:
     assert digest({}, [image], without=out) != alone
 
 
-# Keeps a state after every frame, and kills itself at the n-th event (a stage, a frame, a file that
-# is moved or a state that is kept), or at the n-th file that is moved to its place.
+# Keeps a state after every frame, and kills itself at the n-th event (a stage, a frame, a file or a
+# state that is moved), or at the n-th file that is moved to its place.
 _KILLED = """
 import os, pathlib, signal, sys
 from tofuse.cli import main
@@ -250,7 +250,6 @@ def counted(function):
 QuietProgress.stage = counted(QuietProgress.stage)
 QuietProgress.advance = counted(QuietProgress.advance)
 os.replace = counted(os.replace)
-os.fsync = counted(os.fsync)
 sys.exit(main(sys.argv[4:]))
 """
 

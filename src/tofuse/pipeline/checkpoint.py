@@ -289,9 +289,8 @@ def _write(file: BinaryIO, header: dict[str, Any], state: Any) -> None:
     file.write(_MAGIC + json.dumps(header).encode() + b"\n")
     summed = _Summed(file)
     pickle.Pickler(summed, protocol=5).dump(state)
+    # Not forced to the disk: should the power fail, the sum tells.
     file.write(summed.sum.to_bytes(4, "little"))
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _read(file: BinaryIO, key: str) -> Any:
