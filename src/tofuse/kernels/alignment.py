@@ -206,7 +206,7 @@ def _distances(
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
     scale_g2, slack2 = np.float32(scale_g * scale_g), np.float32(slack * slack)
     per_limit2, least = np.float32(1 / (robust * robust)), np.float32(min_cosine)
-    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
+    one, none = np.float32(1), np.float32(0)
     for k in range(_LANES):
         px = block[POINT * _LANES + k]
         py = block[(POINT + 1) * _LANES + k]
@@ -238,27 +238,14 @@ def _distances(
         weight = (one - e2) * (one - e2) if fits else none
         root = (one - e2) * np.sqrt(per_variance) if fits else none
         block[_FITS * _LANES + k] = one if fits else none
-        block[(_STAT + INLIERS - INLIERS) * _LANES + k] = one if fits else none
+        block[_STAT * _LANES + k] = one if fits else none
         block[(_STAT + IN_FRONT - INLIERS) * _LANES + k] = one if in_front else none
         block[(_STAT + WEIGHT_G - INLIERS) * _LANES + k] = weight
         block[(_STAT + SQUARES_G - INLIERS) * _LANES + k] = r2 * root * root
         block[(_STAT + SQUARES_M - INLIERS) * _LANES + k] = r2 if fits else none
-        a0, a1, a2 = half * root * (m0 + s0), half * root * (m1 + s1), half * root * (m2 + s2)
-        block[_J * _LANES + k] = a0
-        block[(_J + 1) * _LANES + k] = a1
-        block[(_J + 2) * _LANES + k] = a2
-        block[(_J + 3) * _LANES + k] = py * a2 - pz * a1
-        block[(_J + 4) * _LANES + k] = pz * a0 - px * a2
-        block[(_J + 5) * _LANES + k] = px * a1 - py * a0
         block[(_J + 6) * _LANES + k] = none
         block[_R * _LANES + k] = root * r if fits else none
-        a0, a1, a2 = half * root * (m0 - s0), half * root * (m1 - s1), half * root * (m2 - s2)
-        block[_D * _LANES + k] = a0
-        block[(_D + 1) * _LANES + k] = a1
-        block[(_D + 2) * _LANES + k] = a2
-        block[(_D + 3) * _LANES + k] = py * a2 - pz * a1
-        block[(_D + 4) * _LANES + k] = pz * a0 - px * a2
-        block[(_D + 5) * _LANES + k] = px * a1 - py * a0
+        _put(block, k, root, px, py, pz, m0, m1, m2, s0, s1, s2)
 
 
 @kernel
@@ -269,7 +256,7 @@ def _albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
     per_p, change = np.float32(1 / scale_p), np.float32(exposure)
     per_limit2 = np.float32(1 / (scale_p * scale_p * robust * robust))
-    one, half, none = np.float32(1), np.float32(0.5), np.float32(0)
+    one, none = np.float32(1), np.float32(0)
     for k in range(_LANES):
         px = block[POINT * _LANES + k]
         py = block[(POINT + 1) * _LANES + k]
@@ -299,22 +286,42 @@ def _albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        a0, a1, a2 = half * root * (m0 + s0), half * root * (m1 + s1), half * root * (m2 + s2)
-        block[_J * _LANES + k] = a0
-        block[(_J + 1) * _LANES + k] = a1
-        block[(_J + 2) * _LANES + k] = a2
-        block[(_J + 3) * _LANES + k] = py * a2 - pz * a1
-        block[(_J + 4) * _LANES + k] = pz * a0 - px * a2
-        block[(_J + 5) * _LANES + k] = px * a1 - py * a0
         block[(_J + 6) * _LANES + k] = -root
         block[_R * _LANES + k] = root * r
-        a0, a1, a2 = half * root * (m0 - s0), half * root * (m1 - s1), half * root * (m2 - s2)
-        block[_D * _LANES + k] = a0
-        block[(_D + 1) * _LANES + k] = a1
-        block[(_D + 2) * _LANES + k] = a2
-        block[(_D + 3) * _LANES + k] = py * a2 - pz * a1
-        block[(_D + 4) * _LANES + k] = pz * a0 - px * a2
-        block[(_D + 5) * _LANES + k] = px * a1 - py * a0
+        _put(block, k, root, px, py, pz, m0, m1, m2, s0, s1, s2)
+
+
+@kernel
+def _put(
+    block: Float32,
+    k: int,
+    root: np.float32,
+    px: np.float32,
+    py: np.float32,
+    pz: np.float32,
+    m0: np.float32,
+    m1: np.float32,
+    m2: np.float32,
+    s0: np.float32,
+    s1: np.float32,
+    s2: np.float32,
+) -> None:
+    """Write J by the pose and D into column k, weighted; m and s are the sides' directions."""
+    half = np.float32(0.5) * root
+    a0, a1, a2 = half * (m0 + s0), half * (m1 + s1), half * (m2 + s2)
+    block[_J * _LANES + k] = a0
+    block[(_J + 1) * _LANES + k] = a1
+    block[(_J + 2) * _LANES + k] = a2
+    block[(_J + 3) * _LANES + k] = py * a2 - pz * a1
+    block[(_J + 4) * _LANES + k] = pz * a0 - px * a2
+    block[(_J + 5) * _LANES + k] = px * a1 - py * a0
+    a0, a1, a2 = half * (m0 - s0), half * (m1 - s1), half * (m2 - s2)
+    block[_D * _LANES + k] = a0
+    block[(_D + 1) * _LANES + k] = a1
+    block[(_D + 2) * _LANES + k] = a2
+    block[(_D + 3) * _LANES + k] = py * a2 - pz * a1
+    block[(_D + 4) * _LANES + k] = pz * a0 - px * a2
+    block[(_D + 5) * _LANES + k] = px * a1 - py * a0
 
 
 @kernel

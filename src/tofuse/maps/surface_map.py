@@ -26,9 +26,9 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-# Chunks of rows: few, as each costs a hand-over between threads; fixed, so that the number of
-# threads changes nothing.
-_CHUNKS = 4
+# Rows of a chunk: many, as each costs a hand-over between threads, and windows reach into the next;
+# fixed, so that the number of threads changes nothing.
+_CHUNK_ROWS = 60
 # Depths within this share of each other are one surface when an image is halved.
 _HALVING_JUMP = 0.02
 # Levels of colour: below, the logarithm is noise; from the other on, a channel is saturated.
@@ -354,7 +354,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
             w, rays, weight, radii, limit, options.fill, options.offset, planes, quality, a, b
         ),
         rows,
-        _CHUNKS,
+        _chunks(rows),
     )
     photo = np.full((rows, columns, 3), np.nan, np.float32)
     has_photo = light is not None
@@ -367,7 +367,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
                 albedo, planes, rays, options.photo_radius, 0.05, photo, a, b
             ),
             rows,
-            _CHUNKS,
+            _chunks(rows),
         )
     variance = quality[..., 1] * np.float32(scale)
     shared = _shared_sigma(frame, projection.lengths2)
@@ -462,9 +462,13 @@ def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
     run_chunks(
         lambda a, b: halve(z, light, variance, _HALVING_JUMP, out[0], out[1], out[2], a, b),
         len(out[0]),
-        _CHUNKS,
+        _chunks(len(out[0])),
     )
     return out
+
+
+def _chunks(rows: int) -> int:
+    return max(2, rows // _CHUNK_ROWS)
 
 
 def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
@@ -534,7 +538,7 @@ def _noise_scale(w: Float32, rays: Float32, weight: Float32, radius: int) -> flo
     quality = np.empty((rows, columns, 2), np.float32)
     values = []
     radii = np.array([radius], np.int64)
-    for i in range(radius, rows - radius, max(1, rows // 16)):
+    for i in range(radius, rows - radius, max(1, rows // 12)):
         fit_planes(w, rays, weight, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
         values.append(quality[i, :, 0])
     found = np.concatenate(values) if values else np.zeros(0)
