@@ -174,6 +174,24 @@ def test_a_refinement_is_kept_only_where_the_views_support_it():
     np.testing.assert_array_equal(refiner(NoRefinement(), views, start).poses, start)
 
 
+def test_an_error_that_pixels_share_counts_once_where_all_views_are_compared():
+    """One alignment would take it for motion; of many views each has another one."""
+    truth = path(4)
+    shared = np.full(corner(truth[0]).depth.shape, 0.01, np.float32)
+    frames = [replace(corner(T), index=k, shared_sigma_image=shared) for k, T in enumerate(truth)]
+    views = [surface_map(frame, SHARP) for frame in frames]
+    whole = [view.once() for view in views]
+    np.testing.assert_array_equal(whole[0].plane_variance, views[0].pixel_variance)
+    assert whole[0].once() is whole[0]
+    found = refiner(Joint(), views, truth)
+    # A hundred pixels that share their error are not worth one, but no less than they are alone.
+    wary = refine([KeptView.of(view, 1500) for view in views], truth, OPTIONS)
+    once = refine([KeptView.of(view, 1500) for view in whole], truth, OPTIONS)
+    np.testing.assert_allclose(found.poses, once.poses, atol=1e-12)
+    gained = np.linalg.det(once.information) / np.linalg.det(wary.information)
+    assert gained.min() > 10
+
+
 def test_a_view_that_loses_support_stays_with_its_neighbours():
     """One view is of another place: it must not be dragged about to fit what it can't."""
     truth = path(12)

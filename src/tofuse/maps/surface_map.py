@@ -279,6 +279,17 @@ class SurfaceMap:
             np.float32
         )
 
+    def once(self) -> SurfaceMap:
+        """Return the view with `pixel_variance` for `plane_variance`, if it has both.
+
+        A single alignment can't but take an error that pixels share for the camera's motion, so it
+        must rely little on such pixels. Where each view is compared with many others, which saw
+        the same surfaces from elsewhere, they know more than that.
+        """
+        if self.pixel_variance is None:
+            return self
+        return replace(self, plane_variance=self.pixel_variance, pixel_variance=None)
+
     def thinned(self, columns: int) -> SurfaceMap:
         """Return the view at every n-th pixel, so that it has at most so many columns.
 

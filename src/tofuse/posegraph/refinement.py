@@ -160,7 +160,7 @@ class _Joint(Refiner):
     def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
         """See `Refiner.push`."""
         if surface is not None:
-            self._store.push(surface.thinned(_COLUMNS), T_world_camera)
+            self._store.push(surface.once().thinned(_COLUMNS), T_world_camera)
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
