@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import fields
@@ -16,7 +17,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, replacing, write_text
 from tofuse.files.images import read_color, read_header, read_image, write_png
 from tofuse.files.ply import write_ply
-from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.reading import files_with, is_file, is_folder, list_folder
 from tofuse.files.tables import exact, read_columns, read_numbers, write_columns
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable, range_from_z, z_from_range
@@ -40,6 +41,8 @@ from tofuse.recordings.frames import (
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
 from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.models import SPEED_OF_LIGHT
+from tofuse.sensor.frequencies import DISAGREEMENT, combined
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -91,6 +94,7 @@ class NativeSource(FileSource):
         self.color = self._channel("color", *_IMAGES)
         self.sigma = self._channel("sigma", ".png")
         self.rays = self._channel("rays", ".npy")
+        self.by_frequency = self._frequencies()
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
@@ -116,9 +120,12 @@ class NativeSource(FileSource):
             return ply_frame(self.files[index], index, timestamp)
         size = (self.camera.width, self.camera.height)
         camera = self._camera_of(index, self.camera)
-        counts = read_image(self.files[index], size=size, dtype="uint16")
-        depth = depth_from_counts(counts, self.description.depth_unit_m)
         kind = self.description.depth_kind
+        if self.by_frequency:
+            depth = self._combined(index, camera, size, kind)
+        else:
+            counts = read_image(self.files[index], size=size, dtype="uint16")
+            depth = depth_from_counts(counts, self.description.depth_unit_m)
         if self.correction is not None:
             depth = corrected_depth(self.correction, camera, depth, kind)
         frame = RangeFrame(index, timestamp, camera, depth, kind)
@@ -223,6 +230,45 @@ class NativeSource(FileSource):
         if [f.stem for f in files] != [f.stem for f in self.files]:
             self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
         return files
+
+    def _frequencies(self) -> dict[float, list[Path]]:
+        """Return the images of depth measured at each frequency, in Hz, where there are several."""
+        folder = self.folder / "frequencies"
+        if self.is_clouds or not is_folder(folder):
+            return {}
+        found: dict[float, list[Path]] = {}
+        for part in list_folder(folder):
+            try:
+                hertz = float(part.name)
+            except ValueError:
+                hertz = math.nan
+            if not 1e5 <= hertz <= 1e10 or not is_folder(part):
+                raise InputError(
+                    "isn't a frequency", where=part, remedy="name the folder in Hz, as 30000000"
+                )
+            found[hertz] = files_with(part, ".png")
+            if len(found[hertz]) != len(self.files):
+                raise self._count_error(part, f"{len(found[hertz])} images")
+        if len(found) == 1:
+            raise InputError(
+                "holds one frequency", where=folder, remedy="give two or more, or remove it"
+            )
+        return found
+
+    def _combined(
+        self, index: int, camera: Camera, size: tuple[int, int], kind: DepthKind
+    ) -> Float32:
+        """Return the depth that all frequencies agree on; 0 where they don't."""
+        unit = self.description.depth_unit_m
+        periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
+        ranges = []
+        for files in self.by_frequency.values():
+            counts = read_image(files[index], size=size, dtype="uint16")
+            depth = depth_from_counts(counts, unit)
+            ranges.append(depth if kind == "range" else range_from_z(camera, depth))
+        radial, apart = combined(ranges, periods)
+        agreed = np.where(apart < DISAGREEMENT * min(periods), radial, np.float32(0))
+        return agreed if kind == "range" else z_from_range(camera, agreed)
 
     def _read_correction(self) -> DepthCorrection | None:
         path = self.folder / "correction.npz"

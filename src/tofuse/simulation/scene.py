@@ -296,6 +296,7 @@ SCENES: dict[str, SceneKind] = {
     "box": SceneKind("a box of 300 x 300 x 400 mm on a stand, one turn", "box", 570, 10),
     "wall": SceneKind("one flat wall, swaying in front of it", "plain", 60, 3),
     "corner": SceneKind("three planes that meet, swaying in front of them", "plain", 60, 3),
+    "hall": SceneKind("a hall of 8 x 8 m, larger than some cameras' period", "plain", 180, 6),
     "corridor": SceneKind("1.5 m forward along a corridor", "plain", 60, 3),
 }
 

@@ -1,0 +1,135 @@
+"""Bring back surfaces that lie beyond the camera's period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.filters._options import above
+from tofuse.filters.correction import Correction, Corrector
+from tofuse.filters.multipath import light_image
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+_ROUNDS = 4
+
+
+@part("correction", "unwrap", label="validated")
+@dataclass(frozen=True)
+class Unwrap(Correction):
+    """Undo phase wraps by amplitude and neighbourhood, see `tofuse.sensor.unwrap`.
+
+    Works on cameras of one modulation frequency that record amplitude; other views are passed on as
+    they are.
+
+    Attributes
+    ----------
+    white
+        Raw amplitude of a white wall at 1 m in the image's centre; None: found from the recording.
+    period_m
+        Range after which the phase repeats; None: as the frame says.
+    options
+        See there.
+    """
+
+    white: float | None = None
+    period_m: float | None = None
+    options: UnwrapOptions = field(default_factory=UnwrapOptions)
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if self.white is not None:
+            above("white", self.white, 0)
+        if self.period_m is not None:
+            above("period_m", self.period_m, 0)
+
+    @property
+    def learns(self) -> bool:
+        """See `Correction.learns`."""
+        return self.white is None
+
+    def learnt(self, frames: Sequence[Frame]) -> Self:
+        """Return the part with the amplitude of white that the brightest frames show."""
+        white = 0.0
+        # Where most is beyond the period, white is known only once that has been brought back.
+        for _ in range(_ROUNDS):
+            found = [w for frame in frames if (w := self._white_of(frame, white)) > 0]
+            if not found:
+                return self
+            before, white = white, float(np.quantile(found, 0.9))
+            if abs(white - before) < 0.02 * white:
+                break
+        return replace(self, white=white)
+
+    def start(self) -> UnwrapCorrector:
+        """See `Correction.start`."""
+        return UnwrapCorrector(self)
+
+    def _white_of(self, frame: Frame, white: float) -> float:
+        known = wrapped_light(frame, self.period_m)
+        if known is None:
+            return 0.0
+        radial, light, period = known
+        pitch = _pitch(frame)
+        periods = count_periods(radial, light, period, white, pitch, self.options)
+        return white_light(light, (radial + periods * period).astype(np.float32), radial > 0)
+
+
+class UnwrapCorrector(Corrector):
+    """Moves pixels of each frame by whole periods."""
+
+    def __init__(self, part: Unwrap) -> None:
+        self.part = part
+
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
+        """See `Corrector.apply`. Range-compensated amplitude is that of the new range."""
+        known = wrapped_light(frame, self.part.period_m)
+        if known is None or not isinstance(frame, RangeFrame):
+            return frame
+        radial, light, period = known
+        white = self.part.white or 0.0
+        periods = count_periods(radial, light, period, white, _pitch(frame), self.part.options)
+        if not periods.any():
+            return frame
+        factor = np.where(periods > 0, 1 + periods * period / np.where(radial > 0, radial, 1), 1)
+        amplitude = frame.amplitude_image
+        if amplitude is not None and frame.amplitude_kind == "range_compensated":
+            amplitude = np.where(periods > 0, amplitude * factor**2, amplitude).astype(np.float32)
+        return replace(
+            frame,
+            depth=(frame.depth * factor).astype(np.float32),
+            amplitude_image=amplitude,
+            ambiguity_m=frame.ambiguity_m,
+        )
+
+
+def wrapped_light(frame: Frame, period_m: float | None) -> tuple[Float32, Float32, float] | None:
+    """Return radial range and raw light with the falloff of lens and lamp taken off, and period."""
+    if not isinstance(frame, RangeFrame):
+        return None
+    image = light_image(frame, period_m)
+    if image is None:
+        return None
+    rays = frame.camera.rays()
+    cosine2 = 1 / (1 + (rays * rays).sum(-1))
+    radial = np.where(frame.valid, frame.radial_range, np.float32(0))
+    with np.errstate(invalid="ignore"):
+        light = np.nan_to_num(image.light / cosine2**2)
+    return radial, light.astype(np.float32), image.period_m
+
+
+def _pitch(frame: Frame) -> float:
+    """Angle between neighbouring pixels in the middle of the image, rad."""
+    assert isinstance(frame, RangeFrame)
+    rays = frame.camera.rays()
+    rows, columns = (slice(n // 4, max(n - n // 4, n // 4 + 2)) for n in rays.shape[:2])
+    return float(np.nanmedian(np.abs(np.diff(rays[rows, columns, 0], axis=1))))

@@ -1,0 +1,75 @@
+"""One range from phases at several frequencies: the periods are those at which all agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Share of the shortest period by which frequencies may differ, rms, about one range.
+DISAGREEMENT = 0.1
+
+
+def combined(
+    ranges: Sequence[Float32],
+    periods_m: Sequence[float],
+    weights: Sequence[float] | None = None,
+    longest_m: float | None = None,
+) -> tuple[Float32, Float32]:
+    """Return the range that measurements at several frequencies agree on, and how well.
+
+    Parameters
+    ----------
+    ranges
+        Radial ranges (H, W) in m, each in [0, its period), 0 where invalid.
+    periods_m
+        Of each.
+    weights
+        Of each in the mean, such as 1 / sigma^2; unless given those of equal phase noise,
+        1 / period^2.
+    longest_m
+        Largest range to look at; unless given, up to where the first periods meet again, at most
+        40 m.
+
+    Returns
+    -------
+    combined
+        (H, W) in m, 0 where one measurement is missing.
+    disagreement
+        (H, W) weighted rms of the measurements about it, m.
+    """  # fmt: skip
+    P = np.asarray(periods_m, float)
+    w = 1 / P**2 if weights is None else np.asarray(weights, float)
+    w = w / w.sum()
+    stack = np.stack([np.asarray(r, float) for r in ranges])
+    valid = (stack > 0).all(0)
+    first = int(np.argmin(P))  # the finest leads: its periods are tried
+    limit = min(longest_m or _beat(P), 40.0)
+    best = np.full(stack.shape[1:], np.inf)
+    out = np.zeros(stack.shape[1:])
+    for k in range(int(np.ceil(limit / P[first]))):
+        guess = stack[first] + k * P[first]
+        near = np.stack([r + np.rint((guess - r) / p) * p for r, p in zip(stack, P, strict=True)])
+        mean = np.tensordot(w, near, 1)
+        error = np.sqrt(np.tensordot(w, (near - mean) ** 2, 1))
+        better = valid & (error < best) & (near >= 0).all(0) & (mean < limit)
+        best[better], out[better] = error[better], mean[better]
+    found = np.isfinite(best)
+    return (
+        np.where(found, out, 0).astype(np.float32),
+        np.where(found, best, 0).astype(np.float32),
+    )
+
+
+def _beat(periods: Float64) -> float:
+    """Range after which two or more periods meet again, to a percent of the shortest."""
+    shortest = periods.min()
+    for k in range(1, 1000):
+        at = k * shortest
+        if (np.abs(at / periods - np.rint(at / periods)) * periods < 0.01 * shortest).all():
+            return float(at)
+    return float(1000 * shortest)

@@ -1,0 +1,255 @@
+"""Whole periods of the phase, which a camera of one frequency can't measure.
+
+Beyond the ambiguity P a surface at r + P is measured at r. Two things tell it apart. Its light is
+that of a far surface: raw amplitude falls with the squared range, so that the albedo that its
+amplitude means at r is too small by (r / (r + P))^2, a factor of thirty at r = 1 m and P = 5 m.
+And it goes on in its neighbours: a floor that leaves one period enters the next.
+
+Both are costs of a random field over the image, whose most likely state is found by belief
+propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude). Several frequencies need
+none of that: see `tofuse.sensor.frequencies`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label, uniform_filter
+
+from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.unwrap import pass_messages
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+# Of an image's pixels so many are taken to be brighter than white: gloss, noise.
+_GLOSSY = 0.01
+# Slopes are told from blocks so far on either side, of a phase averaged over so many: far surfaces
+# are noisy. Less than the last cosine of incidence is not believed.
+_REACH, _WIDE, _STEEPEST = 2, 5, 0.25
+
+
+@dataclass(frozen=True)
+class UnwrapOptions:
+    """What speaks for a number of periods, and how much.
+
+    Attributes
+    ----------
+    periods
+        Most periods that a surface lies beyond the first.
+    albedo, spread
+        Albedos are log-normal about the first, with the second as the logarithm's deviation.
+    albedo_most
+        Most that the albedo of one block may cost.
+    nearness
+        What each period costs: without anything else nothing is moved.
+    alone
+        Share of these costs that counts: blocks of one surface are dark or bright together.
+    scale
+        Difference of neighbours that costs 1, as a share of the period.
+    difference_most
+        Most that a difference may cost: that of a jump.
+    entry
+        Surfaces are moved only if at least this share of their rim goes on across the period:
+        dark ones that nothing leads to stay.
+    columns
+        Blocks along the image's width.
+    iterations
+        Of the messages: about how many blocks one place can tell another.
+    """
+
+    periods: int = 1
+    albedo: float = 0.5
+    spread: float = 0.6
+    albedo_most: float = 4.0
+    nearness: float = 0.1
+    alone: float = 0.1
+    scale: float = 0.05
+    difference_most: float = 3.0
+    entry: float = 0.05
+    columns: int = 88
+    iterations: int = 120
+
+
+_DEFAULT = UnwrapOptions()
+
+
+def white_light(light: Float32, radial_range: Float32, valid: Bool) -> float:
+    """Return the raw light of a white surface at 1 m as the brightest of an image tell it, or 0.
+
+    Wrapped pixels look too dark, not too bright, so they do no harm unless there is nothing else.
+    """
+    seen = valid & (light > 0)
+    if not seen.any():
+        return 0.0
+    at_1_m = light[seen].astype(float) * radial_range[seen].astype(float) ** 2
+    return float(np.quantile(at_1_m, 1 - _GLOSSY))
+
+
+def count_periods(
+    radial_range: Float32,
+    light: Float32,
+    period_m: float,
+    white: float,
+    pitch: float,
+    options: UnwrapOptions = _DEFAULT,
+) -> Int32:
+    """Return how many periods (H, W) each pixel is to be moved back by.
+
+    Parameters
+    ----------
+    radial_range
+        (H, W) in m, in [0, period), 0 where invalid.
+    light
+        (H, W) raw amplitude, not compensated for range; 0 where unknown.
+    period_m
+        Range after which the measurement repeats.
+    white
+        Light of a white surface at 1 m, see `white_light`; 0 where that is not known.
+    pitch
+        Angle between neighbouring pixels, rad.
+    options
+        See there.
+    """
+    out = np.zeros(radial_range.shape, np.int32)
+    if white <= 0 or not (radial_range > 0).any():
+        return out
+    side = max(1, round(radial_range.shape[1] / options.columns))
+    blocks = _Blocks.of(radial_range, light, period_m, side)
+    unary = _unlikely(blocks, period_m, white, pitch * side, options)
+    messages = np.zeros((4, *unary.shape), np.float32)
+
+    def renew(start: int, stop: int, parity: int) -> None:
+        pass_messages(
+            blocks.range_m, blocks.valid, unary, period_m, options.scale * period_m,
+            options.difference_most, 1.0, start, stop, parity, messages,
+        )  # fmt: skip
+
+    for step in range(2 * options.iterations):
+        run_chunks(partial(renew, parity=step % 2), len(unary))
+    best = np.argmin(unary + messages.sum(0), axis=2)
+    best = _entered(blocks, best, period_m, options)
+    return _of_pixels(radial_range, blocks, best, period_m, side, options.periods)
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Range (h, w) in [0, period) of the light of square blocks, its mean, and which have any."""
+
+    range_m: Float32
+    light: Float32
+    valid: Bool
+
+    @classmethod
+    def of(cls, radial_range: Float32, light: Float32, period: float, side: int) -> Self:
+        height, width = radial_range.shape
+        rows, columns = -(-height // side), -(-width // side)
+        spare = ((0, rows * side - height), (0, columns * side - width))
+
+        def summed(image: NDArray[np.floating]) -> Float64:
+            whole = np.pad(image.astype(float), spare)
+            return whole.reshape(rows, side, columns, side).sum((1, 3))
+
+        seen = radial_range > 0
+        # Its strength does not count in full, or bright surfaces would swallow dark ones beside.
+        strength = np.where(seen, np.sqrt(np.maximum(light, 0)) + 1e-3, 0)
+        phase = 2 * np.pi * radial_range.astype(float) / period
+        range_m = _range_of(
+            summed(strength * np.cos(phase)), summed(strength * np.sin(phase)), period
+        )
+        count = summed(seen.astype(float))
+        mean = summed(np.where(seen, light, 0)) / np.maximum(count, 1)
+        return cls(range_m, mean.astype(np.float32), count >= 0.5 * side * side)
+
+
+def _range_of(real: Float64, imaginary: Float64, period: float) -> Float32:
+    angle = np.mod(np.arctan2(imaginary, real), 2 * np.pi)
+    return (angle * period / (2 * np.pi)).astype(np.float32)
+
+
+def _unlikely(
+    blocks: _Blocks, period: float, white: float, pitch: float, options: UnwrapOptions
+) -> Float32:
+    """Cost (h, w, K) of each number of periods by the albedo that it means."""
+    phase = 2 * np.pi * blocks.range_m.astype(float) / period
+    real = uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WIDE)
+    imaginary = uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WIDE)
+    slope = _steps(_range_of(real, imaginary, period), period) / pitch
+    cost = np.empty((*blocks.range_m.shape, options.periods + 1), np.float32)
+    for k in range(options.periods + 1):
+        beyond = np.maximum(blocks.range_m + k * period, 1e-6)
+        # A slanted surface is darker; how slanted it is depends on how large its pixels are.
+        cosine = np.maximum(1 / np.sqrt(1 + (slope / beyond) ** 2), _STEEPEST)
+        albedo = np.maximum(blocks.light * beyond**2 / (white * cosine), 1e-6)
+        unlikely = 0.5 * (np.log(albedo / options.albedo) / options.spread) ** 2
+        cost[..., k] = np.minimum(unlikely, options.albedo_most) + options.nearness * k
+    return np.float32(options.alone) * cost
+
+
+def _steps(range_m: Float32, period: float) -> Float32:
+    """Change (h, w) of the range to the next block, over the period where that is the shorter."""
+    squares = np.zeros(range_m.shape, np.float32)
+    for axis in (0, 1):
+        wide = [(_REACH, _REACH) if a == axis else (0, 0) for a in (0, 1)]
+        padded = np.pad(range_m, wide, "edge")
+        count = padded.shape[axis]
+        ahead = np.take(padded, np.arange(2 * _REACH, count), axis)
+        difference = ahead - np.take(padded, np.arange(count - 2 * _REACH), axis)
+        difference -= period * np.rint(difference / period)
+        squares += (difference / (2 * _REACH)) ** 2
+    return np.sqrt(squares)
+
+
+def _entered(
+    blocks: _Blocks, best: NDArray[np.intp], period: float, options: UnwrapOptions
+) -> NDArray[np.intp]:
+    """Put back what was moved though no surface leads into it across the period."""
+    moved = (best > 0) & blocks.valid
+    pieces, count = label(moved)
+    rim = np.zeros(count + 1)
+    entries = np.zeros(count + 1)
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        for inside, outside in ((a, b), (b, a)):
+            edge = moved[inside] & ~moved[outside] & blocks.valid[outside]
+            far = blocks.range_m[inside] + best[inside] * period
+            near = blocks.range_m[outside] + best[outside] * period
+            goes_on = edge & (np.abs(far - near) < options.scale * period)
+            rim += np.bincount(pieces[inside][edge], minlength=count + 1)
+            entries += np.bincount(pieces[inside][goes_on], minlength=count + 1)
+    kept = entries > np.maximum(options.entry * rim, 2)
+    return np.where(kept[pieces], best, 0)
+
+
+def _of_pixels(
+    radial_range: Float32,
+    blocks: _Blocks,
+    best: NDArray[np.intp],
+    period: float,
+    side: int,
+    most: int,
+) -> Int32:
+    """Periods (H, W) of pixels: those of the block around that they lie nearest to."""
+    height, width = radial_range.shape
+    rows, columns = best.shape
+    out = np.zeros((height, width), np.int64)
+    nearest = np.full((height, width), np.inf)
+    at_row, at_column = np.arange(height) // side, np.arange(width) // side
+    for down in (0, -1, 1):
+        for right in (0, -1, 1):
+            here = np.ix_(
+                np.clip(at_row + down, 0, rows - 1), np.clip(at_column + right, 0, columns - 1)
+            )
+            difference = blocks.range_m[here] - radial_range
+            across = np.rint(difference / period)
+            # A pixel's own block is taken unless another one fits clearly better.
+            off = np.abs(difference - across * period) + (0.02 * period if down or right else 0)
+            better = blocks.valid[here] & (off < nearest)
+            out[better] = (best[here] + across.astype(np.int64))[better]
+            nearest[better] = off[better]
+    return np.where(radial_range > 0, np.clip(out, 0, most), 0).astype(np.int32)

@@ -1,0 +1,204 @@
+"""Whole periods: by amplitude and neighbourhood, and by several frequencies."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.errors import InputError
+from tofuse.files.images import write_png
+from tofuse.filters.unwrap import Unwrap
+from tofuse.geometry.cameras import Pinhole, range_from_z
+from tofuse.kernels.threads import threads
+from tofuse.kernels.unwrap import STEPS, pass_messages
+from tofuse.recordings.frames import RangeFrame
+from tofuse.sensor.frequencies import combined
+from tofuse.sensor.models import SPEED_OF_LIGHT
+from tofuse.sensor.unwrap import count_periods
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import plan
+
+PERIOD = 5.0
+
+
+def taken(scene: str, every: int) -> list[tuple[RangeFrame, np.ndarray]]:
+    """Frames of a simulated SR4000 and the true radial range of their pixels."""
+    made = plan(scene, every=every, seed=3, effects=Effects().without("multipath"))
+    out = []
+    for rendered in made.frames(None):
+        frame, true = rendered.frame, rendered.depth
+        radial = true if made.model.depth_kind == "range" else range_from_z(frame.camera, true)
+        out.append((frame, radial))
+    return out
+
+
+def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Periods that each pixel lacks, and which pixels measured one surface to half a metre."""
+    lacks = np.rint((radial - frame.radial_range) / PERIOD)
+    off = np.abs(radial - frame.radial_range - lacks * PERIOD)
+    confident = frame.confidence_image is None or frame.confidence_image >= 1
+    return lacks, frame.valid & (radial > 0) & (off < 0.5) & confident
+
+
+def test_a_hall_beyond_the_period_is_brought_back() -> None:
+    """8 x 8 m before a camera of 5 m: most of it is wrapped."""
+    frames = taken("hall", 90)
+    part = Unwrap().learnt([frame for frame, _ in frames])
+    corrector = part.start()
+    wrapped = restored = good = harmed = 0
+    for frame, radial in frames:
+        lacks, sure = periods_of(frame, radial)
+        moved = np.rint((corrector.apply(frame).radial_range - frame.radial_range) / PERIOD)
+        wrapped += (sure & (lacks == 1)).sum()
+        restored += (sure & (lacks == 1) & (moved == 1)).sum()
+        good += (sure & (lacks == 0)).sum()
+        harmed += (sure & (lacks == 0) & (moved != 0)).sum()
+    assert wrapped > 10_000
+    assert good > 5_000
+    assert restored > 0.97 * wrapped
+    assert harmed <= 0.001 * good
+
+
+def test_a_room_within_the_period_is_left_alone() -> None:
+    """Its dark chairs and floor reflect as little as a white wall a period farther would."""
+    frames = taken("room", 128)
+    corrector = Unwrap().learnt([frame for frame, _ in frames]).start()
+    for frame, _ in frames:
+        moved = corrector.apply(frame).depth != frame.depth
+        assert moved.mean() < 0.001
+
+
+def test_amplitude_follows_the_range() -> None:
+    """Range-compensated amplitude of a wall is the same before and behind the period."""
+    frame, _ = taken("hall", 180)[0]
+    assert frame.amplitude_kind == "range_compensated"
+    out = Unwrap().learnt([frame]).start().apply(frame)
+    assert isinstance(out, RangeFrame)
+    assert frame.amplitude_image is not None
+    assert out.amplitude_image is not None
+    moved = (out.depth != frame.depth) & (frame.radial_range > 0.5)
+    factor = (out.radial_range / np.where(moved, frame.radial_range, 1))[moved]
+    np.testing.assert_allclose(
+        out.amplitude_image[moved], frame.amplitude_image[moved] * factor**2, rtol=1e-4
+    )
+    still = out.depth == frame.depth
+    np.testing.assert_array_equal(out.amplitude_image[still], frame.amplitude_image[still])
+
+
+def test_other_views_are_passed_on() -> None:
+    camera = Pinhole(16, 12, 12.0, 12.0, 7.5, 5.5)
+    frame = RangeFrame(0, 0.0, camera, np.full((12, 16), 2.0, np.float32))
+    corrector = Unwrap().learnt([frame]).start()
+    assert corrector.apply(frame) is frame
+    empty = replace(frame, depth=np.zeros((12, 16), np.float32), ambiguity_m=PERIOD)
+    assert corrector.apply(empty) is empty
+
+
+def test_the_same_with_any_number_of_threads() -> None:
+    frame, _ = taken("hall", 180)[0]
+    corrector = Unwrap(white=3000.0).start()
+    with threads(1):
+        one = corrector.apply(frame)
+    with threads(3):
+        three = corrector.apply(frame)
+    assert isinstance(one, RangeFrame)
+    assert isinstance(three, RangeFrame)
+    np.testing.assert_array_equal(one.depth, three.depth)
+
+
+def test_messages_find_the_minimum_of_a_chain() -> None:
+    """On a chain belief propagation is exact: every state of 1 x 7 pixels is tried."""
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        n, labels = 7, 3
+        range_m = rng.uniform(0, PERIOD, (1, n)).astype(np.float32)
+        unary = rng.uniform(0, 2, (1, n, labels)).astype(np.float32)
+        valid = np.ones((1, n), bool)
+        messages = np.zeros((4, 1, n, labels), np.float32)
+        for step in range(2 * n):
+            pass_messages(range_m, valid, unary, PERIOD, 0.5, 3.0, 1.0, 0, 1, step % 2, messages)
+        found = np.argmin(unary + messages.sum(0), axis=2)[0]
+        states = np.stack(np.meshgrid(*[range(labels)] * n, indexing="ij"), -1).reshape(-1, n)
+        cost = unary[0, np.arange(n), states].sum(1)
+        along = range_m[0] + states * PERIOD
+        cost += np.minimum(np.abs(np.diff(along, axis=1)) / 0.5, 3.0).sum(1)
+        assert np.array_equal(found, states[np.argmin(cost)])
+    assert len(STEPS) == 4
+
+
+def test_dark_surfaces_alone_prove_nothing() -> None:
+    """A black board before a grey wall, both within the period, stays where it is."""
+    r = np.full((48, 64), 3.0, np.float32)
+    light = np.full((48, 64), 0.5 * 3000 / 9, np.float32)
+    r[15:30, 20:40], light[15:30, 20:40] = 2.0, 0.03 * 3000 / 4
+    assert not count_periods(r, light, PERIOD, 3000.0, 0.02).any()
+    assert not count_periods(r, light, PERIOD, 0.0, 0.02).any()
+
+
+def test_two_frequencies_agree_on_one_range() -> None:
+    rng = np.random.default_rng(8)
+    periods = [SPEED_OF_LIGHT / 2 / f for f in (80e6, 60e6)]  # 1.87 and 2.50 m meet at 7.5 m
+    true = rng.uniform(0.3, 7.0, (40, 50))
+    ranges = [np.mod(true + rng.normal(0, 0.01, true.shape), p).astype(np.float32) for p in periods]
+    ranges[0][3, 4] = 0
+    found, apart = combined(ranges, periods)
+    assert found[3, 4] == 0
+    known = found > 0
+    assert known.sum() >= known.size - 20  # phases of nearly zero count as invalid
+    assert np.abs(found - true)[known].max() < 0.05
+    assert apart[known].max() < 0.05
+    # The finer frequency counts for more: better than either alone, and than the coarse one.
+    assert np.std((found - true)[known]) < 0.01
+
+
+@pytest.fixture
+def two_frequencies(room_recording: Path, tmp_path: Path) -> Path:
+    """A recording whose depth is told only by two frequencies."""
+    folder = tmp_path / "two"
+    shutil.copytree(room_recording, folder)
+    recording = tofuse.open(room_recording)
+    for k in range(len(recording)):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        unit = recording.metadata["depth_unit_m"]
+        for hertz in (80_000_000, 60_000_000):
+            period = SPEED_OF_LIGHT / 2 / hertz
+            radial = np.mod(frame.radial_range, period)
+            depth = radial if frame.depth_kind == "range" else radial * frame.z / np.where(
+                frame.valid, frame.radial_range, 1
+            )  # fmt: skip
+            (folder / "frequencies" / str(hertz)).mkdir(parents=True, exist_ok=True)
+            path = folder / "frequencies" / str(hertz) / f"{k:06d}.png"
+            write_png(path, np.rint(depth / unit).astype(np.uint16))
+    (folder / "correction.npz").unlink(missing_ok=True)
+    return folder
+
+
+def test_native_recordings_of_several_frequencies(
+    room_recording: Path, two_frequencies: Path
+) -> None:
+    plain, combined_ = tofuse.open(room_recording), tofuse.open(two_frequencies)
+    a, b = plain[1], combined_[1]
+    assert isinstance(a, RangeFrame)
+    assert isinstance(b, RangeFrame)
+    both = a.valid & b.valid
+    assert both.sum() > 0.98 * a.valid.sum()
+    assert np.quantile(np.abs(a.depth - b.depth)[both], 0.999) < 0.003
+
+
+def test_frequencies_that_make_no_sense_are_refused(two_frequencies: Path) -> None:
+    folder = two_frequencies / "frequencies"
+    (folder / "80000000" / "000000.png").unlink()
+    with pytest.raises(InputError, match="frequencies/80000000"):
+        tofuse.open(two_frequencies)
+    shutil.rmtree(folder / "80000000")
+    with pytest.raises(InputError, match="holds one frequency"):
+        tofuse.open(two_frequencies)
+    (folder / "fast").mkdir()
+    with pytest.raises(InputError, match="isn't a frequency"):
+        tofuse.open(two_frequencies)
