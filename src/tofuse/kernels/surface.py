@@ -44,6 +44,20 @@ def halve(
     s = np.empty(4)
     for i in range(start, stop):
         for j in range(columns):
+            p, q = z[2 * i, 2 * j], z[2 * i, 2 * j + 1]
+            r, t = z[2 * i + 1, 2 * j], z[2 * i + 1, 2 * j + 1]
+            low = min(min(p, q), min(r, t))
+            if low > 0 and max(max(p, q), max(r, t)) - low <= jump * low:  # as nearly everywhere
+                u, v = 2 * i, 2 * j
+                z_out[i, j] = 4 / (1.0 / p + 1.0 / q + 1.0 / r + 1.0 / t)
+                value_out[i, j] = 0.25 * (
+                    (value[u, v] + value[u, v + 1]) + (value[u + 1, v] + value[u + 1, v + 1])
+                )
+                variance_out[i, j] = 0.0625 * (
+                    (variance[u, v] + variance[u, v + 1])
+                    + (variance[u + 1, v] + variance[u + 1, v + 1])
+                )
+                continue
             n = 0
             for k in range(4):
                 x = z[2 * i + (k >> 1), 2 * j + (k & 1)]
