@@ -3,7 +3,9 @@ from __future__ import annotations
 import os
 import shutil
 import threading
+import time
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -214,7 +216,7 @@ def counting(count: int, *bad: int) -> tuple[Counting, Recording]:
 
 
 def reader_threads() -> list[threading.Thread]:
-    return [t for t in threading.enumerate() if t.name == "tofuse-reader"]
+    return [t for t in threading.enumerate() if t.name.startswith("tofuse-reader")]
 
 
 def test_frames_come_in_order_with_errors_in_place() -> None:
@@ -270,3 +272,20 @@ def test_opening_leaves_the_recording_untouched(tmp_path: Path) -> None:
     list(open_recording(folder))
     files = sorted(p.relative_to(folder) for p in folder.rglob("*"))
     assert files == sorted(p.relative_to(copy) for p in copy.rglob("*"))
+
+
+def test_two_readers_keep_the_order() -> None:
+    class Uneven(Counting):
+        concurrent = True
+        names: ClassVar[set[str]] = set()
+
+        def read(self, index: int) -> Frame:
+            self.names.add(threading.current_thread().name)
+            time.sleep(0.003 if index % 2 == 0 else 0.0)
+            return super().read(index)
+
+    source = Uneven([CloudFrame.of(np.ones((3, 3)), index=k) for k in range(40)])
+    items = list(Recording.of(source, "memory", "array").read_all())
+    assert [item.index for item in items if isinstance(item, CloudFrame)] == list(range(40))
+    assert len(source.names) == 2
+    assert reader_threads() == []

@@ -44,6 +44,8 @@ class DepthImageSource(FileSource):
         If the camera disagrees with the size of the images.
     """
 
+    concurrent = True
+
     def __init__(
         self,
         files: Sequence[Path],

@@ -41,8 +41,8 @@ from tofuse.recordings.frames import (
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
 from tofuse.sensor.correction import DepthCorrection
-from tofuse.sensor.models import SPEED_OF_LIGHT
 from tofuse.sensor.frequencies import DISAGREEMENT, combined
+from tofuse.sensor.models import SPEED_OF_LIGHT
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -73,6 +73,8 @@ class NativeSource(FileSource):
     InputError
         Naming file and field, if the folder isn't complete and consistent.
     """
+
+    concurrent = True
 
     def __init__(self, folder: Path, camera_file: Path | None = None) -> None:
         self.folder = folder

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -177,43 +178,27 @@ class Recording:
     def read_all(self, ahead: int = 8, *, first: int = 0) -> Iterator[Frame | UnreadableFrameError]:
         """Iterate over the frames from the `first`, with the error in place of unreadable ones.
 
-        Reads up to `ahead` frames in advance on another thread.
+        Reads up to `ahead` frames in advance: on two other threads where the source allows it,
+        else on one.
         """
-        out: queue.Queue[Frame | BaseException | None] = queue.Queue(max(1, ahead))
-        stop = threading.Event()
 
-        def put(item: Frame | BaseException | None) -> bool:
-            while not stop.is_set():
-                try:
-                    out.put(item, timeout=0.1)
-                    return True
-                except queue.Full:
-                    continue
-            return False
-
-        def work() -> None:
+        def read(index: int) -> Frame | UnreadableFrameError:
             try:
-                for index in self.indices[first:]:
-                    try:
-                        item: Frame | BaseException = self.source.read(int(index))
-                    except UnreadableFrameError as error:
-                        item = error
-                    if not put(item):
-                        return
-                put(None)
-            except BaseException as error:
-                put(error)
+                return self.source.read(index)
+            except UnreadableFrameError as error:
+                return error
 
-        thread = threading.Thread(target=work, name="tofuse-reader", daemon=True)
-        thread.start()
+        workers = 2 if getattr(self.source, "concurrent", False) else 1
+        pool = ThreadPoolExecutor(workers, thread_name_prefix="tofuse-reader")
+        indices = iter(self.indices[first:].tolist())
+        waiting = deque(pool.submit(read, k) for k in islice(indices, max(1, ahead)))
         try:
-            while (item := out.get()) is not None:
-                if isinstance(item, BaseException) and not isinstance(item, UnreadableFrameError):
-                    raise item
+            while waiting:
+                item = waiting.popleft().result()
+                waiting.extend(pool.submit(read, k) for k in islice(indices, 1))
                 yield item
         finally:
-            stop.set()
-            thread.join()
+            pool.shutdown(cancel_futures=True)
 
 
 def evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:

@@ -26,7 +26,15 @@ FARTHEST_M = 1e9  # beyond it, a coordinate is damage
 
 
 class FileSource(ABC):
-    """A source whose frames are files; any trouble with one of them is that frame's alone."""
+    """A source whose frames are files; any trouble with one of them is that frame's alone.
+
+    Attributes
+    ----------
+    concurrent
+        Whether frames can be read by several threads at once: `load` changes nothing.
+    """
+
+    concurrent = False
 
     def __init__(self, timestamps: Float64) -> None:
         self.timestamps = timestamps
@@ -153,6 +161,7 @@ class JoinedSource:
 
     def __init__(self, parts: Sequence[Source], names: Sequence[str]) -> None:
         self.parts = list(parts)
+        self.concurrent = all(getattr(p, "concurrent", False) for p in self.parts)
         counts = [len(p.timestamps) for p in self.parts]
         self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
         self.warnings = _joined_warnings(self.parts, names)
@@ -219,6 +228,7 @@ class LimitedSource:
 
     def __init__(self, source: Source, nearest: float, farthest: float) -> None:
         self.source, self.nearest, self.farthest = source, nearest, farthest
+        self.concurrent = getattr(source, "concurrent", False)
         self.timestamps = source.timestamps
         self.reference = source.reference
         self.odometry = source.odometry

@@ -1,0 +1,146 @@
+"""Readers: damage of every kind, and how fast depth images are decoded.
+
+    python benchmarks/readers.py [--mutations 10000] [--frames 400]
+
+Makes a small recording of each format as the tests do, damages it (cut off, flipped bits, swapped
+files, numbers changed, files gone or replaced by folders), and reads it through. Whatever comes out
+other than frames or the package's own errors on one line, or takes more than 20 s, is printed and
+makes the exit status 1. Then decodes 640 x 480 depth images with reading ahead, and prints frames a
+second. The peak memory of the whole process is printed at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+import test_recordings_fuzz as folders  # noqa: E402
+import test_recordings_fuzz_cameras as cameras  # noqa: E402
+from tofuse.errors import TofuseError  # noqa: E402
+from tofuse.geometry.cameras import Pinhole  # noqa: E402
+from tofuse.recordings.frames import RangeFrame  # noqa: E402
+from tofuse.recordings.native import RecordingWriter  # noqa: E402
+from tofuse.recordings.open import open_recording  # noqa: E402
+
+LIMIT_S = 20
+
+
+def makers() -> dict[str, tuple[Callable[[Path], None], str | None]]:
+    found: dict[str, tuple[Callable[[Path], None], str | None]] = {
+        name: (make, None) for name, make in folders.MAKERS.items()
+    }
+    found |= {name: (make, file) for name, (make, file, _) in cameras.MAKERS.items()}
+    return found
+
+
+class TooSlowError(Exception):
+    pass
+
+
+def alarm(number: int, frame: object) -> None:
+    raise TooSlowError
+
+
+def read_through(path: Path) -> tuple[int, int]:
+    """Frames read, and errors of our own; anything else is raised."""
+    whole = told = 0
+    try:
+        for item in open_recording(path).read_all():
+            if isinstance(item, TofuseError):
+                told += 1
+                assert len(str(item).splitlines()) == 1
+            else:
+                assert np.isfinite(item.points).all()
+                whole += 1
+    except TofuseError as error:
+        told += 1
+        if len(str(error).splitlines()) != 1:
+            raise ValueError("more than one line") from error
+    return whole, told
+
+
+def fuzz(total: int, work: Path) -> int:
+    signal.signal(signal.SIGALRM, alarm)
+    known = makers()
+    bad = 0
+    print(f"{'format':14s} {'mutations':>9s} {'frames':>8s} {'errors':>8s} {'failures':>8s}")
+    for number, (name, (make, file)) in enumerate(known.items()):
+        original = work / name / "freiburg1"
+        original.parent.mkdir(parents=True)
+        make(original / (file or "."))
+        count = total // len(known) + (number < total % len(known))
+        frames = errors = failures = 0
+        for k in range(count):
+            rng = np.random.default_rng([200, number, k])
+            copy = work / "copy" / "freiburg1"
+            shutil.copytree(original, copy)
+            for _ in range(1 + int(rng.integers(3))):
+                if files := sorted(p for p in copy.rglob("*") if p.is_file()):
+                    folders.damage(files, rng)
+            signal.alarm(LIMIT_S)
+            try:
+                whole, told = read_through(copy / (file or "."))
+                frames, errors = frames + whole, errors + told
+            except BaseException:
+                failures += 1
+                print(f"{name}, mutation {k}:", file=sys.stderr)
+                traceback.print_exc()
+            finally:
+                signal.alarm(0)
+            shutil.rmtree(work / "copy")
+        bad += failures
+        print(f"{name:14s} {count:9d} {frames:8d} {errors:8d} {failures:8d}", flush=True)
+    return bad
+
+
+def decode(frames: int, work: Path) -> None:
+    """Print how many 640 x 480 depth images a second are read, warm, with reading ahead."""
+    camera = Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)
+    folder = work / "vga"
+    writer = RecordingWriter(folder, camera)
+    rng = np.random.default_rng(1)
+    slope = np.linspace(0.8, 3.0, 640, dtype=np.float32) * np.ones((480, 1), np.float32)
+    for k in range(20):
+        noise = rng.normal(0, 0.003, slope.shape).astype(np.float32)
+        writer.add(RangeFrame(k, k / 30, camera, slope + noise))
+    writer.finish()
+    for path in sorted((folder / "depth").iterdir()):
+        for k in range(1, frames // 20):
+            shutil.copyfile(path, folder / "depth" / f"{int(path.stem) + 20 * k:06d}.png")
+    (folder / "timestamps.txt").unlink()
+    rates = []
+    for _ in range(3):
+        start = time.perf_counter()
+        count = sum(1 for _ in open_recording(folder))
+        rates.append(count / (time.perf_counter() - start))
+    print(f"640 x 480 depth images: {np.median(rates):.0f} a second (median of 3 runs)")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mutations", type=int, default=10_000)
+    parser.add_argument("--frames", type=int, default=400)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        bad = fuzz(given.mutations, work) if given.mutations else 0
+        decode(given.frames, work)
+    print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
