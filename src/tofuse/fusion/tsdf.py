@@ -34,7 +34,7 @@ _CHUNKS = 16
 # Nearer cuts would take off more of the noise on one side of a surface than on the other.
 _REACH_SIGMAS = 3.0
 _LARGEST_REACH = 8.0  # voxels: the noise of a bad sensor is no reason to fill space
-_KNOWN = 2.5  # voxels: the largest standard deviation of a surface
+_KNOWN = 1.5  # voxels: the largest standard deviation of a surface
 # How much larger voxels get when there are too many.
 _COARSER = 1.25
 
@@ -111,7 +111,7 @@ class Volume:
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.uint16),
             np.zeros((blocks, VOXELS, channels), np.float32),
-            np.zeros(blocks, np.float32),
+            np.zeros((blocks, 8), np.float32),
         )
 
     def add(self, view: RangeView, T_world_camera: Float64) -> None:

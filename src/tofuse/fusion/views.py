@@ -76,9 +76,10 @@ class RangeView:
     ) -> RangeView:
         """Keep what of `frame` is valid; `surface` is the same image before filters, if there is.
 
-        A pixel's weight is the squared cosine of the incidence over the variance of its depth. It
-        is 0 next to jumps in depth, where light of both sides mixes. Its depth is drawn towards
-        the plane fitted around it, the more the noisier it is.
+        A pixel's weight is one over the variance of the distance from its plane: that of its depth
+        times the squared cosine of the incidence. It is 0 next to jumps in depth, where light of
+        both sides mixes. Its depth is drawn towards the plane fitted around it, the more the
+        noisier it is.
         """
         options = options or SurfaceOptions()
         if surface is None:
@@ -97,7 +98,7 @@ class RangeView:
         normals = np.where(fitted[..., None], normals, straight)
         good = (z > 0) & (surface.sigma > 0) & (cosine > _LEAST_COSINE)
         good &= ~_near_jumps(surface, options)
-        weight = np.divide(cosine * cosine, variance, out=np.zeros_like(z), where=good)
+        weight = np.divide(1, cosine * cosine * variance, out=np.zeros_like(z), where=good)
         weight[~fitted] *= np.float32(_UNFITTED)
         farthest = float(z.max(initial=0.0))
         unit = max(farthest, 1e-3) / 65535

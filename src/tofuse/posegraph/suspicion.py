@@ -39,6 +39,9 @@ _VAGUE = 0.25
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
 # The way to what fits may be long.
 _ROUNDS = (Round(4, 0.02, 0.1), Round(4, 0.005, 0.03), Round(6, 0.0, 0.0))
+# Errors that all views share are known from so many pairs; where there are many more, half of them
+# and a third of the points take part.
+_ENOUGH_PAIRS = 500
 
 
 @dataclass(frozen=True)
@@ -111,13 +114,17 @@ def suspicion(
     errors: dict[str, float] = {}
     sigmas: dict[str, float] = {}
     best: Refined | None = None
+    some, few = replace(options, rounds=_ROUNDS), list(views)
+    if len(pairs) > 2 * _ENOUGH_PAIRS:
+        some = replace(some, neighbours=-(-options.neighbours // 2))
+        few = [KeptView(v.surface, np.ascontiguousarray(v.points[::3])) for v in views]
     for name in _NUMBERS:
         if sigma[_NUMBERS[name]] > _VAGUE * TOLERANCES[name]:
             continue
         found = refine(
-            views,
+            few,
             poses,
-            replace(options, rounds=_ROUNDS),
+            some,
             calibrate=[_NUMBERS[name]],
             beside=beside,
         )
