@@ -116,6 +116,8 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "outside",
         "refinement",
         "filters",
+        "findings",
+        "warnings",
     }
     assert data["schema"] == 1
     assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}

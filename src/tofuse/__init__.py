@@ -17,6 +17,7 @@ from tofuse._version import __version__
 
 if TYPE_CHECKING:
     from tofuse.errors import InputError, OutputError, RegistrationError, TofuseError
+    from tofuse.inspection.inspect import inspect_recording as inspect
     from tofuse.live.player import Player
     from tofuse.pipeline.config import Config
     from tofuse.pipeline.mapper import Mapper
@@ -39,6 +40,7 @@ _HOMES = {
     "Recording": "tofuse.recordings.recording",
     "RegistrationError": "tofuse.errors",
     "TofuseError": "tofuse.errors",
+    "inspect": "tofuse.inspection.inspect",
     "open": "tofuse.recordings.open",
     "reconstruct": "tofuse.pipeline.reconstruct",
     "register": "tofuse.registration.register",
@@ -57,6 +59,7 @@ __all__ = [
     "RegistrationError",
     "TofuseError",
     "__version__",
+    "inspect",
     "open",
     "reconstruct",
     "register",
@@ -66,7 +69,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'tofuse' has no attribute {name!r}")
-    attribute = "open_recording" if name == "open" else name
+    attribute = f"{name}_recording" if name in ("inspect", "open") else name
     value = getattr(importlib.import_module(_HOMES[name]), attribute)
     globals()[name] = value
     return value

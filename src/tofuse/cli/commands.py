@@ -16,6 +16,7 @@ from rich.table import Table
 from tofuse.cli.progress import emit, progress_for
 from tofuse.results.types import Reconstruction
 
+_SEVERITIES = {"severe": "red", "warning": "yellow", "note": "cyan"}
 _COLORS = {"good": "green", "degraded": "yellow", "failed": "red"}
 
 
@@ -146,7 +147,9 @@ def inspect(arguments: argparse.Namespace) -> int:
         camera=arguments.camera,
         topic=arguments.topic,
     )
-    found = inspect_recording(recording)
+    found = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
+    if arguments.sheet is not None:
+        found.save_sheet(arguments.sheet)
     if arguments.json:
         emit(found.to_dict())
         return 0
@@ -154,8 +157,16 @@ def inspect(arguments: argparse.Namespace) -> int:
     width = max(map(len, found.facts))
     for name, value in found.facts.items():
         console.print(f"[bold]{name:<{width}}[/]  {_escape(value)}")
-    for warning in found.warnings:
-        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    for note in found.notes:
+        console.print(f"[yellow]warning:[/] {_escape(note)}")
+    for finding in found.findings:
+        color = _SEVERITIES[finding.severity]
+        console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {_escape(finding.text)}")
+        console.print(f"  {_escape(finding.remedy)}")
+    if not found.findings:
+        console.print("[green]no check found anything wrong[/]")
+    if arguments.sheet is not None:
+        console.print(f"see {_escape(str(arguments.sheet))}")
     return 0
 
 

@@ -175,6 +175,9 @@ def _inspect(commands: Any) -> None:
     p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
     p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
+    p.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet of the frames")
+    p.add_argument("--object", action="store_true", help="an object turns before a still camera")
+    p.add_argument("--quick", action="store_true", help="only what a run does at its start")
     p.add_argument("--json", action="store_true", help="as JSON")
 
 

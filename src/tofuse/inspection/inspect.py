@@ -1,139 +1,130 @@
-"""What a recording is: the facts that decide whether a reconstruction can work."""
+"""What a recording is, and what is wrong with it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
-from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.errors import InputError
+from tofuse.inspection import channels, facts, focal, geometry, moving, times, values
+from tofuse.inspection.finding import SEVERITIES, Finding
+from tofuse.inspection.sample import Sample
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 
-_SAMPLE = 9
+# Pairs of neighbours that are read, by `inspect` and at the start of a run.
+PAIRS, QUICK_PAIRS = 8, 4
 
-# Depths of indoor ToF recordings; outside them the unit is probably wrong.
-_NEAR_M, _FAR_M = 0.1, 20.0
-_FEW_VALID = 0.1
+Check = Callable[[Sample], Iterable[Finding]]
+
+# In the order in which they are told, within one severity.
+QUICK: tuple[Check, ...] = (
+    values.check_unit,
+    values.check_valid,
+    geometry.check_intrinsics,
+    geometry.check_kind,
+    geometry.check_lens,
+    channels.check_mirrored,
+    channels.check_color,
+    times.check_times,
+    times.check_repeats,
+    values.check_wrap,
+    values.check_saturation,
+    values.check_flying,
+    moving.check_motion,
+    moving.check_moving_objects,
+    moving.check_still,
+    moving.check_walls,
+)
+CHECKS: tuple[Check, ...] = (*QUICK, focal.check_focal)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Inspection:
-    """Facts by name, for people, and warnings, one line each."""
+    """What a recording is, and what is wrong with it.
+
+    Attributes
+    ----------
+    facts
+        By name, for people.
+    findings
+        The gravest first.
+    notes
+        What reading it told, one line each.
+    frames
+        Those that were looked at.
+    """
 
     facts: dict[str, str]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    frames: tuple[Frame, ...] = ()
+
+    @property
+    def severe(self) -> bool:
+        """Whether a model of it would be spoilt."""
+        return any(f.severity == "severe" for f in self.findings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Notes and findings, one line each."""
+        return (*self.notes, *(str(f) for f in self.findings))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data."""
-        return {"facts": self.facts, "warnings": list(self.warnings)}
+        return {
+            "facts": self.facts,
+            "findings": [f.to_dict() for f in self.findings],
+            "warnings": list(self.warnings),
+        }
+
+    def save_sheet(self, path: str | Path) -> Path:
+        """Write a contact sheet of some of the frames as a PNG.
+
+        Raises
+        ------
+        OutputError
+            If it can't be written.
+        """
+        from tofuse.inspection.sheet import write_sheet
+
+        return write_sheet(self, Path(path))
 
 
-def inspect_recording(recording: Recording) -> Inspection:
-    """Look at up to nine evenly spaced frames of a recording.
+def inspect_recording(
+    recording: Recording | str | Path, *, turning: bool = False, quick: bool = False
+) -> Inspection:
+    """Say what a recording is and what is wrong with it.
+
+    Parameters
+    ----------
+    recording
+        What `tofuse.open` gives, or the path of one.
+    turning
+        Whether an object turns before a still camera: then nothing is said of motion.
+    quick
+        Read fewer frames and leave out what takes longer than a moment: what a run does.
 
     Raises
     ------
     InputError
-        If none of them can be read.
+        If it can't be opened, or no frame of it can be read.
     """
-    sample = recording.sample(_SAMPLE)
-    frames = [item for item in sample if not isinstance(item, UnreadableFrameError)]
-    warnings = list(recording.warnings)
-    warnings += [str(item) for item in sample if isinstance(item, UnreadableFrameError)]
-    if not frames:
-        raise InputError("no frame can be read", where=recording.path, remedy=warnings[-1])
-    facts = {
-        "recording": recording.path,
-        "format": recording.format,
-        "frames": str(len(recording)),
-        "time": _time(recording.timestamps),
-        **_view_facts(frames[0]),
-        **_depth_facts(frames),
-        "reference poses": _share(recording.reference),
-        "odometry": _share(recording.odometry),
-    }
-    facts |= {
-        name: str(value)
-        for name, value in recording.metadata.items()
-        if isinstance(value, str | int | float)
-    }
-    return Inspection(facts, tuple(warnings + _depth_warnings(frames)))
-
-
-def _time(times: NDArray[np.float64]) -> str:
-    if len(times) < 2:
-        return "a single moment"
-    step = float(np.median(np.diff(times)))
-    rate = f", {1 / step:.1f} frames a second" if step > 0 else ""
-    return f"{times[-1] - times[0]:.2f} s{rate}"
-
-
-def _view_facts(frame: Frame) -> dict[str, str]:
-    if not isinstance(frame, RangeFrame):
-        return {"views": f"clouds of about {len(frame)} points"}
-    rays = frame.camera.rays()
-    x, y = (
-        np.degrees(np.arctan(rays[rays.shape[0] // 2, :, 0])),
-        np.degrees(np.arctan(rays[:, rays.shape[1] // 2, 1])),
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording)
+    sample = Sample.of(recording, QUICK_PAIRS if quick else PAIRS, turning=turning)
+    notes = [*recording.warnings, *(str(error) for error in sample.unreadable)]
+    if not sample.frames:
+        raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
+    # BLAS sums differ with its number of threads; ours don't.
+    with threadpool_limits(1):
+        findings = [f for check in (QUICK if quick else CHECKS) for f in check(sample)]
+    findings.sort(key=lambda f: SEVERITIES.index(f.severity))
+    return Inspection(
+        facts.facts_of(recording, sample.frames), tuple(findings), tuple(notes), sample.frames
     )
-    wide, high = np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)
-    model = getattr(frame.camera, "model", type(frame.camera).__name__)
-    also = [
-        name
-        for name, image in (
-            ("amplitude", frame.amplitude_image),
-            ("confidence", frame.confidence_image),
-            ("colour", frame.color_image),
-        )
-        if image is not None
-    ]
-    return {
-        "images": f"{frame.camera.width} x {frame.camera.height}, {wide:.0f} x {high:.0f} degrees, "
-        f"{model} camera",
-        "depth is": "z" if frame.depth_kind == "z" else "radial range",
-        "with": ", ".join(also) or "nothing but depth",
-    }
-
-
-def _depths(frame: Frame) -> NDArray[np.float32]:
-    if isinstance(frame, RangeFrame):
-        return frame.depth[frame.valid]
-    return np.linalg.norm(frame.points - frame.origin.astype(np.float32), axis=1)
-
-
-def _depth_facts(frames: list[Frame]) -> dict[str, str]:
-    depths = np.concatenate([_depths(f) for f in frames])
-    valid = np.mean([len(f) / max(f.valid.size, 1) for f in frames])
-    if len(depths) == 0:
-        return {"depth": "no valid point in the frames looked at"}
-    low, middle, high = np.percentile(depths, [1, 50, 99])
-    return {
-        "depth": f"{low:.2f} to {high:.2f} m, median {middle:.2f} m",
-        "valid points": f"{valid:.0%}",
-    }
-
-
-def _depth_warnings(frames: list[Frame]) -> list[str]:
-    depths = np.concatenate([_depths(f) for f in frames])
-    if len(depths) == 0:
-        return ["no valid point in the frames looked at: is the depth unit right?"]
-    out = []
-    middle = float(np.median(depths))
-    if not _NEAR_M <= middle <= _FAR_M:
-        out.append(
-            f"the median depth is {middle:.3g} m, which a ToF camera hardly measures: "
-            "check depth_unit_m"
-        )
-    valid = float(np.mean([len(f) / max(f.valid.size, 1) for f in frames]))
-    if valid < _FEW_VALID:
-        out.append(f"only {valid:.1%} of the pixels are valid")
-    return out
-
-
-def _share(poses: NDArray[np.float64] | None) -> str:
-    if poses is None:
-        return "none"
-    return f"for {int(np.isfinite(poses[:, 0, 0]).sum())} frames"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +11,8 @@ import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
+from tofuse.inspection.finding import Finding
+from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
@@ -31,7 +33,8 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import average_still
 from tofuse.results.output import OutputFolder, is_result, plain, read_run_json, write_result
-from tofuse.results.types import Reconstruction
+from tofuse.results.types import Reason, Reconstruction
+from tofuse.results.verdict import verdict_of
 
 _THUMBNAILS = 12
 _TEXTURE = 2048  # texels, where no size is given
@@ -86,7 +89,9 @@ def run(
     loops = (
         read_loops(options.loops, frozenset(recording.indices.tolist())) if options.loops else ()
     )
-    for warning in recording.warnings:
+    # At the start: what is wrong with a recording is told before hours of work.
+    findings = _findings(recording, turning=options.object)
+    for warning in (*recording.warnings, *(str(f) for f in findings)):
         progress.note(warning)
     kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
     folder = OutputFolder(options.out, overwrite=options.overwrite or bool(kept.fresh))
@@ -105,6 +110,7 @@ def run(
         texture = paint(recording, result, size, options.threads, progress) if size else None
         if size and texture is None:
             progress.note("no texture: there is no surface, or neither colour nor amplitude")
+        result = with_findings(result, findings)
         progress.stage("writing")
         write_result(result, folder, lambda r, f: _report(recording, config, r, f), texture)
     except BaseException as error:
@@ -136,6 +142,34 @@ def _key(
     beside = (options.camera, options.loops)
     files = [Path(path) for path in (*inputs, *beside) if path is not None]
     return digest(facts, files, without=options.out)
+
+
+def _findings(recording: Recording, *, turning: bool) -> tuple[Finding, ...]:
+    """What a quick look finds; nothing, if the frames that it looks at can't be read."""
+    try:
+        return inspect_recording(recording, turning=turning, quick=True).findings
+    except InputError:
+        return ()
+
+
+def with_findings(result: Reconstruction, findings: Sequence[Finding]) -> Reconstruction:
+    """Return the result with what a look at the recording found, which may change the verdict."""
+    indices = [f.index for f in result.diagnostics.frames]
+    everything = (indices[0], indices[-1])
+    told = [
+        Reason("faulty_recording", everything, f"{f.text} {f.remedy}")
+        for f in findings
+        if f.severity == "severe"
+    ]
+    reasons = (*result.diagnostics.reasons, *told)
+    verdict = verdict_of(reasons)
+    recording = {
+        **result.recording,
+        "warnings": [*result.recording["warnings"], *(str(f) for f in findings)],
+        "findings": [f.to_dict() for f in findings],
+    }
+    diagnostics = replace(result.diagnostics, verdict=verdict, reasons=reasons)
+    return replace(result, recording=recording, diagnostics=diagnostics)
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:

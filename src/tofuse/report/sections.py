@@ -111,7 +111,7 @@ def _timings(s: Subject) -> Values:
 
 def _settings(s: Subject) -> Values:
     result = s.result
-    recording = {k: v for k, v in result.recording.items() if k != "warnings"}
+    recording = {k: v for k, v in result.recording.items() if k not in ("warnings", "findings")}
     source = {"version": __version__, **recording, "seed": result.seed, "threads": result.threads}
     return {
         "warnings": [str(w) for w in result.recording.get("warnings", ())],

@@ -311,6 +311,8 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "schema": 1,
             "version": __version__,
             "input": {key: result.recording[key] for key in ("path", "format", "frames")},
+            "warnings": result.recording.get("warnings", []),
+            "findings": result.recording.get("findings", []),
             "seed": result.seed,
             "threads": result.threads,
             "config": result.config,

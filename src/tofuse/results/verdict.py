@@ -14,6 +14,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "lost_frames": ("degraded", "Some readable frames have no pose."),
     "images_differ": ("degraded", "Images that overlap do not agree as well as neighbours do."),
     "jumped": ("degraded", "A frame was found far from where the motion led."),
+    "faulty_recording": ("degraded", "The recording itself is wrong, by what its frames show."),
     "unobserved_motion": ("degraded", "Often the data did not hold the camera in every direction."),
     "repeated_images": ("degraded", "Images were repeated, to the last pixel."),
     "implausible_depth": ("degraded", "Depths are not such as this camera measures."),

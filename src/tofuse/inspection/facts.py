@@ -1,0 +1,103 @@
+"""What a recording is, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry.cameras import Pinhole, RayTable
+from tofuse.inspection.values import depths_of
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.recordings.noise import family_of
+from tofuse.recordings.recording import Recording
+
+
+def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
+    """Say in words what a recording is, by some of its frames."""
+    facts = {
+        "recording": recording.path,
+        "format": recording.format,
+        "frames": str(len(recording)),
+        "time": _time(recording.timestamps),
+        **_view_facts(recording, frames[0]),
+        **_depth_facts(frames),
+        "reference poses": _share(recording.reference),
+        "odometry": _share(recording.odometry),
+    }
+    facts |= {
+        name: str(value)
+        for name, value in recording.metadata.items()
+        if isinstance(value, str | int | float)
+    }
+    return facts
+
+
+def _time(times: NDArray[np.float64]) -> str:
+    if len(times) < 2:
+        return "a single moment"
+    step = float(np.median(np.diff(times)))
+    rate = f", {1 / step:.1f} frames a second" if step > 0 else ""
+    return f"{times[-1] - times[0]:.2f} s{rate}"
+
+
+def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
+    if not isinstance(frame, RangeFrame):
+        return {"views": f"clouds of about {len(frame)} points"}
+    rays = frame.camera.rays()
+    x, y = (
+        np.degrees(np.arctan(rays[rays.shape[0] // 2, :, 0])),
+        np.degrees(np.arctan(rays[:, rays.shape[1] // 2, 1])),
+    )
+    wide, high = np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)
+    model = getattr(frame.camera, "model", type(frame.camera).__name__)
+    also = [
+        name + ("" if name != "colour" or frame.color_registered else " (beside depth)")
+        for name, image in (
+            ("amplitude", frame.amplitude_image),
+            ("confidence", frame.confidence_image),
+            ("colour", frame.color_image),
+            ("noise", frame.sigma_image),
+        )
+        if image is not None
+    ]
+    family = family_of(recording, frame)
+    lens = frame.camera.fit if isinstance(frame.camera, RayTable) else frame.camera
+    out = {
+        "images": f"{frame.camera.width} x {frame.camera.height}, {wide:.0f} x {high:.0f} degrees, "
+        f"{model} camera",
+        "noise as of": family if family != "unknown" else "no camera that is known",
+    }
+    if isinstance(lens, Pinhole):
+        out["lens"] = f"f {lens.fx:.1f}, {lens.fy:.1f} pixels, centre {lens.cx:.1f}, {lens.cy:.1f}"
+    return out | {
+        "depth is": "z" if frame.depth_kind == "z" else "radial range",
+        "with": ", ".join(also) or "nothing but depth",
+    }
+
+
+def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:
+    depths = np.concatenate([depths_of(f) for f in frames])
+    valid = np.mean([len(f) / max(f.valid.size, 1) for f in frames])
+    if len(depths) == 0:
+        return {"depth": "no valid point in the frames looked at"}
+    low, middle, high = np.percentile(depths, [1, 50, 99])
+    extent = np.median([_extent(f) for f in frames if len(f)], axis=0)
+    return {
+        "depth": f"{low:.2f} to {high:.2f} m, median {middle:.2f} m",
+        "a view spans": " x ".join(f"{size:.2f}" for size in extent) + " m",
+        "valid points": f"{valid:.0%}",
+    }
+
+
+def _extent(frame: Frame) -> NDArray[np.float64]:
+    """Size (3,) in m of the box that holds nearly all points of a view."""
+    low, high = np.percentile(frame.points, [1, 99], axis=0)
+    return high - low
+
+
+def _share(poses: NDArray[np.float64] | None) -> str:
+    if poses is None:
+        return "none"
+    return f"for {int(np.isfinite(poses[:, 0, 0]).sum())} frames"

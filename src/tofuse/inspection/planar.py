@@ -1,0 +1,274 @@
+"""Do planes stay planes? How surfaces bend says how rays and depth are wrong.
+
+In inverse depth ``w = 1/z`` a plane is linear in the ray coordinates: ``w = a x + b y + c``.
+What was recorded as z but is radial range has ``w = L^-1 (a x + b y + c)``, with the length L of
+the ray (x, y, 1) (eq 2.3 of the thesis), and the reverse; rays that are off by a factor
+``q = 1 + t1 rho^2 + t2 rho^4`` (Brown 1966; rho is the distance from the axis in units of the
+image's corner) bend ``a x + b y`` but leave a wall seen head-on as it is. So the two can be told
+apart. All regions that might be planes are fitted at once, each with its own plane, all with the
+same three numbers, by Gauss-Newton with the planes eliminated:
+
+    kind:   w L^alpha        = a x q + b y q + c      (alpha, t1, t2)
+    range:  w L(x p) / L(x)  = a x p + b y p + c      (s, t1, t2), with p = s + q
+
+and "z" is the first with alpha = 0. The last is for radial range, whose z depends on the rays:
+there a wrong focal length bends planes too. z does not: a wrong focal length stretches the whole
+world, and planes stay planes. Along a corridor alpha and t1 are the same; then neither is known.
+
+How well the numbers are known comes from how the surfaces disagree (the sandwich estimator: White
+1980), which knows of all errors of a camera that noise does not explain, such as wiggling and
+rounded corners. What several frames see at the same place of the image is one surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from tofuse.maps.surface_map import SurfaceMap
+
+Float64 = NDArray[np.float64]
+Model = Literal["kind", "z", "range"]
+Int64 = NDArray[np.int64]
+
+# Neighbouring pixels belong to one surface if their normals differ by less than this, and their
+# planes put each other's depth within so many sigmas or this share of it.
+_SAME_TURN = np.cos(np.radians(10.0))
+_SAME_SIGMAS, _SAME_SHARE = 3.0, 0.01
+# Smaller pieces, as a share of the image, don't bend enough to see it.
+_LEAST_SHARE = 0.02
+_MOST_POINTS = 1500
+# Errors of neighbours are alike over patches of about so many pixels.
+_ALIKE = 25.0
+_ITERATIONS = 6
+# Regions of different frames are of one surface if they are this near in ray coordinates, and
+# turned alike.
+_SAME_PLACE, _SAME_PLACE_COSINE = 0.12, np.cos(np.radians(12.0))
+_ROBUST = 3.0
+# What is known of the three numbers beforehand: they are hardly larger than this.
+_PRIOR: dict[Model, Float64] = {
+    "kind": np.array([3.0, 0.15, 0.15]),
+    "z": np.array([1e-9, 0.15, 0.15]),
+    "range": np.array([0.7, 0.15, 0.15]),
+}
+_LONGEST_STEP = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A piece of a view that might be a plane.
+
+    Attributes
+    ----------
+    frame
+        Its position in the sample.
+    x, y, w, sigma
+        (N,) ray coordinates, inverse z in 1/m and its standard deviation.
+    share
+        Of the valid pixels of the view.
+    normal
+        (3,) mean unit normal away from the camera.
+    """
+
+    frame: int
+    x: Float64
+    y: Float64
+    w: Float64
+    sigma: Float64
+    share: float
+    normal: Float64
+
+    @property
+    def misfit(self) -> float:
+        """Robust deviation from a plane, as a share of the depth."""
+        B = np.stack([self.x, self.y, np.ones_like(self.x)], 1)
+        e = self.w - B @ np.linalg.lstsq(B, self.w, rcond=None)[0]
+        return _spread(e / self.w)
+
+
+def regions_of(view: SurfaceMap, frame: int) -> list[Region]:
+    """Smooth pieces of a view without edges or creases."""
+    planes = view.planes
+    w = planes[..., 3]
+    on = (w > 0) & (view.z > 0) & (view.sigma > 0) & np.isfinite(view.sigma)
+    on &= np.isfinite(view.normals).all(-1) & np.isfinite(view.rays).all(-1)
+    labels = _labels(view, on)
+    counts = np.bincount(labels[on]) if on.any() else np.zeros(0, int)
+    out = []
+    valid = max(int(np.count_nonzero(view.z > 0)), 1)
+    for label in np.flatnonzero(counts >= _LEAST_SHARE * on.size):
+        v, u = np.nonzero(on & (labels == label))
+        step = -(-len(v) // _MOST_POINTS)
+        v, u = v[::step], u[::step]
+        z = view.z[v, u].astype(float)
+        x, y = view.rays[v, u].astype(float).T
+        sigma = view.sigma[v, u].astype(float) / z**2
+        normal = view.normals[v, u].astype(float).mean(0)
+        normal /= np.linalg.norm(normal)
+        out.append(Region(frame, x, y, 1 / z, sigma, float(counts[label]) / valid, normal))
+    return out
+
+
+def _labels(view: SurfaceMap, on: NDArray[np.bool_]) -> Int64:
+    """(H, W) number of the piece that each pixel is of."""
+    rows, columns = on.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    normals, planes, rays = view.normals, view.planes, view.rays
+    tolerance = np.hypot(_SAME_SHARE, _SAME_SIGMAS * view.sigma / np.maximum(view.z, 1e-3))
+    starts, ends = [], []
+    for a, b in (
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+    ):
+        same = on[a] & on[b]
+        same &= (normals[a] * normals[b]).sum(-1) > _SAME_TURN
+        here = planes[b][..., :2] * rays[a]
+        there = here[..., 0] + here[..., 1] + planes[b][..., 2]
+        same &= np.abs(there - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
+        starts.append(number[a][same])
+        ends.append(number[b][same])
+    i, j = np.concatenate(starts), np.concatenate(ends)
+    graph = sparse.coo_matrix((np.ones(len(i), bool), (i, j)), shape=(number.size,) * 2)
+    return connected_components(graph, directed=False)[1].reshape(on.shape).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Bending:
+    """How the surfaces of a recording bend.
+
+    Attributes
+    ----------
+    values
+        (3,) the numbers of the module's text: alpha or s, then t1, t2.
+    covariance
+        (3, 3) of them.
+    surfaces
+        How many different ones took part.
+    rms_before, rms_after
+        Of the distances from the planes, as a share of z, before and after.
+    """
+
+    values: Float64
+    covariance: Float64
+    surfaces: int
+    rms_before: float
+    rms_after: float
+
+    @property
+    def first(self) -> tuple[float, float]:
+        """Alpha, or s, and its standard deviation."""
+        return float(self.values[0]), float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def stretch(self) -> tuple[float, float]:
+        """By what share the lens moves rays at the corner, and its standard deviation.
+
+        Of the model of the lens: beyond what the focal length does.
+        """
+        g = np.array([0.0, 1.0, 1.0])
+        return float(g @ self.values), float(np.sqrt(g @ self.covariance @ g))
+
+
+def bending(regions: Sequence[Region], radius: float, model: Model) -> Bending | None:
+    """Fit the three numbers; None where no region is large enough.
+
+    Parameters
+    ----------
+    radius
+        Largest distance of the camera's rays from the axis: the corner.
+    """
+    if not regions:
+        return None
+    prior = _PRIOR[model]
+    theta = np.zeros(3)
+    bounds = [np.inf] * len(regions)
+    H, scores = np.eye(3), np.zeros((len(regions), 3))
+    misfit: list[float] = []
+    for _ in range(_ITERATIONS):
+        H, g = np.diag(prior**-2.0), -theta / prior**2
+        squares = count = 0.0
+        for n, region in enumerate(regions):
+            e, G, weight, bounds[n] = _residuals(region, theta, radius, model, bounds[n])
+            H += G.T @ (G * weight[:, None])
+            scores[n] = -(G * weight[:, None]).T @ e
+            kept = weight > 0
+            squares += float(((e / region.w)[kept] ** 2).sum())
+            count += float(np.count_nonzero(kept))
+        g += scores.sum(0)
+        misfit.append(float(np.sqrt(squares / max(count, 1))))
+        step = np.linalg.solve(H, g)
+        theta = theta + step * min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+    inverse = np.linalg.inv(H)
+    group = _same_surface(regions)
+    n = int(group.max()) + 1
+    sums = np.zeros((n, 3))
+    np.add.at(sums, group, scores)
+    spread = inverse @ (sums.T @ sums) @ inverse * (n / max(n - 3, 0.5))
+    return Bending(theta, inverse + spread, n, misfit[0], misfit[-1])
+
+
+def _same_surface(regions: Sequence[Region]) -> Int64:
+    """(R,) number of the surface of each region: neighbours in the image across frames are one."""
+    out = np.zeros(len(regions), np.int64)
+    last: list[Region] = []
+    for n, region in enumerate(regions):
+        known = [
+            (float(np.hypot(region.x.mean() - r.x.mean(), region.y.mean() - r.y.mean())), k)
+            for k, r in enumerate(last)
+            if r.frame != region.frame and float(region.normal @ r.normal) > _SAME_PLACE_COSINE
+        ]
+        distance, k = min(known, default=(np.inf, 0))
+        if distance > _SAME_PLACE:
+            k = len(last)
+            last.append(region)
+        last[k] = region
+        out[n] = k
+    return out
+
+
+def _residuals(
+    region: Region, theta: Float64, radius: float, model: Model, bound: float
+) -> tuple[Float64, Float64, Float64, float]:
+    """Residuals (N,) from the plane, their Jacobian (N, 3), weights (N,), and the next bound."""
+    x, y = region.x, region.y
+    r2 = x * x + y * y
+    rho2 = r2 / radius**2
+    length = 0.5 * np.log1p(r2)
+    stretch = 1 + theta[1] * rho2 + theta[2] * rho2**2
+    if model != "range":
+        bent = region.w * np.exp(theta[0] * length)
+    else:
+        stretch = stretch + theta[0]
+        bent = region.w * np.sqrt((1 + r2 * stretch**2) / (1 + r2))
+    B = np.stack([x * stretch, y * stretch, np.ones_like(x)], 1)
+    base = 1 / region.sigma**2
+    weight = base
+    for _ in range(2 if np.isfinite(bound) else 5):
+        root = np.sqrt(weight)
+        plane = np.linalg.lstsq(B * root[:, None], bent * root, rcond=None)[0]
+        e = bent - B @ plane
+        reach = bound if np.isfinite(bound) else _ROBUST * _spread(e)
+        weight = base * np.maximum(1 - (e / reach) ** 2, 0) ** 2
+    slope = plane[0] * x + plane[1] * y
+    if model != "range":
+        first, by_stretch = bent * length, -slope
+    else:
+        by_stretch = bent * r2 * stretch / (1 + r2 * stretch**2) - slope
+        first = by_stretch
+    G = np.stack([first, by_stretch * rho2, by_stretch * rho2**2], 1)
+    # What a change of the plane would take up is none of the numbers' doing.
+    root = np.sqrt(weight)[:, None]
+    G = G - B @ np.linalg.lstsq(B * root, G * root, rcond=None)[0]
+    # Noise as seen: what is stated may be wrong by a factor. Pixels near each other err alike.
+    scale = max(_spread(e / region.sigma), 0.3)
+    return e, G, weight / (scale**2 * _ALIKE), _ROBUST * _spread(e)
+
+
+def _spread(e: Float64) -> float:
+    return max(1.4826 * float(np.median(np.abs(e))), 1e-9)

@@ -1,0 +1,145 @@
+"""The contact sheet: some frames of a recording on one picture, with what was found."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import OutputError
+from tofuse.inspection.values import fliers
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+
+if TYPE_CHECKING:
+    from tofuse.inspection.inspect import Inspection
+
+UInt8 = NDArray[np.uint8]
+
+_COLUMNS = 5
+# Rows of a mask: what a pixel is, and its colour.
+_MASK = (
+    ("valid", (225, 228, 232)),
+    ("no measurement", (60, 64, 70)),
+    ("saturated", (214, 69, 65)),
+    ("flying", (226, 40, 160)),
+    ("lowest confidence", (240, 190, 70)),
+)
+_LINES = 125
+
+
+def write_sheet(inspection: Inspection, path: Path) -> Path:
+    """Write the contact sheet of an inspection as a PNG.
+
+    Raises
+    ------
+    OutputError
+        If it can't be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    frames = [f for f in inspection.frames if len(f)]
+    frames = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, min(_COLUMNS, len(frames)))]
+    lines = _lines(inspection)
+    columns = max(len(frames), 2)
+    height = 0.135 * len(lines) + 0.45
+    pictures = 3 * 1.75
+    figure = Figure(figsize=(2.35 * columns, pictures + height), facecolor="white")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(
+        3, columns, left=0.01, right=0.90, top=1 - 0.3 / (pictures + height),
+        bottom=height / (pictures + height), wspace=0.04, hspace=0.16,
+    )  # fmt: skip
+    limits = _limits(frames)
+    for column, frame in enumerate(frames):
+        axes = [figure.add_subplot(grid[row, column]) for row in range(3)]
+        shown = _draw(axes, frame, limits)
+        axes[0].set_title(f"frame {frame.index}", fontsize=8)
+        if column == len(frames) - 1 and shown is not None:
+            place = axes[0].get_position()
+            bar = figure.add_axes((0.915, place.y0, 0.012, place.height))
+            figure.colorbar(shown, cax=bar)
+            bar.tick_params(labelsize=7)
+            bar.set_title("m", fontsize=8)
+    for row, (name, colour) in enumerate(_MASK):
+        figure.text(
+            0.912, (height + 0.25 * row) / (pictures + height), f"■ {name}", fontsize=6,
+            color=np.array(colour) / 255 * 0.75,
+        )  # fmt: skip
+    top = (height - 0.2) / (pictures + height)
+    figure.text(0.012, top, "\n".join(lines), fontsize=7.5, va="top", family="monospace")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110, metadata={"Software": None})
+    except OSError as error:
+        raise OutputError(
+            f"can't be written ({error.strerror or error})", where=path, remedy="give another name"
+        ) from error
+    return path
+
+
+def _lines(inspection: Inspection) -> list[str]:
+    facts = inspection.facts
+    shown = ("recording", "format", "frames", "time", "images", "depth is", "depth", "with")
+    out = [f"{name:<10} {facts[name]}"[:_LINES] for name in shown if name in facts]
+    out.append("")
+    for finding in inspection.findings:
+        text = f"{finding.severity}: {finding.code}: {finding.text}"
+        out += textwrap.wrap(text, _LINES, subsequent_indent="    ")
+    if not inspection.findings:
+        out.append("no check found anything wrong")
+    return [line.replace("$", r"\$") for line in out]
+
+
+def _limits(frames: list[Frame]) -> tuple[float, float]:
+    depths = [f.radial_range[f.valid] for f in frames if isinstance(f, RangeFrame)]
+    if not depths:
+        return 0.0, 1.0
+    low, high = np.percentile(np.concatenate(depths), [1, 99])
+    return float(low), float(max(high, low + 1e-3))
+
+
+def _draw(axes: list[Any], frame: Frame, limits: tuple[float, float]) -> Any:
+    """Draw range, light and mask of a frame; of a cloud, its view from above."""
+    for axis in axes:
+        axis.set_xticks([])
+        axis.set_yticks([])
+    if not isinstance(frame, RangeFrame):
+        points = frame.points[:: max(1, len(frame) // 20000)]
+        for axis, (a, b) in zip(axes, ((0, 1), (0, 2), (2, 1)), strict=True):
+            axis.scatter(points[:, a], points[:, b], s=0.2, c="#27496d", linewidths=0)
+            axis.set_aspect("equal")
+        return None
+    z = np.where(frame.valid, frame.radial_range, np.nan)
+    shown = axes[0].imshow(z, vmin=limits[0], vmax=limits[1], cmap="viridis")
+    axes[0].set_facecolor("#3c4046")
+    axes[1].imshow(_light(frame))
+    axes[2].imshow(_mask(frame))
+    return shown
+
+
+def _light(frame: RangeFrame) -> UInt8:
+    """Colour, or the logarithm of the amplitude, as an image (H, W, 3)."""
+    if frame.color_image is not None:
+        return frame.color_image
+    light = frame.amplitude_image
+    if light is None:
+        return np.full((*frame.depth.shape, 3), 128, np.uint8)
+    grey = np.log1p(np.minimum(light, SATURATED_AMPLITUDE))
+    lit = grey[(light > 0) & (light < SATURATED_AMPLITUDE)]
+    low, high = np.percentile(lit, [1, 99]) if len(lit) else (0.0, 1.0)
+    value = np.clip((grey - low) / max(high - low, 1e-6), 0, 1) * 255
+    return np.repeat(value.astype(np.uint8)[..., None], 3, -1)
+
+
+def _mask(frame: RangeFrame) -> UInt8:
+    kind = np.where(frame.valid, 0, 1)
+    if frame.confidence_image is not None:
+        kind[frame.valid & (frame.confidence_image == 0)] = 4
+    kind[fliers(frame)] = 3
+    if frame.amplitude_image is not None:
+        kind[frame.amplitude_image >= SATURATED_AMPLITUDE] = 2
+    return np.array([colour for _, colour in _MASK], np.uint8)[kind]
