@@ -249,6 +249,26 @@ def _interrupted() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
+def calibrate(arguments: argparse.Namespace) -> int:
+    """``tofuse calibrate``."""
+    from tofuse.calibration.camera_json import check_new
+    from tofuse.cli import calibrating
+
+    if arguments.out is not None:
+        check_new(arguments.out, overwrite=arguments.overwrite)
+    console = _Output(highlight=False, soft_wrap=True)
+    subjects = {"lens": calibrating.lens, "import": calibrating.import_lens}
+    data, lines, warnings = subjects[arguments.subject](arguments)
+    if arguments.json:
+        emit(data)
+        return 0
+    for line in lines:
+        console.print(_escape(line))
+    for warning in warnings:
+        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    return 0
+
+
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
     from tofuse.calibration.noise import estimate_noise

@@ -46,6 +46,7 @@ def make_parser() -> Parser:
     _inspect(commands)
     _convert(commands)
     _record(commands)
+    _calibrate(commands)
     _noise(commands)
     _evaluate(commands)
     _optimize(commands)
@@ -214,6 +215,46 @@ def _record(commands: Any) -> None:
         metavar="NAME=VALUE",
         help="an option of the camera, such as serial=1234; may be repeated",
     )
+
+
+def _calibrate(commands: Any) -> None:
+    p = _command(
+        commands,
+        "calibrate",
+        "estimate a camera's lens, or import one",
+        epilog="lens: from views of a checkerboard, writes a camera.json.\n"
+        "import: from a file of Bouguet's toolbox, CalLab, OpenCV or ROS, writes a camera.json.\n",
+    )
+    p.add_argument("subject", choices=("lens", "import"), help="what to do")
+    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings; import: one file")
+    p.add_argument("--out", type=Path, metavar="FILE", help="write the result")
+    p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    p.add_argument("--json", action="store_true", help="what was found, as JSON")
+    g = p.add_argument_group("lens")
+    g.add_argument(
+        "--board", metavar="CxR:M", help="inner corners and metres of a square, such as 8x6:0.1"
+    )
+    g.add_argument(
+        "--image",
+        choices=("amplitude", "color"),
+        default="amplitude",
+        help="where the board is looked for (amplitude)",
+    )
+    g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
+    g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    g.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
+    g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
+    g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
+    g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    g.add_argument(
+        "--model",
+        choices=("pinhole", "brown", "rational", "fisheye"),
+        default="brown",
+        help="kind of lens (brown)",
+    )
+    g = p.add_argument_group("import")
+    g.add_argument("--recording", metavar="REC", help="keep depth unit and kind of this recording")
+    g.add_argument("--index", type=_whole, metavar="N", help="which camera of a CalLab file")
 
 
 def _noise(commands: Any) -> None:

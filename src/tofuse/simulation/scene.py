@@ -298,6 +298,9 @@ SCENES: dict[str, SceneKind] = {
     "corner": SceneKind("three planes that meet, swaying in front of them", "plain", 60, 3),
     "hall": SceneKind("a hall of 8 x 8 m, larger than some cameras' period", "plain", 180, 6),
     "corridor": SceneKind("1.5 m forward along a corridor", "plain", 60, 3),
+    "checkerboard": SceneKind(
+        "a board of 8 x 6 corners, 100 mm, on a wall, from 32 places", "checkerboard", 2880, 90
+    ),
 }
 
 FRAME_RATE_HZ = 30.0

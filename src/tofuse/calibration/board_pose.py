@@ -1,0 +1,51 @@
+"""Where a checkerboard is, seen through a lens that is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.calibration.board import Board
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Camera
+
+Float64 = NDArray[np.float64]
+
+
+def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64, float] | None:
+    """Find T_camera_board (4, 4) of corners (N, 2) in pixels, and their rms distance in pixels.
+
+    By the homography of a plane (Collins and Bartoli 2014), refined by Levenberg-Marquardt. None
+    if corners lie where the lens shows nothing.
+    """
+    rays = cv2.remap(
+        np.asarray(camera.rays(), np.float32),
+        corners[:, 0].astype(np.float32),
+        corners[:, 1].astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).reshape(-1, 2)
+    if not np.isfinite(rays).all():
+        return None
+    points = board.points.astype(float)
+    seen = rays.astype(float)
+    try:
+        found, rvec, tvec = cv2.solvePnP(points, seen, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        if not found:
+            return None
+        rvec, tvec = cv2.solvePnPRefineLM(points, seen, np.eye(3), None, rvec, tvec)
+    except cv2.error:
+        return None
+    T = pose_of(rvec, tvec)
+    missed = camera.project(se3.transform(T, points)) - corners
+    rms = float(np.sqrt((missed**2).sum(1).mean()))
+    return (T, rms) if np.isfinite(rms) else None
+
+
+def pose_of(rvec: NDArray[np.generic], tvec: NDArray[np.generic]) -> Float64:
+    """(4, 4) motion of OpenCV's rotation vector and translation."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.asarray(rvec, float))[0]
+    T[:3, 3] = np.asarray(tvec, float).ravel()
+    return T

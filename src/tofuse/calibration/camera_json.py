@@ -1,0 +1,107 @@
+"""Writing a lens where readers look for it: a camera.json, with what else it says kept."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.errors import InputError, OutputError
+from tofuse.files.atomic import make_folder, replacing
+from tofuse.files.reading import is_file, is_folder
+from tofuse.geometry.cameras import Camera, RayTable
+from tofuse.recordings.camera_file import SCHEMA, camera_fields, read_json
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import Recording
+
+_LENS = ("schema", "model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+_KEPT = (
+    "depth_unit_m",
+    "depth_kind",
+    "frame_rate_hz",
+    "ambiguity_m",
+    "confidence_max",
+    "amplitude_kind",
+)
+
+
+def recording_fields(recording: Recording) -> dict[str, Any]:
+    """Return what a recording says of its images beside the lens, as fields of camera.json."""
+    own = Path(recording.path) / "camera.json"
+    if is_folder(Path(recording.path)) and is_file(own):
+        return {key: value for key, value in read_json(own).items() if key not in _LENS}
+    known = {key: recording.metadata.get(key) for key in _KEPT}
+    found = {key: value for key, value in known.items() if value is not None}
+    frame = next((f for f in recording.sample(3) if isinstance(f, RangeFrame)), None)
+    if frame is not None:
+        found.setdefault("depth_kind", frame.depth_kind)
+    return found
+
+
+def write_camera_json(
+    path: str | Path, camera: Camera, about: dict[str, Any], *, overwrite: bool = False
+) -> list[Path]:
+    """Write a camera.json, and rays.npy beside it for a table of rays.
+
+    Parameters
+    ----------
+    path
+        The file, which `--camera` or a native recording's folder takes.
+    camera
+        The lens.
+    about
+        Other fields; `depth_unit_m` is 0.001 and `depth_kind` "z" where they don't say.
+    overwrite
+        Whether files that are there are replaced.
+
+    Returns
+    -------
+    What was written.
+
+    Raises
+    ------
+    OutputError
+        If a file is there already, or a rays.npy beside it would override the lens.
+    InputError
+        If the lens is of no known model.
+    """
+    path = Path(path)
+    table = path.with_name("rays.npy")
+    files = [table, path] if isinstance(camera, RayTable) else [path]
+    if not overwrite and (there := [file for file in files if file.exists()]):
+        raise OutputError(
+            "is there already", where=there[0], remedy="give --overwrite to replace it"
+        )
+    if table.exists() and table not in files:
+        raise OutputError(
+            "would override the lens that is written beside it",
+            where=table,
+            remedy="move it away, or give --out in another folder",
+        )
+    fields = {"schema": SCHEMA} | camera_fields(camera)
+    content = fields | {"depth_unit_m": 0.001, "depth_kind": "z"} | about
+    make_folder(path.parent)
+    if isinstance(camera, RayTable):
+        with replacing(table) as part:
+            np.save(part, camera.rays(), allow_pickle=False)
+    with replacing(path) as part:
+        part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return files
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file that is there before anything is computed.
+
+    Raises
+    ------
+    OutputError
+        If it is there and may not be replaced.
+    InputError
+        If it is a folder.
+    """
+    if is_folder(path):
+        raise InputError("is a folder", where="--out", remedy="give a file, such as camera.json")
+    if path.exists() and not overwrite:
+        raise OutputError("is there already", where=path, remedy="give --overwrite to replace it")

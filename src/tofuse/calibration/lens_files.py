@@ -1,0 +1,367 @@
+"""Lenses from other programs' calibration files.
+
+All of these count pixels from 0 at the centre of the first one, as tofuse does: Bouguet's toolbox
+takes 1 off MATLAB's coordinates before it calibrates, OpenCV and ROS start there, and a CalLab file
+says which origin it has. A lens that none of the models here describes (skew, thin prism, tilted
+sensor) becomes a table of rays, exactly.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_bytes, read_text
+from tofuse.geometry.cameras import (
+    DISTORTION_ORDER,
+    BrownConrady,
+    Camera,
+    Fisheye,
+    Pinhole,
+    Rational,
+    RayTable,
+)
+from tofuse.recordings.camera_file import checked_lens
+
+Float64 = NDArray[np.float64]
+
+_LIMIT = 64 << 20
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
+# Over all of the image, skew moves a pixel by less than this: none.
+_NO_SKEW_PX = 0.005
+_MATLAB = ("fc", "cc", "alpha_c", "kc", "nx", "ny")
+_CALLAB = ("A", "k1", "k2", "k3", "p1", "p2", "width", "height")
+_ROS_MODELS = {
+    "plumb_bob": "brown",
+    "rational_polynomial": "rational",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class LensFile:
+    """What a calibration file says.
+
+    Attributes
+    ----------
+    camera
+        The lens.
+    format
+        "bouguet", "callab", "opencv" or "ros".
+    warnings
+        What a person should know, one line each.
+    """
+
+    camera: Camera
+    format: str
+    warnings: tuple[str, ...] = ()
+
+
+def read_lens_file(path: str | Path, index: int | None = None) -> LensFile:
+    """Read a lens from a calibration file, whose format is told by what is in it.
+
+    Parameters
+    ----------
+    path
+        Calib_Results.m or .mat of Bouguet's toolbox, a .cal of DLR CalLab, a .yml, .yaml, .xml or
+        .json of OpenCV, or a camera_info .yaml of ROS.
+    index
+        Which camera, where a CalLab file holds several.
+
+    Raises
+    ------
+    InputError
+        If it is none of these, or says something that can't be.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".mat":
+        return _bouguet(_mat_values(path), path)
+    text = read_text(path, limit=_LIMIT)
+    if re.search(r"^\s*camera\.(\d+\.)?A\s*=", text, re.MULTILINE):
+        return _callab(text, index, path)
+    if re.search(r"^\s*fc\s*=", text, re.MULTILINE):
+        return _bouguet(_m_values(text), path)
+    return _opencv(text, path)
+
+
+def _m_values(text: str) -> dict[str, list[float]]:
+    """Numbers that a MATLAB script assigns; nothing is run."""
+    plain = re.sub(r"%.*", "", text)
+    out = {}
+    for name in _MATLAB:
+        found = re.search(rf"^\s*{name}\s*=\s*(\[[^\]]*\]|{_NUMBER})", plain, re.MULTILINE)
+        if found:
+            out[name] = _numbers(found[1])
+    return out
+
+
+def _mat_values(path: Path) -> dict[str, list[float]]:
+    from scipy.io import loadmat
+
+    read_bytes(path, limit=_LIMIT)
+    try:
+        data = loadmat(str(path), variable_names=_MATLAB)
+        return {n: np.asarray(data[n], float).ravel().tolist() for n in _MATLAB if n in data}
+    except Exception as error:  # a parser of a binary format: anything may come out
+        raise InputError(
+            f"can't be read as a .mat file ({error})",
+            where=path,
+            remedy="save it by the toolbox again, with -v7 or older, or give Calib_Results.m",
+        ) from error
+
+
+def _bouguet(values: dict[str, list[float]], path: Path) -> LensFile:
+    for name, count in (("fc", 2), ("cc", 2), ("nx", 1), ("ny", 1)):
+        if len(values.get(name, [])) != count:
+            raise InputError(
+                f"gives no {name}", where=path, remedy="save the results of the toolbox again"
+            )
+    k = values.get("kc", [])
+    if len(k) > 5:
+        raise InputError(
+            f"has {len(k)} distortion coefficients",
+            where=f"{path}: kc",
+            remedy="give the results of a perspective lens, [k1 k2 p1 p2 k3]",
+        )
+    skew = (values.get("alpha_c") or [0.0])[0] * values["fc"][0]
+    size = _size(values["nx"][0], values["ny"][0], path)
+    camera, warnings = _lens("brown", [*values["fc"], *values["cc"]], skew, k, size, path)
+    return LensFile(camera, "bouguet", warnings)
+
+
+def _callab(text: str, index: int | None, path: Path) -> LensFile:
+    """Version 2, which explains itself in its comments."""
+    plain = re.sub(r"#.*", "", text)
+    pairs: dict[str, str] = {
+        key: value.strip() for key, value in re.findall(r"^\s*([\w.]+)\s*=(.*)$", plain, re.M)
+    }
+    if pairs.get("version") != "2":
+        raise InputError(
+            f"is version {pairs.get('version', 'unknown'):.20}",
+            where=path,
+            remedy="write it by a CalLab whose files say version=2",
+        )
+    origin = pairs.get("origin", "center")
+    if origin not in ("center", "corner"):
+        raise InputError(
+            f"is {origin!r:.60}", where=f"{path}: origin", remedy="give center or corner"
+        )
+    cameras = sorted({int(k.split(".")[1]) for k in pairs if re.fullmatch(r"camera\.\d+\.A", k)})
+    prefix = "camera."
+    if cameras:
+        if index is None and len(cameras) > 1:
+            raise InputError(
+                f"holds the cameras {', '.join(map(str, cameras))}",
+                where=path,
+                remedy="say which by --index",
+            )
+        chosen = cameras[0] if index is None else index
+        if chosen not in cameras:
+            raise InputError(
+                f"holds no camera {chosen}",
+                where=path,
+                remedy=f"give --index {' or '.join(map(str, cameras))}",
+            )
+        prefix = f"camera.{chosen}."
+    own = {k.removeprefix(prefix): _numbers(v) for k, v in pairs.items() if k.startswith(prefix)}
+    strange = [k for k, v in own.items() if re.fullmatch(r"[a-z]\d", k) and any(v)]
+    strange = [k for k in strange if k not in _CALLAB]
+    if strange:
+        raise InputError(
+            f"has coefficients {', '.join(strange)} that are not known here",
+            where=path,
+            remedy="calibrate with radial and tangential distortion alone",
+        )
+    matrix = own.get("A", [])
+    if len(matrix) != 9:
+        raise InputError(
+            "is no 3x3 matrix", where=f"{path}: {prefix}A", remedy="write nine numbers"
+        )
+    width, height = (_one(own, name, f"{path}: {prefix}{name}") for name in ("width", "height"))
+    size = _size(width, height, path)
+    shift = 0.5 if origin == "corner" else 0.0
+    pinhole = [matrix[0], matrix[4], matrix[2] - shift, matrix[5] - shift]
+    k = [own.get(n, [0.0])[0] if own.get(n) else 0.0 for n in DISTORTION_ORDER["brown"]]
+    camera, warnings = _lens("brown", pinhole, matrix[1], k, size, path)
+    return LensFile(camera, "callab", warnings)
+
+
+def _opencv(text: str, path: Path) -> LensFile:
+    """OpenCV's YAML, XML or JSON, and the camera_info of ROS, which looks the same."""
+    matrix = _array(
+        text, ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "intrinsic_matrix")
+    )
+    if matrix is None or len(matrix) != 9:
+        raise InputError(
+            "holds no lens that is known here (fc of Bouguet's toolbox, camera.A of CalLab, "
+            "camera_matrix of OpenCV or ROS)",
+            where=path,
+            remedy="check the file",
+        )
+    names = (
+        "distortion_coefficients", "Distortion_Coefficients", "distortion_coeffs", "distCoeffs",
+        "dist_coeffs", "D",
+    )  # fmt: skip
+    k = _array(text, names) or []
+    both = _array(text, ("image_size", "imageSize", "resolution")) or []
+    width = _scalar(text, ("image_width", "image_Width", "imageWidth", "width"))
+    height = _scalar(text, ("image_height", "image_Height", "imageHeight", "height"))
+    if width is None and height is None and len(both) == 2:
+        width, height = both
+    if width is None or height is None:
+        raise InputError(
+            "doesn't say how large the images are",
+            where=path,
+            remedy="add image_width and image_height",
+        )
+    word = re.search(r"""distortion_model["']?\s*:\s*["']?(\w+)""", text)
+    is_ros = word is not None
+    model = _ROS_MODELS.get(word[1].lower()) if word else None
+    if word and model is None:
+        raise InputError(
+            f"is {word[1]!r:.40}",
+            where=f"{path}: distortion_model",
+            remedy=f"use one of {', '.join(_ROS_MODELS)}",
+        )
+    fisheye = _scalar(text, ("fisheye_model",))
+    if model is None:
+        model = "fisheye" if fisheye else ("brown" if len(k) <= 5 else "rational")
+    pinhole = [matrix[0], matrix[4], matrix[2], matrix[5]]
+    camera, warnings = _lens(model, pinhole, matrix[1], k, _size(width, height, path), path)
+    return LensFile(camera, "ros" if is_ros else "opencv", warnings)
+
+
+def _array(text: str, names: tuple[str, ...]) -> list[float] | None:
+    """Numbers of the first of these names, in YAML, JSON or XML; None if there is none."""
+    for name in names:
+        xml = re.search(rf"<{name}\b[^>]*>(.*?)</{name}>", text, re.DOTALL)
+        if xml:
+            data = re.search(r"<data>(.*?)</data>", xml[1], re.DOTALL)
+            return _numbers(data[1] if data else xml[1])
+        # Up to the next key that begins a line, or a closing brace; then after `data:`, if any.
+        yaml = re.search(rf"""(?:^|[{{,])\s*["']?{name}["']?\s*:(.*)""", text, re.M | re.DOTALL)
+        if yaml:
+            body = yaml[1]
+            data = re.match(r"[^\[]{0,200}?[\"']?data[\"']?\s*:", body, re.DOTALL)
+            body = body[data.end() :] if data else body
+            flow = re.match(r"\s*(?:!!\S+\s*)?\[((?:[^\[\]]|\[[^\[\]]*\])*)\]", body)
+            if flow:
+                return _numbers(flow[1])
+            block = re.match(rf"\s*\n((?:\s*-\s*(?:-\s*)?{_NUMBER}\s*(?:\n|$))+)", body)
+            if block:
+                return [float(v) for v in re.findall(rf"-\s+({_NUMBER})\s*$", block[1], re.M)]
+    return None
+
+
+def _scalar(text: str, names: tuple[str, ...]) -> float | None:
+    for name in names:
+        found = re.search(rf"""<{name}>\s*({_NUMBER})\s*</""", text) or re.search(
+            rf"""(?:^|[{{,])\s*["']?{name}["']?\s*:\s*({_NUMBER})\b""", text, re.MULTILINE
+        )
+        if found:
+            return _number(found[1])
+    return None
+
+
+def _numbers(text: str) -> list[float]:
+    return [_number(value) for value in re.findall(_NUMBER, text)]
+
+
+def _number(text: str) -> float:
+    return float(text.replace("d", "e").replace("D", "e"))
+
+
+def _one(values: dict[str, list[float]], name: str, where: str) -> float:
+    found = values.get(name, [])
+    if len(found) != 1:
+        raise InputError("is missing", where=where, remedy="give a number")
+    return found[0]
+
+
+def _size(width: float, height: float, path: Path) -> tuple[int, int]:
+    if not (2 <= width <= 16384 and 2 <= height <= 16384):
+        raise InputError(
+            f"is {width:g} x {height:g}", where=f"{path}: image size", remedy="give pixels"
+        )
+    return round(width), round(height)
+
+
+def _lens(
+    model: str,
+    pinhole: list[float],
+    skew: float,
+    k: list[float],
+    size: tuple[int, int],
+    path: Path,
+) -> tuple[Camera, tuple[str, ...]]:
+    """Make a lens of fx, fy, cx, cy and coefficients in OpenCV's order."""
+    values = dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True))
+    order = DISTORTION_ORDER[model]
+    values |= dict(zip(order, k, strict=False))
+    classes: dict[str, type[Pinhole]] = {
+        "brown": BrownConrady,
+        "rational": Rational,
+        "fisheye": Fisheye,
+    }
+    camera = checked_lens(classes[model], size, values, path)
+    extra = k[len(order) :]
+    if not np.isfinite(extra).all() or len(k) > 14:
+        raise InputError(
+            f"has {len(k)} distortion coefficients", where=path, remedy="give 14 at most"
+        )
+    if any(extra) and model == "fisheye":
+        raise InputError(
+            f"has {len(k)} distortion coefficients for a fisheye lens",
+            where=path,
+            remedy="give four",
+        )
+    if any(extra):
+        table = _opencv_rays(camera, skew, k)
+        return table, ("thin prism or tilted sensor: the lens becomes a table of rays",)
+    if abs(skew) * size[1] / camera.fy > _NO_SKEW_PX:
+        if not abs(skew) <= camera.fx:
+            raise InputError(f"is {skew}", where=f"{path}: skew", remedy="give 0, or pixels")
+        return _skewed_rays(camera, skew), (
+            f"a skew of {skew:.3g} px: the lens becomes a table of rays",
+        )
+    return camera, ()
+
+
+def _normalised(camera: Pinhole, skew: float) -> Float64:
+    """(H, W, 2) distorted x/z, y/z of the pixels: u = fx x + skew y + cx, v = fy y + cy."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
+    y = (v - camera.cy) / camera.fy
+    return np.stack([(u - camera.cx - skew * y) / camera.fx, y], -1)
+
+
+def _skewed_rays(camera: Pinhole, skew: float) -> RayTable:
+    return RayTable(camera._undistort(_normalised(camera, skew)).astype(np.float32))
+
+
+def _opencv_rays(camera: Pinhole, skew: float, k: list[float]) -> RayTable:
+    """Rays of a lens with up to 14 coefficients, of which OpenCV knows the meaning."""
+    full = _Full(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, tuple(k))
+    return RayTable(full._undistort(_normalised(camera, skew)).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class _Full(Pinhole):
+    """A lens of all of OpenCV's coefficients."""
+
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        pass  # checked before
+
+    def _distort(self, xy: Float64) -> Float64:
+        points = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1).reshape(-1, 1, 3)
+        given = np.array([*self.coefficients, *([0.0] * (14 - len(self.coefficients)))])
+        out = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), given)[0]
+        return np.asarray(out, float).reshape(xy.shape)

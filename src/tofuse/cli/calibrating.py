@@ -1,0 +1,96 @@
+"""``tofuse calibrate``: what each subject does, and how it is told in a few lines."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from tofuse.calibration.board import Board
+from tofuse.calibration.camera_json import recording_fields, write_camera_json
+from tofuse.calibration.lens import calibrate_lens
+from tofuse.calibration.lens_files import read_lens_file
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import Pinhole, RayTable
+from tofuse.recordings.camera_file import camera_fields
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+
+# What a subject gives: data for JSON, lines to print, and warnings.
+Told = tuple[dict[str, Any], list[str], list[str]]
+_NAMED = 8
+
+
+def lens(arguments: argparse.Namespace) -> Told:
+    """``tofuse calibrate lens``."""
+    board = _board(arguments)
+    recording = _recording(arguments)
+    fit = calibrate_lens(recording, board, arguments.model, arguments.image)
+    lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
+    lines.append(
+        f"{len(fit.views)} views, corners missed by {fit.rms_px:.3f} px rms (by the lens that the "
+        f"recording came with: {fit.before_px:.3f})"
+    )
+    lines += [f"left out: frame {frame} {why}" for frame, why in fit.left_out[:_NAMED]]
+    if len(fit.left_out) > _NAMED:
+        lines.append(f"left out: {len(fit.left_out) - _NAMED} more frames (--json names all)")
+    if arguments.out is not None:
+        about = recording_fields(recording)
+        write_camera_json(arguments.out, fit.camera, about, overwrite=arguments.overwrite)
+        lines.append(f"written to {arguments.out}")
+    return fit.to_dict(), lines, list(fit.warnings)
+
+
+def import_lens(arguments: argparse.Namespace) -> Told:
+    """``tofuse calibrate import``."""
+    if len(arguments.inputs) != 1:
+        raise InputError("takes one file", where="calibrate import", remedy="give one INPUT")
+    found = read_lens_file(arguments.inputs[0], arguments.index)
+    about: dict[str, Any] = {}
+    warnings = list(found.warnings)
+    if arguments.recording is None:
+        warnings.append(
+            "depth is taken for z in mm; give --recording to keep what a recording says"
+        )
+    else:
+        recording = open_recording(arguments.recording)
+        about = recording_fields(recording)
+    fields = camera_fields(found.camera)
+    lines = [f"{name} {value}" for name, value in fields.items()]
+    if isinstance(found.camera, RayTable):
+        near = found.camera.fit
+        lines.append(f"about a pinhole of f {near.fx:.2f}, {near.fy:.2f} px")
+    lines.append(f"read as a file of {found.format}")
+    if arguments.out is not None:
+        written = write_camera_json(
+            arguments.out, found.camera, about, overwrite=arguments.overwrite
+        )
+        lines += [f"written to {path}" for path in written]
+    return {"format": found.format, "warnings": warnings} | fields, lines, warnings
+
+
+def _recording(arguments: argparse.Namespace) -> Recording:
+    recording = open_recording(
+        *arguments.inputs,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+    )
+    return recording.select(arguments.start, arguments.end, arguments.every)
+
+
+def _board(arguments: argparse.Namespace) -> Board:
+    if arguments.board is None:
+        raise InputError(
+            "is missing",
+            where="--board",
+            remedy="give inner corners and metres of a square, such as 8x6:0.1",
+        )
+    return Board.parse(arguments.board)
+
+
+def _number(camera: Pinhole, name: str, sigma: float | None) -> str:
+    value = getattr(camera, name)
+    if sigma is None:
+        return f"{name} {value:.6g} (held)"
+    digits = 2 if name in ("fx", "fy", "cx", "cy") else 5
+    return f"{name} {value:.{digits}f} +- {sigma:.{digits}f}"

@@ -1,0 +1,222 @@
+"""A lens from views of a checkerboard: simulated cameras, whose lens is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tofuse.calibration import lens
+from tofuse.calibration.board import Board, find_corners
+from tofuse.calibration.board_pose import board_pose
+from tofuse.calibration.lens import BoardView, LensFit, calibrate_lens
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Camera, Fisheye, Pinhole, Rational
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.native import RecordingWriter
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.models import camera_model
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import simulate_recording
+from tofuse.simulation.scenes import checkerboard
+
+BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
+TRUE = camera_model("sr4000").camera
+
+
+@cache
+def frames() -> tuple[RangeFrame, ...]:
+    effects = Effects().without("multipath")
+    return tuple(simulate_recording("checkerboard", frames=16, effects=effects))
+
+
+def recording_of(chosen) -> Recording:
+    numbered = [replace(f, index=k, timestamp=float(k)) for k, f in enumerate(chosen)]
+    return Recording.of(ArraySource(numbered), "views", "simulated")
+
+
+@cache
+def fitted() -> LensFit:
+    return calibrate_lens(recording_of(frames()), BOARD)
+
+
+def test_focal_length_within_0_2_percent_and_principal_point_within_half_a_pixel() -> None:
+    camera = fitted().camera
+    assert camera.fx == pytest.approx(TRUE.fx, rel=0.002)
+    assert camera.fy == pytest.approx(TRUE.fy, rel=0.002)
+    assert camera.cx == pytest.approx(TRUE.cx, abs=0.5)
+    assert camera.cy == pytest.approx(TRUE.cy, abs=0.5)
+    rays = np.abs(camera.rays() - TRUE.rays()) * TRUE.fx
+    assert np.sqrt((rays**2).sum(-1).mean()) < 0.5  # over all of the image, distortion included
+
+
+def test_deviations_say_how_far_off_it_may_be() -> None:
+    found = fitted()
+    for name in ("fx", "fy", "cx", "cy"):
+        assert abs(getattr(found.camera, name) - getattr(TRUE, name)) < 4 * found.sigma[name]
+    assert found.sigma["fx"] < 0.003 * TRUE.fx
+    assert found.sigma.keys() >= {"k1"}
+    # What the views don't tell is held at 0 and has no deviation.
+    held = {"k1", "k2", "p1", "p2", "k3"} - found.sigma.keys()
+    assert all(getattr(found.camera, name) == 0 for name in held)
+    assert found.rms_px < 0.1
+    assert found.before_px == pytest.approx(found.rms_px, abs=0.02)
+
+
+def test_corners_lie_at_pixel_centres_from_zero() -> None:
+    """Half a pixel, as enlarging may add, would show in the mean."""
+    corners = find_corners(frames()[0].amplitude_image, BOARD)
+    assert corners is not None
+    found = board_pose(TRUE, corners, BOARD)
+    assert found is not None
+    T, rms = found
+    assert rms < 0.1
+    place = checkerboard.places(0)[0]
+    # Where the wall and the board's middle are, to the millimetre.
+    middle = se3.transform(se3.inverse(place), [[0, -0.0005, 1.5]])[0]
+    mean = se3.transform(T, BOARD.points).mean(0)
+    assert mean == pytest.approx(middle, abs=0.004)
+    offsets = TRUE.project(middle) - TRUE.project(mean)
+    assert np.abs(offsets).max() < 0.1
+
+
+def test_a_view_that_does_not_fit_is_left_out_and_named() -> None:
+    chosen = list(frames()[:10])
+    image = chosen[4].amplitude_image
+    v, u = np.mgrid[0:144, 0:176].astype(np.float32)
+    bent = cv2.remap(image, u + 3 * np.sin(v / 12).astype(np.float32), v, cv2.INTER_LINEAR)
+    chosen[4] = replace(chosen[4], amplitude_image=bent)
+    found = calibrate_lens(recording_of(chosen), BOARD)
+    assert 4 not in found.views
+    assert any(k == 4 and ("misses" in why or "not found" in why) for k, why in found.left_out)
+    assert found.camera.fx == pytest.approx(TRUE.fx, rel=0.005)
+
+
+def test_the_same_place_counts_once() -> None:
+    found = calibrate_lens(recording_of([*frames()[:8], *frames()[:8]]), BOARD)
+    assert len(found.views) == len([k for k, _ in found.left_out if k >= 8])
+    assert all("like another" in why for k, why in found.left_out if k >= 8)
+
+
+def _bare(frame: RangeFrame) -> RangeFrame:
+    return replace(frame, amplitude_image=None)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "board", "message"),
+    [
+        (lambda: frames()[:3], BOARD, "3 places"),
+        (lambda: frames()[:1] * 6, BOARD, "1 places"),
+        (lambda: frames()[:4], Board(9, 7, 0.1), "shows no board of 9 x 7"),
+        (lambda: frames()[:4], Board(5, 4, 0.1), "check --board"),
+        (lambda: [_bare(frames()[0])], BOARD, "--image color"),
+        (lambda: [CloudFrame.of(np.eye(3))], BOARD, "holds clouds"),
+    ],
+)
+def test_what_tells_no_lens_is_refused(chosen, board: Board, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        calibrate_lens(recording_of(chosen()), board)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def views_of(camera: Pinhole, poses: list[np.ndarray], sigma: float = 0.03) -> list[BoardView]:
+    rng = np.random.default_rng(3)
+    points = BOARD.points.astype(float)
+    views = []
+    for k, T in enumerate(poses):
+        uv = camera.project(se3.transform(T, points))
+        views.append(BoardView(k, uv + sigma * rng.normal(size=uv.shape)))
+    return views
+
+
+def poses_facing(count: int, tilt: float) -> list[np.ndarray]:
+    rng = np.random.default_rng(4)
+    out = []
+    for k in range(count):
+        around = 2.4 * k
+        T = se3.exp([0, 0, 0, tilt * np.cos(around), tilt * np.sin(around), 0])
+        T[:3, 3] = [*rng.uniform(-0.5, 0.2, 2), rng.uniform(0.8, 1.6)]
+        out.append(T)
+    return out
+
+
+def test_views_all_alike_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Pinhole(320, 240, 250, 250, 160, 120)
+    views = views_of(camera, poses_facing(12, 0.01))
+    monkeypatch.setattr(lens, "board_views", lambda *_: (views, [], camera))
+    with pytest.raises(InputError, match="tilt it by 20 to 40 degrees"):
+        calibrate_lens(recording_of(frames()[:1]), BOARD)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Pinhole(320, 240, 250, 251, 163, 117),
+        Fisheye(320, 240, 150, 151, 163, 117, 0.05, -0.02, 0.01, -0.002),
+        Rational(320, 240, 250, 251, 163, 117, 0.5, -0.1, 0.001, -0.002, 0.02, 0.7, 0.1, 0.01),
+    ],
+    ids=lambda c: c.model,
+)
+def test_every_kind_of_lens_comes_back(camera: Pinhole, monkeypatch: pytest.MonkeyPatch) -> None:
+    views = views_of(camera, poses_facing(16, 0.5))
+    monkeypatch.setattr(lens, "board_views", lambda *_: (views, [], camera))
+    found = calibrate_lens(recording_of(frames()[:1]), BOARD, camera.model)
+    assert type(found.camera) is type(camera)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert 0 < found.sigma[name] < 2
+        assert abs(getattr(found.camera, name) - getattr(camera, name)) < 4 * found.sigma[name]
+    assert found.rms_px == pytest.approx(0.03 * np.sqrt(2), rel=0.15)
+    inside = _seen(camera, views)
+    apart = (found.camera.rays() - camera.rays())[inside] * camera.fx
+    assert np.sqrt((apart**2).sum(-1).mean()) < 0.3
+
+
+def _seen(camera: Camera, views: list[BoardView]) -> np.ndarray:
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    for view in views:
+        cv2.fillConvexPoly(mask, cv2.convexHull(view.corners.round().astype(np.int32)), 1)
+    return mask.astype(bool)
+
+
+@pytest.mark.parametrize("text", ["8x6", "8x6:0", "2x6:0.1", "8x6:-1", "8x6:e", "axb:c", ""])
+def test_boards_that_make_no_sense(text: str) -> None:
+    with pytest.raises(InputError, match="--board"):
+        Board.parse(text)
+
+
+def test_command_writes_a_camera_that_readers_take(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = replace(TRUE, fx=200.0)
+    writer = RecordingWriter(
+        tmp_path / "rec", wrong, depth_unit_m=0.0001, amplitude_kind="range_compensated"
+    )
+    for k, frame in enumerate(frames()[:10]):
+        writer.add(replace(frame, camera=wrong, timestamp=float(k)))
+    writer.finish()
+    out = tmp_path / "new" / "camera.json"
+    command = ["calibrate", "lens", str(tmp_path / "rec"), "--board", "8x6:0.1"]
+    assert main([*command, "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "fx 2" in told
+    assert "+-" in told
+    about = json.loads(out.read_text())
+    assert about["depth_unit_m"] == 0.0001
+    assert about["amplitude_kind"] == "range_compensated"
+    frame = open_recording(tmp_path / "rec", camera=out)[0]
+    assert isinstance(frame, RangeFrame)
+    assert isinstance(frame.camera, Pinhole)
+    assert frame.camera.fx == pytest.approx(TRUE.fx, rel=0.005)
+    assert main([*command, "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["calibrate", "lens", str(tmp_path / "rec")]) == 2
+    assert "--board" in capsys.readouterr().err
