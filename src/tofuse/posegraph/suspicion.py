@@ -35,7 +35,7 @@ _SURE, _LIKELY, _WORTH = 4.0, 2.5, 0.2
 # Loops are closed that miss by no more, m and rad.
 _CLOSED = (0.01, np.radians(0.5))
 # Of the tolerance: an error that is known less well is not told.
-_VAGUE = 0.25
+_VAGUE = 0.4
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
 # The way to what fits may be long.
 _ROUNDS = (Round(4, 0.02, 0.1), Round(4, 0.005, 0.03), Round(6, 0.0, 0.0))
