@@ -22,6 +22,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 @pytest.fixture
 def scripts(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import end_to_end
     import peers.o3d
     import pose_graphs
     import scaling
@@ -29,6 +30,7 @@ def scripts(monkeypatch):
     import tracking
 
     return {
+        "end_to_end": end_to_end,
         "pose_graphs": pose_graphs,
         "peers": peers,
         "scaling": scaling,
@@ -57,11 +59,26 @@ def small_room(scripts, tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("script", ["tracking", "scaling"])
+@pytest.mark.parametrize("script", ["tracking", "scaling", "end_to_end"])
 def test_script_says_how_it_is_used(script):
     command = [sys.executable, str(BENCHMARKS / f"{script}.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "--threads" in done.stdout
+
+
+def test_whole_run_as_a_process(scripts, small_room):
+    end_to_end = scripts["end_to_end"]
+    room = small_room / "recordings" / "room"
+    spent = end_to_end.tofuse_run(room, ["--end", "4"], 1)
+    assert spent.frames == 4
+    assert {"tracking", "fusion"} <= set(spent.stages)
+    assert 0 < sum(spent.stages.values()) < spent.wall_s
+    assert spent.peak_mb > 50  # what it imports alone
+    lines = list(end_to_end.table([("tofuse run", [spent])]))
+    assert f"{spent.ms_a_frame:.1f}" in lines[1]
+    assert "tracking" in lines[2]
+    with pytest.raises(RuntimeError, match=r"nothing: doesn.t exist"):
+        end_to_end.tofuse_run(room / "nothing", [], 1)
 
 
 def test_tracking_without_peers(scripts, small_room, tmp_path, monkeypatch, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ class DenseSlam:
     def resolution(self, frame: RangeFrame) -> str:
         return f"{grid(frame)}, {100 * self.voxel_m:g} cm"
 
-    def start(self, frame: RangeFrame, threads: int) -> Session:
+    def start(self, frame: RangeFrame, threads: int) -> _DenseSession:
         return _DenseSession(self, frame)
 
 
@@ -165,6 +166,11 @@ class _DenseSession:
         self._model.synthesize_model_frame(self._cast, _SCALE, 0.1, MAX_DEPTH_M, 8.0, False)
         self._index += 1
         return self._T
+
+    def write_mesh(self, path: Path) -> None:
+        """Write the surface of what was pushed so far as PLY."""
+        mesh = self._model.voxel_grid.extract_triangle_mesh()
+        self._images.o3d.io.write_triangle_mesh(str(path), mesh.to_legacy())
 
 
 def _grey(frame: RangeFrame) -> NDArray[np.uint8]:
