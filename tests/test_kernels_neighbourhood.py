@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.kernels.neighbourhood import largest_angle, window_median
+from tofuse.kernels.neighbourhood import is_steeper, largest_angle, window_median
 
 
 def angle_twin(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -31,6 +31,24 @@ def test_largest_angle() -> None:
     assert (out[4:] == -1).all()  # only its own rows
     largest_angle(points, valid, 4, 9, out)
     assert out == pytest.approx(angle_twin(points, valid), abs=1e-5)
+
+
+@pytest.mark.parametrize("threshold", [np.pi / 2, 2.0, 2.6])
+def test_is_steeper(threshold: float) -> None:
+    rng = np.random.default_rng(1)
+    z = (rng.uniform(1, 3, (9, 11)) * (rng.random((9, 11)) < 0.7)).astype(np.float32)
+    rays = np.stack(np.meshgrid(np.linspace(-2, 2, 11), np.linspace(-2, 2, 9)), -1)
+    points = np.concatenate([rays, np.ones((9, 11, 1))], -1) * z[..., None]
+    rays = np.where(z[..., None] > 0, rays, np.nan).astype(np.float32)  # never looked at
+    out = np.zeros((9, 11), bool)
+    cosine2 = np.float32(np.cos(threshold) ** 2)
+    is_steeper(z, rays, cosine2, 0, 4, out)
+    assert not out[4:].any()  # only its own rows
+    is_steeper(z, rays, cosine2, 4, 9, out)
+    expected = angle_twin(points, z > 0)
+    far = np.abs(expected - threshold) > 1e-4
+    assert (out == (expected > threshold))[far].all()
+    assert 5 < out.sum() < (z > 0).sum()
 
 
 def test_window_median_writes_its_rows_only() -> None:

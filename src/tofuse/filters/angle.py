@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.filters._options import within
 from tofuse.filters.base import Bool, Filter
-from tofuse.kernels.neighbourhood import largest_angle
+from tofuse.kernels.neighbourhood import is_steeper, largest_angle
 from tofuse.kernels.threads import run_chunks
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -48,7 +48,12 @@ class NeighbourhoodAngle(Filter):
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
         assert isinstance(frame, RangeFrame)
-        return neighbourhood_angle(frame) <= self.threshold
+        steep = np.zeros(frame.depth.shape, bool)
+        if self.threshold < math.pi:
+            z = np.where(frame.valid, frame.z, np.float32(0))
+            rays, cosine2 = frame.camera.rays(), np.float32(math.cos(self.threshold) ** 2)
+            run_chunks(lambda a, b: is_steeper(z, rays, cosine2, a, b, steep), len(z))
+        return ~steep
 
 
 def neighbourhood_angle(frame: RangeFrame) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 
 Float64 = NDArray[np.float64]
 
-_SKETCHED = 60  # views in a sketch
+_SKETCHED, _SKETCHED_PIXELS = 60, 6000  # views in a sketch, and about so many pixels of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +125,14 @@ class ModelBuilder:
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
         """Return points of the model at other poses, to be looked at: without normals for images.
 
-        Of many images some are taken, evenly.
+        Of many images some are taken, evenly, and of each some pixels.
         """
         if self._clouds:
             return self._average(self._clouds, poses, self._voxel_m)
         some = self._ranges[:: -(-len(self._ranges) // _SKETCHED)]
         voxel = self._range_voxel
-        return self._average([view.as_cloud() for view in some], poses, voxel, normals=False)
+        clouds = [view.as_cloud(_SKETCHED_PIXELS) for view in some]
+        return self._average(clouds, poses, voxel, normals=False)
 
     @property
     def _range_voxel(self) -> float:

@@ -97,3 +97,61 @@ def largest_angle(
             if least <= 1.0 + 1e-9:
                 least = min(max(least, -1.0), 1.0)
                 out[i, j] = math.acos(math.copysign(math.sqrt(abs(least)), least))
+
+
+@kernel
+def is_steeper(
+    z: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    cosine2: np.float32,
+    start: int,
+    stop: int,
+    out: NDArray[np.bool_],
+) -> None:
+    """Write where an angle as in `largest_angle` is obtuse and above a threshold.
+
+    Without a root, a quotient or a branch for each neighbour, so that several pixels are worked on
+    at once.
+
+    Parameters
+    ----------
+    z
+        (H, W) z depth in m, 0 where invalid.
+    rays
+        (H, W, 2) x/z and y/z.
+    cosine2
+        Squared cosine of the threshold, which is obtuse.
+    start, stop
+        Rows of `out` (H, W) to write: False where the point or all neighbours are invalid.
+    """
+    height, width = z.shape
+    # The points of these rows and of those beside them, with a border at the camera: like points
+    # that are invalid, it lies before all others, and no angle there is obtuse.
+    points = np.zeros((3, stop - start + 2, width + 2), np.float32)
+    for i in range(max(0, start - 1), min(height, stop + 1)):
+        for j in range(width):
+            if z[i, j] > 0:
+                points[0, i - start + 1, j + 1] = rays[i, j, 0] * z[i, j]
+                points[1, i - start + 1, j + 1] = rays[i, j, 1] * z[i, j]
+                points[2, i - start + 1, j + 1] = z[i, j]
+    bound = np.empty(width, np.float32)
+    steep = np.empty(width, np.bool_)
+    for i in range(1, stop - start + 1):
+        x, y, depth = points[0, i, 1:-1], points[1, i, 1:-1], points[2, i, 1:-1]
+        for j in range(width):
+            bound[j] = cosine2 * (x[j] * x[j] + y[j] * y[j] + depth[j] * depth[j])
+            steep[j] = False
+        for v in range(i - 1, i + 2):
+            for u in range(3):
+                if v == i and u == 1:
+                    continue
+                a = points[0, v, u : u + width]
+                b = points[1, v, u : u + width]
+                c = points[2, v, u : u + width]
+                for j in range(width):
+                    dx, dy, dz = a[j] - x[j], b[j] - y[j], c[j] - depth[j]
+                    behind = x[j] * dx + y[j] * dy + depth[j] * dz
+                    away2 = dx * dx + dy * dy + dz * dz
+                    steep[j] |= (behind > 0) & (behind * behind > bound[j] * away2)
+        for j in range(width):
+            out[start + i - 1, j] = steep[j]

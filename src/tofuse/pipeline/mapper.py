@@ -331,9 +331,11 @@ class Mapper:
             self._depths.append(float(np.median(ranges[ranges > 0])) if ranges.any() else 0.0)
             self._ambiguity_m = frame.ambiguity_m
             if isinstance(clean, RangeFrame):
-                self._checks.add(whole(frame, clean))
+                self._checks.add(lambda: whole(frame, clean))
         with self._watch.timing("loops"):
-            view = as_cloud(clean, _KEPT_POINTS)
+            # Who looks at surfaces leaves the points alone, which take long to make.
+            looked_at = step.surface is None or self._loops.points or self._refiner.points
+            view = as_cloud(clean, _KEPT_POINTS) if looked_at else clean
             self._loops.push(view, step.T_world_camera, step.surface)
         with self._watch.timing("fusion"):
             self._model.add(clean, step.surface, _KEPT_POINTS)
@@ -593,9 +595,9 @@ class _EvenSample:
         self.items: list[RangeFrame] = []
         self._size, self._step, self._count = size, 1, 0
 
-    def add(self, item: RangeFrame) -> None:
+    def add(self, made: Callable[[], RangeFrame]) -> None:
         if self._count % self._step == 0:
-            self.items.append(item)
+            self.items.append(made())
             if len(self.items) > self._size:
                 self.items = self.items[::2]
                 self._step *= 2

@@ -77,7 +77,16 @@ def in_order(closed: Mapping[tuple[int, int], ClosedLoop]) -> list[ClosedLoop]:
 
 
 class Loops(Protocol):
-    """Loop detection at work: holds what it needs of the frames so far."""
+    """Loop detection at work: holds what it needs of the frames so far.
+
+    Attributes
+    ----------
+    points
+        Whether it looks at the points of views that have a surface, and keeps them; if not, it
+        keeps no view.
+    """
+
+    points: ClassVar[bool] = True
 
     def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
         """Add the next frame that has a pose, and its surface if the tracker made one."""

@@ -74,7 +74,15 @@ class Refinement:
 
 
 class Refiner(Protocol):
-    """Refinement at work on one recording: holds what it needs of the views so far."""
+    """Refinement at work on one recording: holds what it needs of the views so far.
+
+    Attributes
+    ----------
+    points
+        Whether it looks at the points of views that have a surface.
+    """
+
+    points: ClassVar[bool] = True
 
     def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
         """Add the next view that has a pose, with its surface where the tracker prepared one."""
@@ -109,6 +117,8 @@ class NoRefinement(Refining):
 
 
 class _Idle(Refiner):
+    points: ClassVar[bool] = False
+
     def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
         """Keep nothing."""
 
@@ -153,6 +163,8 @@ class Joint(Refining):
 
 
 class _Joint(Refiner):
+    points: ClassVar[bool] = False
+
     def __init__(self, options: Joint) -> None:
         self._options = options
         self._store: ViewStore[SurfaceMap] = ViewStore(options.spacing)

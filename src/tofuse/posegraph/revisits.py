@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,6 +144,8 @@ class Revisits(LoopDetector):
 
 
 class _RevisitLoops(Loops):
+    points: ClassVar[bool] = False
+
     def __init__(self, options: Revisits, given: Sequence[GivenLoop]) -> None:
         self._options = options
         self._store: ViewStore[SurfaceMap] = ViewStore(options.spacing)
