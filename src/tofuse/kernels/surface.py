@@ -17,7 +17,7 @@ from tofuse.kernels.jit import kernel
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-_SUMS = 11  # weight, x, y, w, xx, xy, yy, xw, yw, ww, count
+_SUMS = 12
 
 
 @kernel
@@ -133,6 +133,8 @@ def fit_planes(
     summed = max(start - most, 0)
     sums[summed % kept] = 0.0
     s = np.empty(_SUMS)
+    per_free, allowed = _by_count(radii, limit)
+    above, below = np.empty_like(radii), np.empty_like(radii)
     for i in range(start, stop):
         while summed < min(i + most + 1, rows):
             _add_row(
@@ -143,6 +145,9 @@ def fit_planes(
                 sums[(summed + 1) % kept],
             )
             summed += 1
+        for q in range(len(radii)):
+            above[q] = max(i - radii[q], 0) % kept
+            below[q] = min(i + radii[q] + 1, rows) % kept
         for j in range(columns):
             planes[i, j, 0] = 0
             planes[i, j, 1] = 0
@@ -158,12 +163,11 @@ def fit_planes(
             # jumps over a gap that a smaller one has seen.
             for q in range(len(radii)):
                 r = radii[q]
-                above = sums[max(i - r, 0) % kept]
-                below = sums[min(i + r + 1, rows) % kept]
+                high, low = sums[above[q]], sums[below[q]]
                 left = max(j - r, 0)
                 right = min(j + r + 1, columns)
                 for k in range(_SUMS):
-                    s[k] = below[right, k] - above[right, k] - below[left, k] + above[left, k]
+                    s[k] = low[right, k] - high[right, k] - low[left, k] + high[left, k]
                 n = s[10]
                 side = 2 * r + 1
                 if n < fill * side * side or n < 6:
@@ -185,25 +189,41 @@ def fit_planes(
                 dy = y0 - my
                 if dx * dx > offset * cxx or dy * dy > offset * cyy:
                     break
-                a = (cyy * cxw - cxy * cyw) / det
-                b = (cxx * cyw - cxy * cxw) / det
-                left_over = max(cww - a * cxw - b * cyw, 0.0) * s[0] / (n - 3)
+                per_det = 1.0 / det
+                a = (cyy * cxw - cxy * cyw) * per_det
+                b = (cxx * cyw - cxy * cxw) * per_det
+                left_over = max(cww - a * cxw - b * cyw, 0.0) * s[0] * per_free[q, int(n)]
                 if q == 0:
                     quality[i, j, 0] = left_over
                 value = mw + a * dx + b * dy
                 off = np.float64(w[i, j]) - value
-                # Of n - 3 squared normal deviates the mean has a standard deviation of
-                # sqrt(2 / (n - 3)).
-                misfit = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
-                if left_over > misfit or off * off * weight[i, j] > 25 * limit or value <= 0:
+                if left_over > allowed[q, int(n)] or off * off * weight[i, j] > 25 * limit or value <= 0:
                     break
                 if q == 0:
-                    leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) / det
+                    leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) * per_det
                     quality[i, j, 1] = inverse * (1.0 + leverage)
                     planes[i, j, 3] = value
                 planes[i, j, 0] = a
                 planes[i, j, 1] = b
                 planes[i, j, 2] = planes[i, j, 3] - a * x0 - b * y0
+
+
+@kernel
+def _by_count(radii: NDArray[np.int64], limit: float) -> tuple[Float64, Float64]:
+    """What a window's fit needs of the number n of its valid pixels, without a root for each.
+
+    Either is (len(radii), most pixels + 1): 1 / (n - 3), and the largest mean squared residual.
+    """
+    most = (2 * radii[-1] + 1) ** 2
+    per_free = np.zeros((len(radii), most + 1))
+    allowed = np.zeros((len(radii), most + 1))
+    for q in range(len(radii)):
+        for n in range(4, (2 * radii[q] + 1) ** 2 + 1):
+            per_free[q, n] = 1.0 / (n - 3)
+            # Of n - 3 squared normal deviates the mean has a standard deviation of
+            # sqrt(2 / (n - 3)).
+            allowed[q, n] = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
+    return per_free, allowed
 
 
 @kernel
