@@ -233,6 +233,13 @@ def test_outliers_count_nothing():
     np.testing.assert_array_equal(before[: kernels.LANDED], after[: kernels.LANDED])
 
 
+def test_what_is_not_there_of_a_block_of_points_adds_nothing():
+    view, of = source(), target()
+    sums = accumulate(view, of, T=np.eye(4), stop=7)
+    assert np.isfinite(sums).all()
+    assert sums[kernels.COUNT_P] > 0
+
+
 def test_parts_of_the_points_add_up():
     view, of = source(), target()
     whole = accumulate(view, of)
@@ -266,6 +273,9 @@ def test_twist_between_is_the_logarithm(size):
     xi = size * rng.normal(size=6) / np.sqrt(6)
     B = A @ se3.exp(xi)
     np.testing.assert_allclose(motion.twist_between(A, B), xi, atol=1e-9)
+    found = motion.distance_and_angle(A, B)
+    wanted = np.linalg.norm(B[:3, 3] - A[:3, 3]), np.linalg.norm(xi[3:])
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize("photometric", [True, False])

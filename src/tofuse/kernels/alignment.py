@@ -64,18 +64,19 @@ SIZE = HISTOGRAM + BINS
 # works on several at a time. Rows of a block: the point, where it came to be (x/z, y/z and z in
 # the target), the target's pixel, whether there is a plane and whether it is an inlier; then the
 # residual's derivatives J (7), r, and D (6), each weighted by the root of its w; what is summed of
-# each column; and its squared distance in unscaled variances.
-_LANES = 128
+# each column; its squared distance in unscaled variances; and the root of the distance's w.
+LANES = 128
 _NEAREST = 0.02  # m; what comes nearer to the target's camera is not compared
 _XN, _YN, _Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
 _SEEN = _PIXEL + PIXEL_SIZE
-_FITS = _SEEN + 1
-_J = _FITS + 1
-_R, _D = _J + 7, _J + 8
-_STAT = _D + 6  # as from INLIERS to SQUARES_M
+FITS = _SEEN + 1
+JACOBIAN = FITS + 1
+MISFIT, DIFFERENCE = JACOBIAN + 7, JACOBIAN + 8
+STAT = DIFFERENCE + 6  # as from INLIERS to SQUARES_M
 _STATS = SQUARES_M + 1 - INLIERS
-_RATIO = _STAT + _STATS
-_ROWS = _RATIO + 1
+_RATIO = STAT + _STATS
+ROOT = _RATIO + 1
+ROWS = ROOT + 1
 
 
 @kernel
@@ -115,29 +116,27 @@ def accumulate(
         Smallest cosine between the normals.
     """
     out = np.zeros(SIZE)
-    block = np.zeros(_ROWS * _LANES, np.float32)
-    sums = np.zeros((LANDED + _STATS, _LANES))
-    for first in range(0, len(points), _LANES):
-        count = min(_LANES, len(points) - first)
-        for k in range(count):
-            for c in range(POINT_SIZE):
-                block[c * _LANES + k] = points[first + k, c]
-        _move(block, T)
-        out[LANDED] += _land(block, count, target, lookup, lookup_frame)
-        _distances(block, T, scale_g, slack, robust, min_cosine)
+    block = np.zeros(ROWS * LANES, np.float32)
+    sums = np.zeros((LANDED + _STATS, LANES))
+    for first in range(0, len(points), LANES):
+        count = min(LANES, len(points) - first)
+        load(block, points[first : first + count])
+        move(block, T)
+        out[LANDED] += land(block, count, target, lookup, lookup_frame)
+        distances(block, T, scale_g, slack, robust, min_cosine)
         _add_products(sums, block)
         if scale_p > 0:
-            _albedos(block, T, exposure, scale_p, robust)
+            albedos(block, T, exposure, scale_p, robust)
             _add_products(sums, block)
         for c in range(_STATS):
-            total, row = sums[LANDED + c], block[(_STAT + c) * _LANES : (_STAT + c + 1) * _LANES]
-            for k in range(_LANES):
+            total, row = sums[LANDED + c], block[(STAT + c) * LANES : (STAT + c + 1) * LANES]
+            for k in range(LANES):
                 total[k] += row[k]
         for k in range(count):
-            if block[_SEEN * _LANES + k] > 0:
+            if block[_SEEN * LANES + k] > 0:
                 out[COMPARED] += 1
-                out[HISTOGRAM + histogram_bin(block[_RATIO * _LANES + k])] += 1
-    width = _LANES
+                out[HISTOGRAM + histogram_bin(block[_RATIO * LANES + k])] += 1
+    width = LANES
     while width > 1:
         width //= 2
         for q in range(len(sums)):
@@ -150,49 +149,55 @@ def accumulate(
 
 
 @kernel
-def _move(block: Float32, T: Float64) -> None:
+def load(block: Float32, points: Float32) -> None:
+    """Put up to `LANES` points into the columns of a block."""
+    for k in range(len(points)):
+        for c in range(POINT_SIZE):
+            block[c * LANES + k] = points[k, c]
+
+
+@kernel
+def move(block: Float32, T: Float64) -> None:
     """Say where the points of a block come to be in the target."""
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    for k in range(_LANES):
-        px = block[POINT * _LANES + k]
-        py = block[(POINT + 1) * _LANES + k]
-        pz = block[(POINT + 2) * _LANES + k]
+    for k in range(LANES):
+        px = block[POINT * LANES + k]
+        py = block[(POINT + 1) * LANES + k]
+        pz = block[(POINT + 2) * LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
-        per_z = 1 / z
-        block[_XN * _LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
-        block[_YN * _LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
-        block[_Z * _LANES + k] = z
+        per_z = 1 / z if z > _NEAREST else 0.0
+        block[_XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
+        block[_YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
+        block[_Z * LANES + k] = z
 
 
 @kernel
-def _land(
+def land(
     block: Float32, count: int, target: Float32, lookup: Float32, lookup_frame: Float64
 ) -> int:
     """Find the target's pixels of the points of a block; returns how many land on one."""
     rows, columns = target.shape[0], target.shape[1]
     landed = 0
-    for k in range(_LANES):
-        block[_SEEN * _LANES + k] = 0
-        if k >= count or not block[_Z * _LANES + k] > _NEAREST:
+    for k in range(LANES):
+        block[_SEEN * LANES + k] = 0
+        if k >= count or not block[_Z * LANES + k] > _NEAREST:
             continue
-        u, v, iu, _ = landing(
-            block[_XN * _LANES + k], block[_YN * _LANES + k], lookup, lookup_frame
-        )
+        u, v, iu, _ = landing(block[_XN * LANES + k], block[_YN * LANES + k], lookup, lookup_frame)
         if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
         landed += 1
         pixel = target[int(v + 0.5), int(u + 0.5)]
         if pixel[DISTANCE] > 0:
-            block[_SEEN * _LANES + k] = 1
+            block[_SEEN * LANES + k] = 1
             for c in range(PIXEL_SIZE):
-                block[(_PIXEL + c) * _LANES + k] = pixel[c]
+                block[(_PIXEL + c) * LANES + k] = pixel[c]
     return landed
 
 
 @kernel
-def _distances(
+def distances(
     block: Float32,
     T: Float64,
     scale_g: float,
@@ -207,49 +212,50 @@ def _distances(
     scale_g2, slack2 = np.float32(scale_g * scale_g), np.float32(slack * slack)
     per_limit2, least = np.float32(1 / (robust * robust)), np.float32(min_cosine)
     one, none = np.float32(1), np.float32(0)
-    for k in range(_LANES):
-        px = block[POINT * _LANES + k]
-        py = block[(POINT + 1) * _LANES + k]
-        pz = block[(POINT + 2) * _LANES + k]
-        s0 = block[NORMAL * _LANES + k]
-        s1 = block[(NORMAL + 1) * _LANES + k]
-        s2 = block[(NORMAL + 2) * _LANES + k]
-        n0 = block[(_PIXEL + PLANE) * _LANES + k]
-        n1 = block[(_PIXEL + PLANE + 1) * _LANES + k]
-        n2 = block[(_PIXEL + PLANE + 2) * _LANES + k]
-        z = block[_Z * _LANES + k]
-        r = z * (n0 * block[_XN * _LANES + k] + n1 * block[_YN * _LANES + k] + n2)
-        r -= block[(_PIXEL + DISTANCE) * _LANES + k]
+    for k in range(LANES):
+        px = block[POINT * LANES + k]
+        py = block[(POINT + 1) * LANES + k]
+        pz = block[(POINT + 2) * LANES + k]
+        s0 = block[NORMAL * LANES + k]
+        s1 = block[(NORMAL + 1) * LANES + k]
+        s2 = block[(NORMAL + 2) * LANES + k]
+        n0 = block[(_PIXEL + PLANE) * LANES + k]
+        n1 = block[(_PIXEL + PLANE + 1) * LANES + k]
+        n2 = block[(_PIXEL + PLANE + 2) * LANES + k]
+        z = block[_Z * LANES + k]
+        r = z * (n0 * block[_XN * LANES + k] + n1 * block[_YN * LANES + k] + n2)
+        r -= block[(_PIXEL + DISTANCE) * LANES + k]
         # m = R^T n, the target's normal in the source frame (away from the camera).
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
         # How an error along the source's ray, relative to z, moves the point across the plane.
-        along = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * _LANES + k]
-        own = along * along + block[(_PIXEL + VARIANCE) * _LANES + k]
+        along = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * LANES + k]
+        own = along * along + block[(_PIXEL + VARIANCE) * LANES + k]
         r2 = r * r
-        block[_RATIO * _LANES + k] = r2 / own
+        block[_RATIO * LANES + k] = r2 / own
         per_variance = one / (scale_g2 * own + slack2)
         e2 = r2 * per_variance * per_limit2
-        seen = block[_SEEN * _LANES + k] > none
+        seen = block[_SEEN * LANES + k] > none
         fits = seen & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= least)
         # Nearer than what the target saw there: it looked through this point.
         in_front = seen & (r < none) & (e2 > np.float32(4))
         weight = (one - e2) * (one - e2) if fits else none
         root = (one - e2) * np.sqrt(per_variance) if fits else none
-        block[_FITS * _LANES + k] = one if fits else none
-        block[_STAT * _LANES + k] = one if fits else none
-        block[(_STAT + IN_FRONT - INLIERS) * _LANES + k] = one if in_front else none
-        block[(_STAT + WEIGHT_G - INLIERS) * _LANES + k] = weight
-        block[(_STAT + SQUARES_G - INLIERS) * _LANES + k] = r2 * root * root
-        block[(_STAT + SQUARES_M - INLIERS) * _LANES + k] = r2 if fits else none
-        block[(_J + 6) * _LANES + k] = none
-        block[_R * _LANES + k] = root * r if fits else none
+        block[ROOT * LANES + k] = root
+        block[FITS * LANES + k] = one if fits else none
+        block[STAT * LANES + k] = one if fits else none
+        block[(STAT + IN_FRONT - INLIERS) * LANES + k] = one if in_front else none
+        block[(STAT + WEIGHT_G - INLIERS) * LANES + k] = weight
+        block[(STAT + SQUARES_G - INLIERS) * LANES + k] = r2 * root * root
+        block[(STAT + SQUARES_M - INLIERS) * LANES + k] = r2 if fits else none
+        block[(JACOBIAN + 6) * LANES + k] = none
+        block[MISFIT * LANES + k] = root * r if fits else none
         _put(block, k, root, px, py, pz, m0, m1, m2, s0, s1, s2)
 
 
 @kernel
-def _albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust: float) -> None:
+def albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust: float) -> None:
     """Compare the albedo of the points of a block that fit with that of where they fell."""
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
@@ -257,37 +263,37 @@ def _albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust
     per_p, change = np.float32(1 / scale_p), np.float32(exposure)
     per_limit2 = np.float32(1 / (scale_p * scale_p * robust * robust))
     one, none = np.float32(1), np.float32(0)
-    for k in range(_LANES):
-        px = block[POINT * _LANES + k]
-        py = block[(POINT + 1) * _LANES + k]
-        pz = block[(POINT + 2) * _LANES + k]
-        xn, yn = block[_XN * _LANES + k], block[_YN * _LANES + k]
-        tx = block[(_PIXEL + ALBEDO_SLOPE) * _LANES + k]
-        ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * _LANES + k]
-        r = block[(_PIXEL + ALBEDO) * _LANES + k] + tx * xn + ty * yn
-        r -= block[LIGHT * _LANES + k] + change
+    for k in range(LANES):
+        px = block[POINT * LANES + k]
+        py = block[(POINT + 1) * LANES + k]
+        pz = block[(POINT + 2) * LANES + k]
+        xn, yn = block[_XN * LANES + k], block[_YN * LANES + k]
+        tx = block[(_PIXEL + ALBEDO_SLOPE) * LANES + k]
+        ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * LANES + k]
+        r = block[(_PIXEL + ALBEDO) * LANES + k] + tx * xn + ty * yn
+        r -= block[LIGHT * LANES + k] + change
         # Where either is unknown, so is r, and no comparison holds.
-        known = (block[_FITS * _LANES + k] > none) & (r * r < np.float32(np.inf))
+        known = (block[FITS * LANES + k] > none) & (r * r < np.float32(np.inf))
         e2 = r * r * per_limit2
         fits = known & (e2 < one)
         weight = (one - e2) * (one - e2) if fits else none
         root = (one - e2) * per_p if fits else none
         r = r if fits else none
         tx, ty = tx if fits else none, ty if fits else none
-        s0 = block[LIGHT_SLOPE * _LANES + k] if fits else none
-        s1 = block[(LIGHT_SLOPE + 1) * _LANES + k] if fits else none
-        s2 = block[(LIGHT_SLOPE + 2) * _LANES + k] if fits else none
-        block[(_STAT + COUNT_P - INLIERS) * _LANES + k] = one if known else none
-        block[(_STAT + WEIGHT_P - INLIERS) * _LANES + k] = weight
-        block[(_STAT + SQUARES_P - INLIERS) * _LANES + k] = weight * r * r
+        s0 = block[LIGHT_SLOPE * LANES + k] if fits else none
+        s1 = block[(LIGHT_SLOPE + 1) * LANES + k] if fits else none
+        s2 = block[(LIGHT_SLOPE + 2) * LANES + k] if fits else none
+        block[(STAT + COUNT_P - INLIERS) * LANES + k] = one if known else none
+        block[(STAT + WEIGHT_P - INLIERS) * LANES + k] = weight
+        block[(STAT + SQUARES_P - INLIERS) * LANES + k] = weight * r * r
         # d(x/z, y/z) by the moved point, then back into the source frame.
-        per_z = one / block[_Z * _LANES + k]
+        per_z = one / block[_Z * LANES + k] if fits else none
         d0, d1, d2 = tx * per_z, ty * per_z, -(tx * xn + ty * yn) * per_z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        block[(_J + 6) * _LANES + k] = -root
-        block[_R * _LANES + k] = root * r
+        block[(JACOBIAN + 6) * LANES + k] = -root
+        block[MISFIT * LANES + k] = root * r
         _put(block, k, root, px, py, pz, m0, m1, m2, s0, s1, s2)
 
 
@@ -309,19 +315,19 @@ def _put(
     """Write J by the pose and D into column k, weighted; m and s are the sides' directions."""
     half = np.float32(0.5) * root
     a0, a1, a2 = half * (m0 + s0), half * (m1 + s1), half * (m2 + s2)
-    block[_J * _LANES + k] = a0
-    block[(_J + 1) * _LANES + k] = a1
-    block[(_J + 2) * _LANES + k] = a2
-    block[(_J + 3) * _LANES + k] = py * a2 - pz * a1
-    block[(_J + 4) * _LANES + k] = pz * a0 - px * a2
-    block[(_J + 5) * _LANES + k] = px * a1 - py * a0
+    block[JACOBIAN * LANES + k] = a0
+    block[(JACOBIAN + 1) * LANES + k] = a1
+    block[(JACOBIAN + 2) * LANES + k] = a2
+    block[(JACOBIAN + 3) * LANES + k] = py * a2 - pz * a1
+    block[(JACOBIAN + 4) * LANES + k] = pz * a0 - px * a2
+    block[(JACOBIAN + 5) * LANES + k] = px * a1 - py * a0
     a0, a1, a2 = half * (m0 - s0), half * (m1 - s1), half * (m2 - s2)
-    block[_D * _LANES + k] = a0
-    block[(_D + 1) * _LANES + k] = a1
-    block[(_D + 2) * _LANES + k] = a2
-    block[(_D + 3) * _LANES + k] = py * a2 - pz * a1
-    block[(_D + 4) * _LANES + k] = pz * a0 - px * a2
-    block[(_D + 5) * _LANES + k] = px * a1 - py * a0
+    block[DIFFERENCE * LANES + k] = a0
+    block[(DIFFERENCE + 1) * LANES + k] = a1
+    block[(DIFFERENCE + 2) * LANES + k] = a2
+    block[(DIFFERENCE + 3) * LANES + k] = py * a2 - pz * a1
+    block[(DIFFERENCE + 4) * LANES + k] = pz * a0 - px * a2
+    block[(DIFFERENCE + 5) * LANES + k] = px * a1 - py * a0
 
 
 @kernel
@@ -329,11 +335,11 @@ def _add_products(sums: Float64, block: Float32) -> None:
     """Add the products of the rows of J and r, and of those of D, column by column."""
     q = 0
     for p in range(14):
-        a = block[(_J + p) * _LANES : (_J + p + 1) * _LANES]
+        a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
         for o in range(p, 8 if p < 8 else 14):
-            b = block[(_J + o) * _LANES : (_J + o + 1) * _LANES]
+            b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
             total = sums[q]
-            for k in range(_LANES):
+            for k in range(LANES):
                 total[k] += a[k] * b[k]
             q += 1
 
@@ -402,22 +408,29 @@ def gather(
     n = 0
     for i in range(stride // 2, rows, stride):
         for j in range(stride // 2, columns, stride):
-            v = planes[i, j, 3]
-            if v <= 0:
+            if planes[i, j, 3] <= 0:
                 continue
-            x, y = rays[i, j, 0], rays[i, j, 1]
-            a, b, c = planes[i, j, 0], planes[i, j, 1], planes[i, j, 2]
-            length = np.sqrt(a * a + b * b + c * c)
-            gx, gy = photo[i, j, 1], photo[i, j, 2]
-            point = out[n]
-            point[POINT], point[POINT + 1], point[POINT + 2] = x / v, y / v, 1 / v
-            point[NORMAL], point[NORMAL + 1], point[NORMAL + 2] = a / length, b / length, c / length
-            point[SIGMA] = np.sqrt(plane_variance[i, j]) / v
-            point[LIGHT] = photo[i, j, 0]
-            point[LIGHT_SLOPE], point[LIGHT_SLOPE + 1] = gx * v, gy * v
-            point[LIGHT_SLOPE + 2] = -(gx * x + gy * y) * v
+            put_point(out[n], rays[i, j], planes[i, j], plane_variance[i, j], photo[i, j])
             n += 1
     return out[:n]
+
+
+@kernel
+def put_point(
+    point: Float32, ray: Float32, plane: Float32, variance: np.float32, light: Float32
+) -> None:
+    """Write a pixel that has a plane as a source point (POINT_SIZE,)."""
+    v = plane[3]
+    x, y = ray[0], ray[1]
+    a, b, c = plane[0], plane[1], plane[2]
+    length = np.sqrt(a * a + b * b + c * c)
+    gx, gy = light[1], light[2]
+    point[POINT], point[POINT + 1], point[POINT + 2] = x / v, y / v, 1 / v
+    point[NORMAL], point[NORMAL + 1], point[NORMAL + 2] = a / length, b / length, c / length
+    point[SIGMA] = np.sqrt(variance) / v
+    point[LIGHT] = light[0]
+    point[LIGHT_SLOPE], point[LIGHT_SLOPE + 1] = gx * v, gy * v
+    point[LIGHT_SLOPE + 2] = -(gx * x + gy * y) * v
 
 
 @kernel

@@ -82,7 +82,7 @@ def composed(A: Float64, B: Float64) -> Float64:
 
 @kernel
 def twist_between(A: Float64, B: Float64) -> Float64:
-    """Logarithm (6,) of A^-1 B, for rotations well below half a turn."""
+    """Logarithm (6,) of A^-1 B, for rotations below half a turn."""
     R = np.zeros((3, 3))
     t = np.zeros(3)
     for i in range(3):
@@ -109,3 +109,17 @@ def twist_between(A: Float64, B: Float64) -> Float64:
     out[2] = t[2] - 0.5 * a2 + c * (w0 * a1 - w1 * a0)
     out[3], out[4], out[5] = w0, w1, w2
     return out
+
+
+@kernel
+def distance_and_angle(A: Float64, B: Float64) -> tuple[float, float]:
+    """Length of the translation of A^-1 B, and angle of its rotation, 0 to pi rad."""
+    R = np.zeros((3, 3))
+    square = 0.0
+    for i in range(3):
+        square += (B[i, 3] - A[i, 3]) ** 2
+        for k in range(3):
+            for j in range(3):
+                R[i, j] += A[k, i] * B[k, j]
+    sine2 = (R[2, 1] - R[1, 2]) ** 2 + (R[0, 2] - R[2, 0]) ** 2 + (R[1, 0] - R[0, 1]) ** 2
+    return np.sqrt(square), np.arctan2(np.sqrt(sine2), R[0, 0] + R[1, 1] + R[2, 2] - 1.0)

@@ -197,7 +197,9 @@ def fit_planes(
                     quality[i, j, 0] = left_over
                 value = mw + a * dx + b * dy
                 off = np.float64(w[i, j]) - value
-                if left_over > allowed[q, int(n)] or off * off * weight[i, j] > 25 * limit or value <= 0:
+                if left_over > allowed[q, int(n)]:
+                    break
+                if off * off * weight[i, j] > 25 * limit or value <= 0:
                     break
                 if q == 0:
                     leverage = (cyy * dx * dx - 2 * cxy * dx * dy + cxx * dy * dy) * per_det
@@ -270,6 +272,7 @@ def albedo_image(
     there is no plane, no light, or the surface is seen too slantwise.
     """
     rows, columns = light.shape
+    one = np.float32(1)
     for i in range(rows):
         for j in range(columns):
             out[i, j] = np.nan
@@ -281,14 +284,14 @@ def albedo_image(
             a = planes[i, j, 0]
             b = planes[i, j, 1]
             c = planes[i, j, 2]
-            length2 = x * x + y * y + 1
+            length2 = x * x + y * y + one
             # The normal is (a, b, c), and (a, b, c) . (x, y, 1) = 1/z.
             cosine = v / np.sqrt((a * a + b * b + c * c) * length2)
-            if cosine < 0.15:
+            if cosine < np.float32(0.15):
                 continue
-            shade = cosine if own_lamp else 1.0
+            shade = cosine if own_lamp else one
             apart = length2 / (v * v)  # the squared range
-            out[i, j] = np.log(light[i, j] / shade * (apart if falls else 1.0))
+            out[i, j] = np.log(light[i, j] / shade * (apart if falls else one))
 
 
 @kernel

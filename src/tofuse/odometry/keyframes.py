@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.kernels.motion import distance_and_angle
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.odometry.likeness import likeness, thumbnail
@@ -30,6 +32,7 @@ from tofuse.registration.projective import (
 from tofuse.registration.search import Match, SearchOptions, search
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Guess = Literal["identity", "previous", "odometry"]
 
@@ -235,6 +238,10 @@ class _Keyframe:
     depth: float  # median, m
     thumbnail: Float64
 
+    @cached_property
+    def target(self) -> Target:
+        return Target(self.view, se3.inverse(self.T_world_camera))
+
 
 @dataclass(frozen=True, eq=False)
 class _Found:
@@ -287,11 +294,11 @@ class _KeyframeTracker(Tracker):
         view = surface_map(frame, options.surface)
         if np.count_nonzero(view.planes[..., 3]) < options.minimum_points:
             return self._lose("nearly no surface in what is left of the image")
-        now = Moment(frame.index, frame.timestamp)
+        now, look = Moment(frame.index, frame.timestamp), glance(view.z)
         if self._T is None:
             self._keep(view, np.eye(4))
             self._T = np.eye(4)
-            self._follow(frame, view, self._T, T_odometry, now)
+            self._follow(frame, view, look, self._T, T_odometry, now)
             return Step("tracked", "", np.eye(4), surface=view)
 
         reasons: list[str] = []
@@ -304,7 +311,7 @@ class _KeyframeTracker(Tracker):
         else:
             found = self._track(view, expected, reasons)
         since = now.seconds_since(self._before)
-        if self._is_suspicious(view, found, expected, since):
+        if self._is_suspicious(look, found, expected, since):
             mended = self._mend(frame, expected, found)
             if mended is not None:
                 return self._follow_mended(mended, T_odometry, now)
@@ -331,7 +338,7 @@ class _KeyframeTracker(Tracker):
             self._doubted = frame.index, step
             return self._lose(f"fits keyframe {reference.view.index}, but {surprise}")
         earlier: tuple[tuple[int, Step], ...] = ()
-        if self._follow(frame, view, T, T_odometry, now):
+        if self._follow(frame, view, look, T, T_odometry, now):
             words = "the camera jumped, and this view goes on from there"
             step = replace(step, reason="; ".join(filter(None, (step.reason, words))))
             if self._doubted is not None:
@@ -347,18 +354,19 @@ class _KeyframeTracker(Tracker):
         self,
         frame: RangeFrame,
         view: SurfaceMap,
+        look: Float32,
         T: Float64,
         T_odometry: Float64 | None,
         now: Moment,
     ) -> bool:
         """Take the pose of a frame; returns whether the camera jumped to get there."""
         self._T, self._T_odometry, self._before, self._lost = T, T_odometry, now, False
-        self._depth, self._frame, self._glance = view.depth, frame, glance(view.z)
+        self._depth, self._frame, self._glance = view.depth, frame, look
         return self._motion.follow(T)
 
     def _is_suspicious(
         self,
-        view: SurfaceMap,
+        look: Float32,
         found: _Found | None,
         expected: Float64 | None,
         seconds: float | None,
@@ -370,7 +378,7 @@ class _KeyframeTracker(Tracker):
             return True
         T = found.aligned.T_world_source
         return self._motion.is_surprising(T, expected, seconds) or looks_turned_over(
-            self._glance, glance(view.z)
+            self._glance, look
         )
 
     def _mend(
@@ -382,7 +390,7 @@ class _KeyframeTracker(Tracker):
         options = self._options
         before = self._mended
         keyframe = self._keyframes[-1] if before is None else before.target
-        targets = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+        targets = [keyframe.target]
         start = self._T if expected is None else expected
         wrong: Iterable[Mending] = () if before is None else [before.mending]
         wrong = wrong or mendings(self._frame, frame, se3.inverse(self._T) @ start)
@@ -403,11 +411,12 @@ class _KeyframeTracker(Tracker):
         """Follow the camera by an image that is wrong, which gets no pose for that."""
         self._motion.dismiss()
         T = mended.aligned.T_world_source
-        self._follow(mended.frame, mended.view, T, T_odometry, now)
+        view = mended.view
+        self._follow(mended.frame, view, glance(view.z), T, T_odometry, now)
         self._doubted = None
         if self._is_new(T, mended.target):
             # Poses that are told must not rest on it, so it is no keyframe like others.
-            mended = replace(mended, target=_keyframe(mended.view, T))
+            mended = replace(mended, target=_keyframe(view, T))
         self._mended = mended
         words = "it fits where the camera was expected once that is undone"
         return Step("lost", f"the image is {mended.mending.words}: {words}", None)
@@ -462,7 +471,7 @@ class _KeyframeTracker(Tracker):
                 f"{newest[-1].depth:.2g} m, and of this view {view.depth:.2g} m"
             )
             return None
-        targets = [Target(k.view, se3.inverse(k.T_world_camera)) for k in newest]
+        targets = [k.target for k in newest]
         for predicted, start, how, chosen in self._predictions(view, targets, expected):
             aligned = align(view, targets, predicted, how, start=start)
             if how is options.alignment:
@@ -523,14 +532,14 @@ class _KeyframeTracker(Tracker):
             keyframe = self._keyframes[k]
             if not _is_comparable(view.depth, keyframe.depth):
                 continue
-            target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+            target = [keyframe.target]
             coarse = align(view, target, keyframe.T_world_camera, wide)
             if not options.relocated.objection(coarse, view.depth):
                 found.append((coarse.score, k, coarse.T_world_source))
         fits = []
         for _, k, T in sorted(found, key=lambda one: (-one[0], one[1])):
             keyframe = self._keyframes[k]
-            target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+            target = [keyframe.target]
             aligned = align(view, target, T, fine)
             # A flat wall fits anywhere: only a view that is held in every direction is found again.
             objection = options.relocated.objection(aligned, view.depth)
@@ -574,7 +583,7 @@ class _KeyframeTracker(Tracker):
             if match is None or not recovery.believes(match, self._lost):
                 continue
             T = keyframe.T_world_camera @ match.T_target_source
-            target = [Target(keyframe.view, se3.inverse(keyframe.T_world_camera))]
+            target = [keyframe.target]
             near = replace(
                 options.alignment,
                 levels=_PATIENT,
@@ -587,11 +596,10 @@ class _KeyframeTracker(Tracker):
         return None
 
     def _is_new(self, T: Float64, reference: _Keyframe) -> bool:
-        motion = se3.inverse(reference.T_world_camera) @ T
         options = self._options
-        return bool(
-            se3.angle(motion) > options.keyframe_angle
-            or np.linalg.norm(motion[:3, 3]) > options.keyframe_distance * reference.depth
+        distance, angle = distance_and_angle(reference.T_world_camera, T)
+        return (
+            angle > options.keyframe_angle or distance > options.keyframe_distance * reference.depth
         )
 
     def _keep(self, view: SurfaceMap, T: Float64) -> None:

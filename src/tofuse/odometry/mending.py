@@ -107,7 +107,8 @@ def glance(z: Float32) -> Float32:
     i = (np.arange(_ROWS) * 2 + 1) * rows // (2 * _ROWS)
     j = (np.arange(_COLUMNS) * 2 + 1) * columns // (2 * _COLUMNS)
     some = z[i[:, None], j]
-    return np.log(some, out=np.full_like(some, np.nan), where=some > 0)
+    some[some <= 0] = np.nan
+    return np.log(some)
 
 
 def looks_turned_over(before: Float32, now: Float32) -> bool:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.geometry import se3
+from tofuse.kernels.motion import distance_and_angle, moved, twist_between
 
 Float64 = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class Motion:
         """
         if expected is None or self._missed >= _FORGOTTEN:
             return ""
-        difference = _size(se3.inverse(expected) @ T)
+        difference = _apart(expected, T)
         allowed = self._allowed(expected, seconds)
         if (difference <= allowed * (self._missed + 1)).all():
             self._differences.append(difference / (self._missed + 1))
@@ -80,7 +80,7 @@ class Motion:
             return ""
         if self._elsewhere is not None and self._per_frame is not None:
             onward = _onward(self._elsewhere, self._per_frame, self._waited + 1)
-            if (_size(se3.inverse(onward) @ T) <= allowed * (self._waited + 1)).all():
+            if (_apart(onward, T) <= allowed * (self._waited + 1)).all():
                 return ""
         self._elsewhere, self._waited = T, -1  # the call of `miss` follows
         return (
@@ -95,7 +95,7 @@ class Motion:
         if self._differences:
             usual = np.max(self._differences, axis=0)
         else:
-            usual = _size(se3.inverse(self._T) @ expected)
+            usual = _apart(self._T, expected)
         return np.asarray(_reach(seconds, self._missed + 1) + _TIMES * usual, np.float64)
 
     def is_surprising(
@@ -105,7 +105,7 @@ class Motion:
         if expected is None or self._missed >= _FORGOTTEN:
             return False
         allowed = self._allowed(expected, seconds) * (self._missed + 1)
-        return bool((_size(se3.inverse(expected) @ T) > allowed).any())
+        return bool((_apart(expected, T) > allowed).any())
 
     def follow(self, T: Float64) -> bool:
         """Take the pose of the next frame; returns whether the camera jumped to get there."""
@@ -116,7 +116,7 @@ class Motion:
         if before is None or frames > _FORGOTTEN:
             self._per_frame = None
         elif frames > 0:  # at the place of a surprise itself the motion is taken to go on
-            self._per_frame = se3.log(se3.inverse(before) @ T) / frames
+            self._per_frame = twist_between(before, T) / frames
         self._T, self._missed, self._elsewhere = T, 0, None
         return jumped
 
@@ -139,7 +139,7 @@ class Motion:
 
 def is_small(T: Float64) -> bool:
     """Whether a motion (4, 4) is one that needs no explanation."""
-    return bool((_size(T) <= FLOOR).all())
+    return bool((_apart(np.eye(4), T) <= FLOOR).all())
 
 
 def jumps(
@@ -179,9 +179,9 @@ def _reach(seconds: float | None, frames: int) -> Float64:
 
 def _onward(T: Float64, per_frame: Float64, frames: int) -> Float64:
     """Pose (4, 4) after so many frames of a motion (6,)."""
-    return se3.orthonormalise(T @ se3.exp(per_frame * frames))
+    return moved(T, per_frame * frames)
 
 
-def _size(T: Float64) -> Float64:
-    """Distance in m and angle in rad of a motion (4, 4)."""
-    return np.array([np.linalg.norm(T[:3, 3]), float(se3.angle(T))])
+def _apart(A: Float64, B: Float64) -> Float64:
+    """Distance in m and angle in rad of the motion from one pose (4, 4) to another."""
+    return np.array(distance_and_angle(A, B))

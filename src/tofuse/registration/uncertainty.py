@@ -16,16 +16,17 @@ true pose, and its covariance ``X^-1 B X^-1`` with X the slope of g and B its co
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.geometry import se3
 from tofuse.kernels import tiles as kernels
 from tofuse.kernels.middle import median
-from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.motion import distance_and_angle
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target
 
@@ -142,58 +143,58 @@ def patches(
     some = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
     some = some[some > 0]
     depth = 1 / median(some) if len(some) else 1.0
-    sums = []
+    distances = []
+    upper = np.zeros((3, kernels.UPPER))
     changes = []
     for target in targets:
         view = target.view
         T = np.ascontiguousarray(target.T_target_world @ aligned.T_world_source)
-        changes.append(float(se3.angle(T)) + float(np.linalg.norm(T[:3, 3])) / depth)
-
-        def work(a: int, b: int, view: SurfaceMap = view, T: Float64 = T) -> Float64:
-            return kernels.tile_sums(
-                source.rays,
-                source.planes,
-                source.plane_variance,
-                source.photo,
-                view.target,
-                view.projection.lookup,
-                view.projection.frame,
-                T,
-                aligned.exposure,
-                aligned.scale,
-                aligned.photo_scale if photometric else 0.0,
-                alignment.robust,
-                float(np.cos(alignment.max_angle)),
-                stride,
-                across,
-                down,
-                a,
-                b,
-            )
-
-        sums.append(np.concatenate(run_chunks(work, down, 2)))
-    v, u = np.mgrid[:down, :across]
-    places = np.stack([u / across, v * rows / (down * columns)], -1).reshape(-1, 2)
-    total = np.stack(sums).reshape(-1, 2, kernels.SIZE)
-    places = np.tile(places, (len(targets), 1))
-    whole = total.sum(0)
-    geometry, photo = (_matrix(whole[k, kernels.H : kernels.H + 28]) for k in range(2))
-    distances = total[:, kernels.GEOMETRY]
-    told = distances[:, kernels.COUNT] >= _LEAST_PIXELS
-    distances = distances[told]
-    weights = distances[:, kernels.WEIGHT]
+        moved, turned = distance_and_angle(np.eye(4), T)
+        changes.append(turned + moved / depth)
+        of_tiles, of_image = kernels.tile_sums(
+            source.rays,
+            source.planes,
+            source.plane_variance,
+            source.photo,
+            view.target,
+            view.projection.lookup,
+            view.projection.frame,
+            T,
+            aligned.exposure,
+            aligned.scale,
+            aligned.photo_scale if photometric else 0.0,
+            alignment.robust,
+            math.cos(alignment.max_angle),
+            stride,
+            across,
+            down,
+        )
+        distances.append(of_tiles)
+        upper += of_image
+    total = np.concatenate(distances)
+    told = total[:, kernels.COUNT] >= _LEAST_PIXELS
+    places = np.tile(_places(rows, columns, across, down), (len(targets), 1))[told]
+    total = total[told]
+    weights = total[:, kernels.WEIGHT]
     return Patches(
-        geometry,
-        photo,
-        _matrix(whole[:, kernels.CROSS : kernels.CROSS + 28].sum(0)),
-        places[told],
+        _matrix(upper[kernels.GEOMETRY]),
+        _matrix(upper[kernels.PHOTO]),
+        _matrix(upper[kernels.CROSS]),
+        places,
         weights,
-        distances[:, kernels.RESIDUAL] / weights,
-        distances[:, kernels.A : kernels.A + 7] * _SCALE,
-        float(np.mean(changes)) if changes else 0.0,
+        total[:, kernels.RESIDUAL] / weights,
+        total[:, kernels.A : kernels.A + 7] * _SCALE,
+        sum(changes) / len(changes),
         depth,
         stride,
     )
+
+
+@cache
+def _places(rows: int, columns: int, across: int, down: int) -> Float64:
+    """(down * across, 2) column and row of the tiles, as a share of the image's width."""
+    v, u = np.mgrid[:down, :across]
+    return np.stack([u / across, v * rows / (down * columns)], -1).reshape(-1, 2)
 
 
 def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
@@ -203,7 +204,8 @@ def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float6
     B = max(1.0, options.noise_pixels / per_pixel) * found.geometry
     B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
     if len(found.weights) >= _LEAST_TILES:
-        apart = np.linalg.norm(found.places[:, None] - found.places[None], axis=-1)
+        x, y = found.places.T
+        apart = np.hypot(x[:, None] - x, y[:, None] - y)
         alike = np.exp(-apart / options.reach)
         seen = _seen_variance(found, bread, alike, options)
         hidden = (options.hidden * found.depth * found.change) ** 2
