@@ -270,9 +270,9 @@ class SurfaceMap:
     pixel_variance: Float32 | None = None
     _thinned: dict[int, SurfaceMap] = field(default_factory=dict, init=False, repr=False)
 
-    @cached_property
+    @property
     def normals(self) -> Float32:
-        """(H, W, 3) unit normals away from the camera, 0 where unknown."""
+        """(H, W, 3) unit normals away from the camera, 0 where unknown; made anew each time."""
         abc = self.planes[..., :3]
         length = np.sqrt((abc * abc).sum(-1, keepdims=True))
         return np.where(self.planes[..., 3:] > 0, abc / np.maximum(length, 1e-12), 0).astype(
@@ -289,6 +289,10 @@ class SurfaceMap:
         if self.pixel_variance is None:
             return self
         return replace(self, plane_variance=self.pixel_variance, pixel_variance=None)
+
+    def bare(self) -> SurfaceMap:
+        """Return the view without what was derived from it, which takes as much memory again."""
+        return replace(self)
 
     def thinned(self, columns: int) -> SurfaceMap:
         """Return the view at every n-th pixel, so that it has at most so many columns.

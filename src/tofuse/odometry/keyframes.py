@@ -604,6 +604,10 @@ class _KeyframeTracker(Tracker):
 
     def _keep(self, view: SurfaceMap, T: Float64) -> None:
         self._keyframes.append(_keyframe(view, T))
+        before = len(self._keyframes) - 1 - self._options.targets
+        if before >= 0:  # only lost views are held against it from here on
+            keyframe = self._keyframes[before]
+            self._keyframes[before] = replace(keyframe, view=keyframe.view.bare())
         if len(self._keyframes) > _REMEMBERED:
             del self._keyframes[self._dispensable()]
 

@@ -384,10 +384,15 @@ class Mapper:
             )
         self._live.finish()
         stages = stages or NotKept()
+        # What a stage was the last to look at makes room for the next one.
+        del self._tracker, self._correctors, self._history
         with threads(self.threads):
             closed = self._staged(stages, "loops", self._close)
+            del self._live, self._loops
             refined = self._staged(stages, "refinement", lambda: self._refine(closed))
+            del self._refiner
             fused = self._staged(stages, "fusion", lambda: self._fuse(closed, refined))
+            del self._model
             return self._check_all(closed, refined, fused)
 
     def _staged(self, stages: Stages, name: str, work: Callable[[], T]) -> T:
