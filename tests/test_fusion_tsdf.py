@@ -14,6 +14,7 @@ from tofuse.fusion.upright import upright
 from tofuse.fusion.views import RangeView, without_camera_errors
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole, ray_lengths
+from tofuse.kernels import tsdf
 from tofuse.kernels.threads import threads
 from tofuse.kernels.tsdf import block_of
 from tofuse.posegraph.refinement import without_errors
@@ -471,3 +472,37 @@ def test_up_is_the_floor_s_normal_or_the_cameras(tilt) -> None:
         np.testing.assert_allclose(R @ down, [0, -1, 0], atol=0.03)
     wall_only = fuse_surface([RangeView.of(frame_of(wall))], EYE[None], Fusion(voxel_m=0.03))
     np.testing.assert_allclose(upright(wall_only, EYE[None]), np.diag([1, -1, -1]), atol=1e-12)
+
+
+def test_packed_views_against_a_slow_twin() -> None:
+    rng = np.random.default_rng(5)
+    shape = (6, 7)
+    rays = rng.uniform(-0.8, 0.8, (*shape, 2)).astype(np.float32)
+    rays[0, 0] = np.nan
+    planes = np.concatenate(
+        [rng.normal(0, 1, (*shape, 2)), rng.uniform(0.2, 1, (*shape, 2))], -1
+    ).astype(np.float32)
+    planes[rng.random(shape) < 0.3] = 0
+    planes[0, 0] = 0
+    variance = rng.uniform(1e-6, 1e-4, shape).astype(np.float32)
+    good = rng.random(shape) < 0.8
+    normals, weights = np.full((*shape, 3), 99, np.int8), np.full(shape, -1, np.float32)
+    lengths2 = (1 + (rays * rays).sum(-1)).astype(np.float32)
+    tsdf.pack_view(planes, rays, lengths2, variance, good, 0.1, 0.25, normals, weights)
+    assert weights[0, 0] == 0
+    assert not normals[0, 0].any()
+    kept = 0
+    for r, c in np.ndindex(shape):
+        if (r, c) == (0, 0):
+            continue
+        ray = np.array([*rays[r, c], 1.0])
+        fitted = planes[r, c, 3] > 0
+        n = planes[r, c, :3].astype(float) if fitted else ray
+        n = n / np.linalg.norm(n)
+        cosine = n @ ray / np.linalg.norm(ray)
+        expected = (1 if fitted else 0.25) / (cosine**2 * variance[r, c])
+        expected *= good[r, c] and cosine > 0.1
+        kept += expected > 0
+        assert weights[r, c] == pytest.approx(expected, rel=1e-4)
+        assert np.abs(normals[r, c] - 127 * n).max() < 0.51
+    assert 10 < kept < good.sum()

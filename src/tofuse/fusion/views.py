@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.kernels.tsdf import unpack_view
+from tofuse.kernels.tsdf import pack_view, unpack_view
 from tofuse.maps.surface_map import (
     Projection,
     SurfaceMap,
@@ -88,18 +88,21 @@ class RangeView:
         valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
         smoothed, variance = _smoothed(surface)
         z = np.where(valid, smoothed, np.float32(0))
-        rays = surface.rays
-        lengths = np.sqrt(surface.projection.lengths2)
-        normals = surface.normals
-        fitted = (normals != 0).any(-1)
-        cosine = (normals[..., 0] * rays[..., 0] + normals[..., 1] * rays[..., 1]) + normals[..., 2]
-        cosine = np.where(fitted, cosine / lengths, np.float32(1))
-        straight = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) / lengths[..., None]
-        normals = np.where(fitted[..., None], normals, straight)
-        good = (z > 0) & (surface.sigma > 0) & (cosine > _LEAST_COSINE)
-        good &= ~_near_jumps(surface, options)
-        weight = np.divide(1, cosine * cosine * variance, out=np.zeros_like(z), where=good)
-        weight[~fitted] *= np.float32(_UNFITTED)
+        good = (z > 0) & (surface.sigma > 0) & ~_near_jumps(surface, options)
+        normals = np.empty((*shape, 3), np.int8)
+        weight = np.empty(shape, np.float32)
+        pack_view(
+            surface.planes,
+            surface.rays,
+            surface.projection.lengths2,
+            variance,
+            good,
+            _LEAST_COSINE,
+            _UNFITTED,
+            normals,
+            weight,
+        )
+        good = weight > 0
         farthest = float(z.max(initial=0.0))
         unit = max(farthest, 1e-3) / 65535
         return cls(
@@ -108,7 +111,7 @@ class RangeView:
             surface.projection,
             np.round(z / unit).astype(np.uint16),
             unit,
-            np.round(127 * np.nan_to_num(normals)).astype(np.int8),
+            normals,
             _encoded(weight),
             _light(frame, shape),
             float(np.sqrt(np.median(variance[good]))) if good.any() else 0.0,

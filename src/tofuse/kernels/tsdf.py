@@ -138,6 +138,57 @@ def neighbours_of(keys: Int64, out: Int32) -> None:
 
 
 @kernel
+def pack_view(
+    planes: Float32,
+    rays: Float32,
+    lengths2: Float32,
+    variance: Float32,
+    good: NDArray[np.bool_],
+    least_cosine: float,
+    unfitted: float,
+    normals: NDArray[np.int8],
+    weights: Float32,
+) -> None:
+    """Fill what `unpack_view` needs of a view: `normals` (H, W, 3), and `weights` (H, W) in 1/m^2.
+
+    Parameters
+    ----------
+    planes
+        (H, W, 4) a, b, c of a X + b Y + c Z = 1, and 1/z on it: 0 where none is fitted.
+    rays, lengths2
+        (H, W, 2) x/z and y/z, and (H, W) the squared ratio of the range to z; NaN where unknown.
+    variance, good
+        (H, W) of the depth in m^2, and whether it is to be believed.
+    least_cosine
+        Of the incidence of light that is believed.
+    unfitted
+        Weights without a plane, which then faces the camera, count so many times.
+    """
+    rows, columns = good.shape
+    for r in range(rows):
+        for c in range(columns):
+            length = np.sqrt(lengths2[r, c])
+            fitted = planes[r, c, 3] > 0
+            if fitted:
+                x, y, z = planes[r, c, 0], planes[r, c, 1], planes[r, c, 2]
+            else:
+                x, y, z = rays[r, c, 0], rays[r, c, 1], np.float32(1)
+            norm = np.sqrt(x * x + y * y + z * z)
+            weights[r, c] = 0
+            if not (norm > 0 and length > 0):
+                normals[r, c, 0] = normals[r, c, 1] = normals[r, c, 2] = 0
+                continue
+            x, y, z = x / norm, y / norm, z / norm
+            normals[r, c, 0] = np.int8(np.rint(np.float32(127) * x))
+            normals[r, c, 1] = np.int8(np.rint(np.float32(127) * y))
+            normals[r, c, 2] = np.int8(np.rint(np.float32(127) * z))
+            cosine = (x * rays[r, c, 0] + y * rays[r, c, 1] + z) / length
+            if good[r, c] and cosine > least_cosine:
+                of_distance = cosine * cosine * variance[r, c]
+                weights[r, c] = (1.0 if fitted else unfitted) / of_distance
+
+
+@kernel
 def unpack_view(
     z: UInt16,
     unit: float,
