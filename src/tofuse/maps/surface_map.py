@@ -345,11 +345,11 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     """
     projection, z, light, own = _reduced(frame, options.columns)
     rays = projection.rays
-    w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
+    w = _inverse(z, z > 0)
     lit = frame.amplitude_image is not None
     sigma = _noise_law(frame, z, light if lit else None, projection) if own is None else own
     # d(1/z) = dz / z^2
-    weight = np.divide(1, (sigma * w * w) ** 2, out=np.zeros_like(z), where=(z > 0) & (sigma > 0))
+    weight = _inverse((sigma * w * w) ** 2, (z > 0) & (sigma > 0))
     noise = _typical_noise(w, weight)
     options = options.for_noise(noise)
     if options.edge_margin:
@@ -403,6 +403,11 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         has_photo,
         pixel_variance=None if shared is None else own_variance,
     )
+
+
+def _inverse(values: Float32, known: NDArray[np.bool_]) -> Float32:
+    """One over each value, 0 where it is not known: at once for all, which is faster."""
+    return np.float32(1) / np.where(known, values, np.float32(np.inf))
 
 
 def _projection(camera: Camera, step: int) -> Projection:
@@ -527,13 +532,14 @@ def _noise_law(
         raw = light
     else:
         r2 = z * z * projection.lengths2
-        raw = np.divide(light, r2, out=np.zeros_like(z), where=r2 > 0)
+        raw = light * _inverse(r2, r2 > 0)
     lit = raw[::2, ::2]
     lit = lit[lit > 0]
     if len(lit) == 0:
         return np.float32(0.001) + np.float32(0.003) * z * z
     typical = np.float32(median(lit))
-    law = np.divide(typical, raw, out=np.full_like(z, 20), where=raw > 0)
+    # The least that is above 0 stands for no light: the law ends far before.
+    law = typical / np.fmax(raw, np.float32(1e-6) * typical)
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
 
 

@@ -118,5 +118,4 @@ def looks_turned_over(before: Float32, now: Float32) -> bool:
 
 
 def _apart(a: Float32, b: Float32) -> float:
-    both = np.abs(a - b)
-    return float(np.where(np.isnan(both), _FARTHEST, np.minimum(both, _FARTHEST)).mean())
+    return float(np.fmin(np.abs(a - b), np.float32(_FARTHEST)).mean())
