@@ -7,8 +7,6 @@ images, so windows can be as wide as the noise asks for and the surface allows.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -317,45 +315,49 @@ def smooth_and_slope(
     above = max(start - h, 0)
     mean = np.empty((min(stop + h, rows) - above, columns, 3), np.float32)
     _box_means(image, rays, radius, above, mean)
-    cross = np.empty((4, 3))
+    inner = columns - 2 * h
     for i in range(start, stop):
-        for j in range(columns):
-            out[i, j, 0] = np.nan
-            out[i, j, 1] = np.nan
-            out[i, j, 2] = np.nan
-            v = planes[i, j, 3]
-            if v <= 0 or i < h or j < h or i >= rows - h or j >= columns - h:
+        out[i] = np.nan
+        if i < h or i >= rows - h or inner <= 0:
+            continue
+        # The pixels that have a cross, and its four ends.
+        here, k = slice(h, h + inner), i - above
+        m, p, r = mean[k, here], planes[i, here], rays[i, here]
+        m0, p0, r0 = mean[k, :inner], planes[i, :inner], rays[i, :inner]
+        m1, p1, r1 = mean[k, 2 * h :], planes[i, 2 * h :], rays[i, 2 * h :]
+        m2, p2, r2 = mean[k - h, here], planes[i - h, here], rays[i - h, here]
+        m3, p3, r3 = mean[k + h, here], planes[i + h, here], rays[i + h, here]
+        light, to = image[i, here], out[i, here]
+        for j in range(inner):
+            v = p[j, 3]
+            if v <= 0 or np.isnan(light[j]):
                 continue
-            if np.isnan(image[i, j]):
+            most = np.float32(jump) * v
+            if not (
+                _continues(p[j], p0[j], r0[j], most)
+                and _continues(p[j], p1[j], r1[j], most)
+                and _continues(p[j], p2[j], r2[j], most)
+                and _continues(p[j], p3[j], r3[j], most)
+            ):
                 continue
-            good = True
-            for k in range(4):
-                ci = i + (h if k == 3 else (-h if k == 2 else 0))
-                cj = j + (h if k == 1 else (-h if k == 0 else 0))
-                u = planes[ci, cj, 3]
-                expected = (
-                    planes[i, j, 0] * rays[ci, cj, 0]
-                    + planes[i, j, 1] * rays[ci, cj, 1]
-                    + planes[i, j, 2]
-                )
-                if u <= 0 or abs(u - expected) > jump * v or np.isnan(mean[ci - above, cj, 0]):
-                    good = False
-                    break
-                for c in range(3):
-                    cross[k, c] = mean[ci - above, cj, c]
-            if not good:
-                continue
-            # Chain rule: slopes by pixel to slopes by ray coordinate, for any lens.
-            du, dv = cross[1, 0] - cross[0, 0], cross[3, 0] - cross[2, 0]
-            xu, xv = cross[1, 1] - cross[0, 1], cross[3, 1] - cross[2, 1]
-            yu, yv = cross[1, 2] - cross[0, 2], cross[3, 2] - cross[2, 2]
-            det = xu * yv - yu * xv
-            sx = (yv * du - yu * dv) / det
-            sy = (xu * dv - xv * du) / det
-            here = mean[i - above, j]
-            out[i, j, 0] = here[0] + sx * (rays[i, j, 0] - here[1]) + sy * (rays[i, j, 1] - here[2])
-            out[i, j, 1] = sx
-            out[i, j, 2] = sy
+            # Chain rule: slopes by pixel to slopes by ray coordinate, for any lens. A mean that is
+            # missing is NaN, and so is what it takes part in.
+            du, dv = m1[j, 0] - m0[j, 0], m3[j, 0] - m2[j, 0]
+            xu, xv = m1[j, 1] - m0[j, 1], m3[j, 1] - m2[j, 1]
+            yu, yv = m1[j, 2] - m0[j, 2], m3[j, 2] - m2[j, 2]
+            per_det = np.float32(1) / (xu * yv - yu * xv)
+            sx = (yv * du - yu * dv) * per_det
+            sy = (xu * dv - xv * du) * per_det
+            to[j, 0] = m[j, 0] + sx * (r[j, 0] - m[j, 1]) + sy * (r[j, 1] - m[j, 2])
+            to[j, 1] = sx
+            to[j, 2] = sy
+
+
+@kernel
+def _continues(plane: Float32, other: Float32, ray: Float32, most: np.float32) -> bool:
+    """Whether a plane goes on to another pixel, to within `most` of its inverse depth."""
+    expected = plane[0] * ray[0] + plane[1] * ray[1] + plane[2]
+    return other[3] > 0 and abs(other[3] - expected) <= most
 
 
 @kernel
@@ -365,18 +367,20 @@ def _box_means(image: Float32, rays: Float32, radius: int, above: int, out: Floa
     out is (rows, W, 3): mean, x and y; NaN where the box is empty.
     """
     rows, columns = image.shape
-    full = (2 * radius + 1) * (2 * radius + 1)
-    known = np.empty(columns)
+    full = np.float32((2 * radius + 1) * (2 * radius + 1))
+    per_full = np.float32(1) / full
+    known = np.empty(columns, np.float32)
+    one, none = np.float32(1), np.float32(0)
     # Sums over the box's rows, with a margin of zeros, and over its columns as well.
-    down = np.zeros((4, columns + 2 * radius))
-    box = np.empty((4, columns))
+    down = np.zeros((4, columns + 2 * radius), np.float32)
+    box = np.empty((4, columns), np.float32)
     for k in range(out.shape[0]):
         i = above + k
         down[:, radius : radius + columns] = 0.0
         for a in range(max(i - radius, 0), min(i + radius + 1, rows)):
             line = image[a]
             for j in range(columns):
-                known[j] = 0.0 if np.isnan(line[j]) else 1.0
+                known[j] = none if np.isnan(line[j]) else one
             _add_known(down[0, radius:], line, known)
             _add_known(down[1, radius:], known, known)
             _add_known(down[2, radius:], rays[a, :, 0], known)
@@ -388,13 +392,16 @@ def _box_means(image: Float32, rays: Float32, radius: int, above: int, out: Floa
                 for j in range(columns):
                     total[j] += part[j]
         for j in range(columns):
-            count = box[1, j]
-            out[k, j, 0] = box[0, j] / count
-            out[k, j, 1] = rays[i, j, 0] if count == full else box[2, j] / count
-            out[k, j, 2] = rays[i, j, 1] if count == full else box[3, j] / count
+            if box[1, j] == full:
+                out[k, j, 0] = box[0, j] * per_full
+                out[k, j, 1], out[k, j, 2] = rays[i, j, 0], rays[i, j, 1]
+            else:
+                for c in range(3):
+                    out[k, j, c] = box[c if c == 0 else c + 1, j] / box[1, j]
 
 
 @kernel
-def _add_known(total: Float64, values: NDArray[np.floating[Any]], known: Float64) -> None:
+def _add_known(total: Float32, values: Float32, known: Float32) -> None:
+    none = np.float32(0)
     for j in range(len(known)):
-        total[j] += values[j] if known[j] > 0 else 0.0
+        total[j] += values[j] if known[j] > none else none
