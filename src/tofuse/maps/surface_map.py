@@ -407,7 +407,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
 
 def _inverse(values: Float32, known: NDArray[np.bool_]) -> Float32:
     """One over each value, 0 where it is not known: at once for all, which is faster."""
-    return np.float32(1) / np.where(known, values, np.float32(np.inf))
+    return np.reciprocal(np.where(known, values, np.float32(np.inf)))
 
 
 def _projection(camera: Camera, step: int) -> Projection:
@@ -539,7 +539,7 @@ def _noise_law(
         return np.float32(0.001) + np.float32(0.003) * z * z
     typical = np.float32(median(lit))
     # The least that is above 0 stands for no light: the law ends far before.
-    law = typical / np.fmax(raw, np.float32(1e-6) * typical)
+    law = np.asarray(typical / np.fmax(raw, np.float32(1e-6) * typical), np.float32)
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
 
 
