@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from tofuse.calibration.board import Board
 from tofuse.calibration.camera_json import recording_fields, write_camera_json
+from tofuse.calibration.depth import calibrate_depth, composed
 from tofuse.calibration.lens import calibrate_lens
 from tofuse.calibration.lens_files import read_lens_file
+from tofuse.calibration.plane_views import board_planes, scene_planes
 from tofuse.errors import InputError
+from tofuse.files.atomic import make_folder, replacing
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.recordings.camera_file import camera_fields
+from tofuse.recordings.native import read_correction
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
+from tofuse.sensor.correction import DepthCorrection
 
 # What a subject gives: data for JSON, lines to print, and warnings.
 Told = tuple[dict[str, Any], list[str], list[str]]
 _NAMED = 8
+_MOST_PLANES = 20
 
 
 def lens(arguments: argparse.Namespace) -> Told:
@@ -38,6 +45,59 @@ def lens(arguments: argparse.Namespace) -> Told:
         write_camera_json(arguments.out, fit.camera, about, overwrite=arguments.overwrite)
         lines.append(f"written to {arguments.out}")
     return fit.to_dict(), lines, list(fit.warnings)
+
+
+def depth(arguments: argparse.Namespace) -> Told:
+    """``tofuse calibrate depth``."""
+    recording = _recording(arguments)
+    earlier = _earlier_correction(arguments, recording)
+    if arguments.board is not None:
+        board = Board.parse(arguments.board)
+        views, camera = board_planes(recording, board, arguments.image, wall=arguments.wall)
+    else:
+        if arguments.wall:
+            raise InputError("needs a board on it", where="--wall", remedy="give --board too")
+        if arguments.planes > _MOST_PLANES:
+            raise InputError(
+                f"is {arguments.planes}", where="--planes", remedy=f"give {_MOST_PLANES} at most"
+            )
+        views, camera = scene_planes(recording, arguments.planes, arguments.seed or 0)
+    fit = calibrate_depth(views, camera, recording.path)
+    low, high = fit.range_m
+    lines = [
+        f"{fit.planes} planes in {fit.frames} frames, {low:.2f} to {high:.2f} m",
+        f"distance of pixels from the planes {1000 * fit.before_m:.1f} mm, "
+        f"corrected {1000 * fit.after_m:.1f} mm (noise included)",
+        f"of patches of pixels {1000 * fit.bias_before_m:.1f} mm, "
+        f"corrected {1000 * fit.bias_after_m:.1f} mm",
+        f"constant offset known to {1000 * fit.constant_sigma_m:.1f} mm, scale to "
+        f"{100 * fit.scale_sigma:.2f} %",
+    ]
+    if arguments.out is not None:
+        whole = fit.correction if earlier is None else composed(earlier, fit.correction)
+        make_folder(arguments.out.parent)
+        with replacing(arguments.out) as part:
+            whole.save(part)
+        lines.append(f"written to {arguments.out}")
+        if earlier is not None:
+            lines.append("it holds the correction that the recording had before, too")
+    return fit.to_dict(), lines, list(fit.warnings)
+
+
+def _earlier_correction(
+    arguments: argparse.Namespace, recording: Recording
+) -> DepthCorrection | None:
+    """Return the correction that was applied when the recording was read."""
+    if not recording.metadata.get("corrected"):
+        return None
+    own = Path(recording.path) / "correction.npz"
+    if len(arguments.inputs) != 1 or not own.is_file():
+        raise InputError(
+            "is corrected already, each part by its own",
+            where=recording.path,
+            remedy="give one folder, or move its correction.npz away",
+        )
+    return read_correction(own)
 
 
 def import_lens(arguments: argparse.Namespace) -> Told:

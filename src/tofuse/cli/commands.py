@@ -257,7 +257,11 @@ def calibrate(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)
     console = _Output(highlight=False, soft_wrap=True)
-    subjects = {"lens": calibrating.lens, "import": calibrating.import_lens}
+    subjects = {
+        "lens": calibrating.lens,
+        "depth": calibrating.depth,
+        "import": calibrating.import_lens,
+    }
     data, lines, warnings = subjects[arguments.subject](arguments)
     if arguments.json:
         emit(data)

@@ -221,16 +221,17 @@ def _calibrate(commands: Any) -> None:
     p = _command(
         commands,
         "calibrate",
-        "estimate a camera's lens, or import one",
+        "estimate a camera's lens or the errors of its depth, or import a lens",
         epilog="lens: from views of a checkerboard, writes a camera.json.\n"
+        "depth: from views of planes, writes a correction.npz.\n"
         "import: from a file of Bouguet's toolbox, CalLab, OpenCV or ROS, writes a camera.json.\n",
     )
-    p.add_argument("subject", choices=("lens", "import"), help="what to do")
+    p.add_argument("subject", choices=("lens", "depth", "import"), help="what to do")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings; import: one file")
     p.add_argument("--out", type=Path, metavar="FILE", help="write the result")
     p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
     p.add_argument("--json", action="store_true", help="what was found, as JSON")
-    g = p.add_argument_group("lens")
+    g = p.add_argument_group("lens and depth")
     g.add_argument(
         "--board", metavar="CxR:M", help="inner corners and metres of a square, such as 8x6:0.1"
     )
@@ -246,6 +247,19 @@ def _calibrate(commands: Any) -> None:
     g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
     g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
     g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    g = p.add_argument_group("depth")
+    g.add_argument(
+        "--wall", action="store_true", help="the board lies flat on a wall, all of which is used"
+    )
+    g.add_argument(
+        "--planes",
+        type=_count,
+        default=4,
+        metavar="N",
+        help="without --board: planes of each view at most (4)",
+    )
+    _seed(g)
+    g = p.add_argument_group("lens")
     g.add_argument(
         "--model",
         choices=("pinhole", "brown", "rational", "fisheye"),

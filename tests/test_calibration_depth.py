@@ -1,0 +1,226 @@
+"""The errors of depth from planes: made up, simulated and real."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofuse.calibration.board import Board
+from tofuse.calibration.depth import DepthFit, calibrate_depth, composed
+from tofuse.calibration.plane_views import PlaneView, board_planes, scene_planes
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.native import RecordingWriter
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.models import camera_model
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import simulate_recording
+from tofuse.simulation.scenes import checkerboard
+from tofuse.simulation.sensor import calibrated
+
+BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
+CAMERA = Pinhole(64, 48, 60.0, 60.0, 31.5, 23.5)
+NOISE_M = 0.008
+
+
+def wiggle(r: np.ndarray) -> np.ndarray:
+    """20 mm rms, four periods to 5 m."""
+    return 0.020 * np.sqrt(2) * np.sin(2 * np.pi * r / 1.25 + 0.4)
+
+
+def own_offsets() -> np.ndarray:
+    rng = np.random.default_rng(6)
+    ramp = np.linspace(-0.01, 0.01, 64) + np.zeros((48, 1))
+    return ramp + rng.normal(0, 0.003, (48, 64))
+
+
+def made_views(*, known: bool, constant: float = 0.0) -> list[PlaneView]:
+    """Planes from 0.8 to 4 m, tilted to all sides."""
+    rng = np.random.default_rng(7)
+    rays = np.concatenate([CAMERA.rays(), np.ones((48, 64, 1))], -1).reshape(-1, 3).astype(float)
+    directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    views = []
+    for k, distance in enumerate(np.linspace(0.8, 4.0, 40)):
+        tilt, around = rng.uniform(0.1, 0.7), rng.uniform(0, 2 * np.pi)
+        normal = [np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)]
+        plane = np.array(normal) / distance
+        true = 1 / (directions @ plane)
+        measured = true + constant + wiggle(true) + own_offsets().ravel()
+        measured = measured + rng.normal(0, NOISE_M, true.shape)
+        told = np.eye(3) * (1e10 if known else 1e-12)
+        start = plane * (1 if known else 1.02) + (0 if known else rng.normal(0, 0.003, 3))
+        seen = np.flatnonzero((true > 0.7) & (true < 4.5))
+        sigma = np.full(len(seen), NOISE_M)
+        views.append(PlaneView(k, start, told, seen, measured[seen], sigma, directions[seen]))
+    return views
+
+
+def curve_error(fit: DepthFit, constant: float = 0.0) -> np.ndarray:
+    """In m, over the ranges that were seen; the curve is over the measured range."""
+    true = np.linspace(0.9, 4.2, 300)
+    measured = true + constant + wiggle(true)
+    found = np.interp(measured, fit.correction.range_m, fit.correction.bias_m)
+    return found - constant - wiggle(true)
+
+
+def bent(error: np.ndarray) -> np.ndarray:
+    """What is neither constant nor scale."""
+    r = np.linspace(0, 1, len(error))
+    return error - np.polyval(np.polyfit(r, error, 1), r)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_known_planes_give_curve_constant_and_offsets() -> None:
+    fit = calibrate_depth(made_views(known=True, constant=0.03), CAMERA)
+    assert rms(curve_error(fit, 0.03)) < 0.001
+    offsets = fit.correction.pixel_bias_m
+    assert offsets is not None
+    apart = offsets - (own_offsets() - own_offsets().mean())
+    assert rms(apart) < 0.0016  # of 6.6 mm; the noise of a mean of 40 is 1.3 mm
+    assert fit.constant_sigma_m < 0.0005
+    assert fit.scale_sigma < 0.0005
+    assert fit.after_m == pytest.approx(NOISE_M, rel=0.05)
+    assert fit.bias_before_m > 5 * fit.bias_after_m
+    assert not any("scale" in warning for warning in fit.warnings)
+
+
+def test_unknown_planes_give_all_but_constant_and_scale() -> None:
+    fit = calibrate_depth(made_views(known=False), CAMERA)
+    assert rms(bent(curve_error(fit))) < 0.001
+    assert rms(curve_error(fit)) < 0.005
+    offsets = fit.correction.pixel_bias_m
+    assert offsets is not None
+    assert rms(offsets - (own_offsets() - own_offsets().mean())) < 0.002
+    assert "scale" in fit.warnings[0]
+
+
+def test_a_constant_is_left_alone_where_it_can_not_be_told() -> None:
+    far = calibrate_depth(made_views(known=False, constant=0.03), CAMERA)
+    error = curve_error(far, 0.03)
+    assert rms(bent(error)) < 0.002
+    assert abs(error.mean()) > 0.01
+
+
+def test_outliers_and_wraps_do_no_harm() -> None:
+    rng = np.random.default_rng(9)
+    views = []
+    for view in made_views(known=True):
+        wild = rng.random(len(view.pixels)) < 0.05
+        measured = np.where(wild, view.measured_m + rng.uniform(-0.3, 0.3), view.measured_m)
+        views.append(replace(view, measured_m=measured))
+    assert rms(curve_error(calibrate_depth(views, CAMERA))) < 0.0015
+
+
+def test_one_distance_is_refused() -> None:
+    views = [
+        replace(view, measured_m=1.0 + 0.01 * view.measured_m) for view in made_views(known=True)
+    ]
+    with pytest.raises(InputError, match="several distances"):
+        calibrate_depth(views, CAMERA)
+
+
+def test_two_corrections_are_one_after_the_other() -> None:
+    r = np.linspace(0.5, 4.5, 60)
+    first = DepthCorrection(r, wiggle(r))
+    second = DepthCorrection(r[::3], 0.01 * r[::3], np.full((1, 50), 0.002, np.float32))
+    measured = np.linspace(0.8, 4.2, 50, dtype=np.float32)[None]
+    both = composed(first, second).correct(measured)
+    np.testing.assert_allclose(both, second.correct(first.correct(measured)), atol=2e-4)
+
+
+EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath", "mixed_pixels")
+
+
+@pytest.fixture(scope="module")
+def views() -> Recording:
+    """A simulated SR4000 that wiggles by 20 mm (peak), before a wall with a board."""
+    return simulate_recording("checkerboard", frames=20, effects=EFFECTS, correction=False)
+
+
+def simulated_error(fit: DepthFit) -> tuple[float, float]:
+    """What is left of the curve's error, and what there was, rms in m."""
+    true = calibrated(camera_model("sr4000"), EFFECTS)
+    assert true.pixel_bias_m is not None
+    r = np.linspace(*fit.range_m, 300)
+    bias = np.interp(r, true.range_m, true.bias_m) + true.pixel_bias_m.mean()
+    found = np.interp(r, fit.correction.range_m, fit.correction.bias_m)
+    return rms(found - bias), rms(bias)
+
+
+def test_board_on_a_wall_takes_wiggling_below_2_mm(views: Recording) -> None:
+    fit = calibrate_depth(*board_planes(views, BOARD, "amplitude", wall=True))
+    after, before = simulated_error(fit)
+    assert before > 0.010
+    assert after < 0.002
+    assert fit.bias_after_m < 0.4 * fit.bias_before_m
+    alone = calibrate_depth(*board_planes(views, BOARD, "amplitude", wall=False))
+    assert simulated_error(alone)[0] < 0.0035
+
+
+def test_wall_at_unknown_poses_takes_wiggling_below_3_mm(views: Recording) -> None:
+    fit = calibrate_depth(*scene_planes(views, 1, 0))
+    assert simulated_error(fit)[0] < 0.003
+
+
+def test_command_writes_a_correction_that_is_applied(
+    views: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = camera_model("sr4000")
+    folder = tmp_path / "rec"
+    writer = RecordingWriter(
+        folder, model.camera, depth_unit_m=0.0001, amplitude_kind="range_compensated"
+    )
+    for k, frame in enumerate(views):
+        writer.add(replace(frame, timestamp=float(k)))
+    writer.finish()
+    before = open_recording(folder)[0]
+    out = folder / "correction.npz"
+    command = ["calibrate", "depth", str(folder), "--planes", "1", "--out", str(out)]
+    assert main(command) == 0
+    assert "planes in" in capsys.readouterr().out
+    first = DepthCorrection.load(out)
+    after = open_recording(folder)
+    assert after.metadata["corrected"] is True
+    moved = (after[0].radial_range - before.radial_range)[before.valid]
+    assert 0.003 < np.abs(moved).mean() < 0.03
+    # Once more: what is left is small, and both are one correction.
+    assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 0
+    again = DepthCorrection.load(out)
+    r = np.linspace(1.2, 3.2, 50)
+    change = np.interp(r, again.range_m, again.bias_m) - np.interp(r, first.range_m, first.bias_m)
+    assert rms(change) < 0.004
+    assert main(["calibrate", "depth", str(folder), "--wall"]) == 2
+    assert "--board" in capsys.readouterr().err
+
+
+def test_real_sr4000_from_two_places_is_refused(shared_data: Path) -> None:
+    """Planes are found, but from two places in a corridor they tell no curve."""
+    recording = open_recording(shared_data / "sr4000_corridor")
+    found, camera = scene_planes(recording, 4, 0)
+    assert len(found) >= 16
+    ranges = [float(np.median(view.measured_m)) for view in found]
+    # The end of the corridor is nearer by 0.3 m from the second place.
+    far = {view.frame // 4: r for view, r in zip(found, ranges, strict=True) if r > 4}
+    assert far[0] - far[1] == pytest.approx(0.31, abs=0.04)
+    with pytest.raises(InputError, match="20 places"):
+        calibrate_depth(found, camera)
+
+
+def test_no_board_and_no_frames_with_amplitude(views: Recording) -> None:
+    bare = [replace(frame, amplitude_image=None) for frame in views.select(0, 2)]
+    recording = Recording.of(ArraySource(bare), "bare", "simulated")
+    with pytest.raises(InputError, match="leave --board out"):
+        board_planes(recording, BOARD, "amplitude", wall=False)
+    with pytest.raises(InputError, match="no board of 9 x 7"):
+        board_planes(views.select(0, 1), Board(9, 7, 0.1), "amplitude", wall=False)
