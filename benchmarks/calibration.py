@@ -4,8 +4,8 @@
 
 For each camera and seed: a checkerboard on a wall, seen from 32 places, with all errors of the
 camera but indirect light (a wall alone has none) and drift. Prints how far off the lens is, and
-what is left of the errors of depth: by a board on a wall, by the board alone, and by the wall at unknown
-poses. The wiggling is as strong as to be 20 mm at its peaks in the SR4000.
+what is left of the errors of depth: by a board on a wall, by the board alone, and by the wall at
+unknown poses. The wiggling is as strong as to be 20 mm at its peaks in the SR4000.
 """
 
 from __future__ import annotations
