@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import argparse
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
 from tofuse.cli.progress import emit, progress_for
 from tofuse.results.types import Reconstruction
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+    from tofuse.pipeline.run import Options
 
 _SEVERITIES = {"severe": "red", "warning": "yellow", "note": "cyan"}
 _COLORS = {"good": "green", "degraded": "yellow", "failed": "red"}
@@ -29,6 +35,7 @@ class _Output(Console):
 
 def run(arguments: argparse.Namespace) -> int:
     """``tofuse run``."""
+    from tofuse.errors import InputError
     from tofuse.pipeline.run import Options, exit_status
     from tofuse.pipeline.run import run as run_pipeline
 
@@ -53,10 +60,69 @@ def run(arguments: argparse.Namespace) -> int:
         texture=arguments.texture,
         overwrite=arguments.overwrite,
     )
+    if arguments.view:
+        return _run_in_view(arguments, options)
+    for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
+        if given:
+            raise InputError("is only for --view", where=name, remedy="give --view as well")
     with progress_for(as_json=arguments.json) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     _tell(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
+
+
+def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
+    """Run, with the model growing in the browser; then show the result until Ctrl-C."""
+    from tofuse.pipeline.progress import Both
+    from tofuse.pipeline.run import exit_status
+    from tofuse.pipeline.run import run as run_pipeline
+    from tofuse.viewer.live import LiveView
+
+    with _page(arguments) as server:
+        live = LiveView(server)
+        with progress_for(as_json=arguments.json) as progress:
+            result = run_pipeline(arguments.inputs, options, Both(progress, live))
+        _tell(result, arguments.out, as_json=arguments.json)
+        live.finish(arguments.out)
+        _wait()
+    return exit_status(result)
+
+
+def view(arguments: argparse.Namespace) -> int:
+    """``tofuse view``."""
+    from tofuse.viewer.app import ResultView
+    from tofuse.viewer.result import read_result
+
+    result = read_result(arguments.result)
+    with _page(arguments) as server:
+        ResultView(server, result)
+        _wait()
+    return 0
+
+
+@contextmanager
+def _page(arguments: argparse.Namespace) -> Iterator[ViserServer]:
+    """Serve a page, say where, and open it in the browser."""
+    import webbrowser
+
+    from tofuse.viewer.server import address, serve, stop
+
+    server = serve(arguments.port)
+    try:
+        print(f"see {address(server)}", file=sys.stderr, flush=True)
+        if not arguments.no_open:
+            webbrowser.open(address(server))
+        yield server
+    finally:
+        stop(server)
+
+
+def _wait() -> None:
+    """Wait for Ctrl-C."""
+    with _interrupted() as asked:
+        print("Ctrl-C ends the page", file=sys.stderr, flush=True)
+        while not asked.wait(0.5):
+            pass
 
 
 def demo(arguments: argparse.Namespace) -> int:

@@ -52,6 +52,7 @@ def make_parser() -> Parser:
     _optimize(commands)
     _export(commands)
     _experiments(commands)
+    _view(commands)
     return parser
 
 
@@ -86,6 +87,11 @@ def _run(commands: Any) -> None:
         "--texture", action="store_true", help="a texture on the surface, in mesh.glb and mesh.obj"
     )
     _processing(p)
+    g = p.add_argument_group("watch it in the browser")
+    g.add_argument(
+        "--view", action="store_true", help="show the model while it grows, and then the result"
+    )
+    _page(g)
     g = p.add_argument_group("what to read")
     g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
     g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
@@ -321,6 +327,24 @@ def _experiments(commands: Any) -> None:
     p.add_argument("--seeds", type=_count, default=20, metavar="N", help="noise seeds (20)")
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+
+
+def _view(commands: Any) -> None:
+    p = _command(commands, "view", "show a result in the browser")
+    p.add_argument("result", type=Path, metavar="DIR", help="the --out of `tofuse run`")
+    _page(p)
+
+
+def _page(p: Any) -> None:
+    p.add_argument("--port", type=_port, metavar="N", help="port of the page (8080 or the next)")
+    p.add_argument("--no-open", action="store_true", help="do not open the browser")
+
+
+def _port(text: str) -> int:
+    value = _whole(text)
+    if not 1 <= value <= 65535:
+        raise argparse.ArgumentTypeError(f"{text} is not a port from 1 to 65535")
+    return value
 
 
 def _whole(text: str) -> int:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
+from tofuse.pipeline.progress import Silent
 from tofuse.results.types import FrameRecord
 
 # The last steps, whose pace tells how long the others will take.
@@ -90,7 +91,7 @@ class Health:
         return f"[{self._color}]{self._words}[/]{more}"
 
 
-class TerminalProgress:
+class TerminalProgress(Silent):
     """The stages on a terminal: those done with their times, and one bar that goes on.
 
     When the job is done all of it goes away, and what came out is said in its place.
@@ -159,7 +160,7 @@ class TerminalProgress:
         self._console.print(f"[yellow]note:[/] {_escaped(text)}")
 
 
-class JsonProgress:
+class JsonProgress(Silent):
     """JSON lines on standard output, for programs."""
 
     def __enter__(self) -> Self:
@@ -202,7 +203,7 @@ class JsonProgress:
         emit({"event": "note", "text": text})
 
 
-class QuietProgress:
+class QuietProgress(Silent):
     """Notes on standard error and nothing else, for logs and pipes.
 
     They come at the end of a job that succeeded: one that fails says its one line alone.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -32,6 +33,7 @@ from tofuse.posegraph.outside import Sensed, Told, told_by, with_outside
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.results.samples import FrameSample, FrameSamples
 from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
 
 T = TypeVar("T")
@@ -133,6 +135,7 @@ class Mapper:
         self._steps: list[Step | None] = []  # None where a frame could not be read
         self._posed = 0
         self._checks = _EvenSample(_CHECKED_IMAGES)
+        self._samples = FrameSamples()
         self._depths: list[float] = []  # typical ranges of the frames with a pose, m
         self._ambiguity_m: float | None = None
         self._before: RangeFrame | None = None  # as the camera gave it
@@ -225,8 +228,21 @@ class Mapper:
                 with self._watch.timing("loops"):
                     if self._live.step():
                         self._follow_loops()
+            if (
+                isinstance(frame, RangeFrame)
+                and isinstance(filtered, RangeFrame)
+                and isinstance(clean, RangeFrame)
+            ):
+                self._samples.take(
+                    lost=step.T_world_camera is None,
+                    make=partial(FrameSample.of, frame, filtered, clean),
+                )
         self._progress.advance(self._records[-1])
-        return None if step.T_world_camera is None else self._T_map_tracked @ step.T_world_camera
+        if step.T_world_camera is None:
+            return None
+        T_world_camera = self._T_map_tracked @ step.T_world_camera
+        self._progress.placed(clean, T_world_camera)
+        return T_world_camera
 
     def _follow_loops(self) -> None:
         """Move the newest pose to where the loops so far put it."""
@@ -500,6 +516,7 @@ class Mapper:
                 refinement,
                 optimisation.parts,
                 closed.told.records,
+                self._samples.all,
             ),
             config=self.config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(self._records)},

@@ -8,6 +8,10 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.recordings.frames import Frame
 from tofuse.results.types import FrameRecord
 
 
@@ -26,6 +30,10 @@ class Progress(Protocol):
         """Say something that a person should know."""
         ...
 
+    def placed(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+        """Show where a frame, as it is for the model, lies by what is known so far."""
+        ...
+
 
 class Silent:
     """Hears and says nothing."""
@@ -38,6 +46,37 @@ class Silent:
 
     def note(self, text: str) -> None:
         """See `Progress`."""
+
+    def placed(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+        """See `Progress`."""
+
+
+@dataclass(frozen=True)
+class Both:
+    """Tells two who listen."""
+
+    first: Progress
+    second: Progress
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """See `Progress`."""
+        self.first.stage(name, total)
+        self.second.stage(name, total)
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """See `Progress`."""
+        self.first.advance(record)
+        self.second.advance(record)
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+        self.first.note(text)
+        self.second.note(text)
+
+    def placed(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+        """See `Progress`."""
+        self.first.placed(frame, T_world_camera)
+        self.second.placed(frame, T_world_camera)
 
 
 @dataclass

@@ -28,7 +28,7 @@ from tofuse.pipeline.reconstruct import (
     view_kind,
 )
 from tofuse.posegraph.given import read_loops
-from tofuse.recordings.frames import Frame
+from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import average_still
@@ -36,7 +36,7 @@ from tofuse.results.output import OutputFolder, is_result, plain, read_run_json,
 from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import verdict_of
 
-_THUMBNAILS = 12
+_CLOUDS = 12  # views drawn, where they are clouds
 _TEXTURE = 2048  # texels, where no size is given
 
 
@@ -93,6 +93,7 @@ def run(
     findings = _findings(recording, turning=options.object)
     for warning in (*recording.warnings, *(str(f) for f in findings)):
         progress.note(warning)
+    _preview(recording, progress)
     kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
     folder = OutputFolder(options.out, overwrite=options.overwrite or bool(kept.fresh))
     kept.begin(not is_result(options.out))
@@ -121,6 +122,16 @@ def run(
     finally:
         folder.discard()
     return result
+
+
+def _preview(recording: Recording, progress: Progress) -> None:
+    """Show the first frame before any work begins: there the first pose will be."""
+    for k in range(len(recording)):
+        try:
+            progress.placed(recording[k], np.eye(4))
+        except UnreadableFrameError:
+            continue
+        return
 
 
 def _key(
@@ -239,17 +250,21 @@ def exit_status(result: Reconstruction) -> int:
 def _report(recording: Recording, config: Config, result: Reconstruction, folder: Path) -> None:
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
+    from tofuse.report.pictures import draw
+    from tofuse.viewer.kept import NAME, write_kept
 
-    sample = recording.sample(_THUMBNAILS)
-    frames = [item for item in sample if not isinstance(item, UnreadableFrameError)]
+    pictures = draw(result.diagnostics.samples)
+    clouds = () if pictures else recording.sample(_CLOUDS)
     extras = ReportExtras(
         title=Path(recording.path).name or recording.path,
         filter_steps=_filter_steps(config, recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth_points(recording),
-        thumbnails=tuple(frames),
+        pictures=pictures,
+        clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
     )
     write_report(result, folder / "report.html", extras)
+    write_kept(result, pictures, folder / NAME)
 
 
 def _filter_steps(

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.recordings.frames import Frame
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.report.pictures import Pictures
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -28,12 +29,15 @@ class ReportExtras:
         identity), NaN where there is none; rows as `Reconstruction.trajectory`. Or None.
     truth_points
         (K, 3) points in m on the true surfaces, in the world frame; None if not known.
-    thumbnails
-        About a dozen evenly spaced, unfiltered frames.
+    pictures
+        Of the result's samples of frames, in their order.
+    clouds
+        About a dozen evenly spaced, unfiltered views, where views are clouds.
     """
 
     title: str
     filter_steps: tuple[tuple[str, Frame], ...] = ()
     reference: Float64 | None = None
     truth_points: Float32 | None = None
-    thumbnails: tuple[Frame, ...] = ()
+    pictures: tuple[Pictures, ...] = ()
+    clouds: tuple[CloudFrame, ...] = ()

@@ -38,12 +38,18 @@ def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> No
 def render(result: Reconstruction, extras: ReportExtras) -> str:
     """Return the report as HTML."""
     shown: dict[str, Any] = sections(result, extras)
-    scene = shown.pop("scene")
+    from jinja2.utils import htmlsafe_json_dumps
+
+    scene, player = shown.pop("scene"), shown.pop("player")
     return _template().render(
         **shown,
         version=__version__,
         style=_asset("style.css"),
         script=_asset("viewer.js"),
+        first_images={} if player is None else {k: v[0] for k, v in player["images"].items()},
+        first_told="" if player is None else player["told"][0],
+        last_picture=0 if player is None else len(player["index"]) - 1,
+        player_json=None if player is None else htmlsafe_json_dumps(player),
         # Only numbers and base64 are in it, so nothing can end the script element early.
         scene_json=None if scene is None else json.dumps(scene, separators=(",", ":")),
     )

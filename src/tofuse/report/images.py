@@ -44,7 +44,7 @@ def viridis(value: Float64) -> UInt8:
     return np.round(_VIRIDIS[low] * (1 - t) + _VIRIDIS[low + 1] * t).astype(np.uint8)
 
 
-def data_uri(image: UInt8, *, jpeg: bool = False) -> str:
+def encoded(image: UInt8, *, jpeg: bool = False) -> bytes:
     """Encode an (H, W, 3) RGB or (H, W, 4) RGBA image as PNG (or JPEG, for photographs)."""
     import cv2
 
@@ -54,8 +54,13 @@ def data_uri(image: UInt8, *, jpeg: bool = False) -> str:
         _, data = cv2.imencode(".jpg", flipped, [cv2.IMWRITE_JPEG_QUALITY, 82])
     else:
         _, data = cv2.imencode(".png", flipped, [cv2.IMWRITE_PNG_COMPRESSION, 7])
+    return bytes(data.tobytes())
+
+
+def data_uri(image: UInt8, *, jpeg: bool = False) -> str:
+    """Encode an image as `encoded` does, for a page."""
     kind = "jpeg" if jpeg else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+    return f"data:image/{kind};base64,{base64.b64encode(encoded(image, jpeg=jpeg)).decode()}"
 
 
 def shrink(image: UInt8, width: int) -> UInt8:
@@ -91,14 +96,15 @@ def depth_image(frame: RangeFrame, limits: tuple[float, float], removed: Bool | 
 
 def amplitude_image(frame: RangeFrame) -> UInt8 | None:
     """Amplitude as grey, stretched and with the gamma of a screen; None if not recorded."""
-    amplitude = frame.amplitude_image
-    if amplitude is None:
-        return None
+    return None if frame.amplitude_image is None else grey(frame.amplitude_image)
+
+
+def grey(amplitude: Float32) -> UInt8:
+    """Stretch amplitude (H, W) to grey (H, W, 3), with the gamma of a screen."""
     lit = (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
     low, high = np.percentile(amplitude[lit], [1, 99]) if lit.any() else (0.0, 1.0)
     level = ((amplitude - low) / max(high - low, 1e-9)).clip(0, 1) ** (1 / 2.2)
-    grey = np.round(255 * level).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=2)
+    return np.repeat(np.round(255 * level).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def splat(

@@ -30,7 +30,9 @@ def frames(s: Subject) -> Values:
         group = records[start : start + size]
         worst = max(group, key=lambda r: (1, 2, 3, 0)[words.STATUSES.index(r.status)])
         lane = words.STATUSES.index(worst.status)
-        out["strip"].append({"status": worst.status, "lane": lane, "title": _told(worst)})
+        out["strip"].append(
+            {"status": worst.status, "lane": lane, "title": told(worst), "index": worst.index}
+        )
     counts = [f"{sum(r.status == name for r in records)} {name}" for name in words.STATUSES]
     out["strip_label"] = "Status of each frame: " + ", ".join(counts)
     first, last = records[0].index, records[-1].index
@@ -63,7 +65,8 @@ def frames(s: Subject) -> Values:
     return out
 
 
-def _told(record: FrameRecord) -> str:
+def told(record: FrameRecord) -> str:
+    """Say what became of a frame."""
     parts = [f"Frame {record.index}: {record.status}"]
     if record.reason:
         parts[0] += f" – {record.reason}"

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+
+import numpy as np
+
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report import images, words
+from tofuse.report.pictures import FATES, KINDS, depth_range
+from tofuse.report.section_frames import told
 from tofuse.report.subject import Subject, Values
 
 _THUMBNAIL, _FILTER = 220, 320  # px
@@ -59,36 +65,69 @@ def filters(s: Subject) -> Values:
     return {"filter_rows": rows, "filter_steps": shown, "filter_note": note}
 
 
-def thumbnails(s: Subject) -> Values:
-    """Return samples of the recording."""
-    frames = s.extras.thumbnails
+def clouds(s: Subject) -> Values:
+    """Return samples of the recording, where its views are clouds."""
+    frames = s.extras.clouds
     every = [images.depth_limits(f) for f in frames if len(f)]
     limits = (0.0, 1.0)
     if every:
         limits = (min(low for low, _ in every), max(high for _, high in every))
     out = []
-    kinds: list[str] = []
     for frame in frames:
-        pictures = []
-        if isinstance(frame, RangeFrame):
-            depth = images.shrink(images.depth_image(frame, limits, None), _THUMBNAIL)
-            pictures.append(("range", images.data_uri(depth, jpeg=True)))
-            grey = images.amplitude_image(frame)
-            if grey is not None:
-                small = images.shrink(grey, _THUMBNAIL)
-                pictures.append(("amplitude", images.data_uri(small, jpeg=True)))
-            if frame.color_image is not None:
-                small = images.shrink(frame.color_image, _THUMBNAIL)
-                pictures.append(("colour", images.data_uri(small, jpeg=True)))
-        else:
-            framing = images.Framing.around(frame.points.astype(float), (_THUMBNAIL, 165))
-            drawn = images.cloud_image(frame, limits, framing)
-            pictures.append(("points from above and to the side", images.data_uri(drawn)))
-        kinds.extend(kind for kind, _ in pictures if kind not in kinds)
-        out.append({"index": frame.index, "images": pictures})
-    note = f"Sample frames before filtering: {', '.join(kinds)}."
+        framing = images.Framing.around(frame.points.astype(float), (_THUMBNAIL, 165))
+        drawn = images.cloud_image(frame, limits, framing)
+        out.append({"index": frame.index, "image": images.data_uri(drawn)})
+    note = "Sample views before filtering, from above and to the side."
     if every:
         note += (
             f" Depth from dark ({words.length(limits[0])}) to bright ({words.length(limits[1])})."
         )
-    return {"thumbnails": out, "thumbnails_note": note}
+    return {"clouds": out, "clouds_note": note}
+
+
+_TITLES = {
+    "color": "Colour",
+    "range": "Range",
+    "amplitude": "Amplitude",
+    "fate": "What became of the points",
+}
+
+
+def player(s: Subject) -> Values:
+    """Return the images of frames, what is said of each, and where each was taken."""
+    shown = s.extras.pictures
+    if not shown:
+        return {"player": None, "player_kinds": [], "player_note": "", "fates": []}
+    records = {r.index: r for r in s.result.diagnostics.frames}
+    T = np.eye(4)
+    T[:3, :3] = s.straight
+    poses = []
+    for picture in shown:
+        row = s.rows.get(picture.index)
+        pose = np.full((4, 4), np.nan) if row is None else T @ s.result.trajectory[row]
+        known = np.isfinite(pose).all()
+        poses.append(np.round(pose[:3], 5).ravel().tolist() if known else None)
+    kinds = [kind for kind in KINDS if kind in shown[0].images]
+    low, high = depth_range(s.result.diagnostics.samples)
+    note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
+    if len(shown) < len(records):
+        note = f"{len(shown):,} of {len(records):,} frames have images here. " + note
+    return {
+        "player": {
+            "index": [p.index for p in shown],
+            "told": [told(records[p.index]) if p.index in records else "" for p in shown],
+            "status": [records[p.index].status if p.index in records else "" for p in shown],
+            "poses": poses,
+            "images": {
+                kind: [_uri(kind, p.images.get(kind, b"")) for p in shown] for kind in kinds
+            },
+        },
+        "player_kinds": [(kind, _TITLES[kind]) for kind in kinds],
+        "player_note": note,
+        "fates": [("#{:02x}{:02x}{:02x}".format(*color), text) for color, text in FATES.values()],
+    }
+
+
+def _uri(kind: str, data: bytes) -> str:
+    name = "png" if kind == "fate" else "jpeg"
+    return f"data:image/{name};base64,{base64.b64encode(data).decode()}" if data else "data:,"

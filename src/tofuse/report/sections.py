@@ -31,7 +31,8 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         section_views.filters,
         section_frames.frames,
         section_frames.loops,
-        section_views.thumbnails,
+        section_views.player,
+        section_views.clouds,
         _timings,
         _settings,
     )
@@ -55,7 +56,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         "settings": "Settings",
         "reading": "How to read this",
     }
-    if not out["thumbnails"]:
+    if not out["clouds"]:
         del names["recording"]
     out["contents"] = list(names.items())
     return out

@@ -47,6 +47,7 @@ FILES = (
     "mesh.mtl",
     "mesh.png",
     "report.html",
+    "view.npz",
     "run.json",
     "cloud.pcd",
     "cloud.las",
@@ -235,7 +236,7 @@ def write_result(
     report: Callable[[Reconstruction, Path], None] | None = None,
     texture: Textured | None = None,
 ) -> None:
-    """Write every file of the contract; `report` writes `report.html` into the folder it gets.
+    """Write every file of the contract; `report` writes what is for people into the folder it gets.
 
     With a `texture`, `mesh.glb` has it, and so has `mesh.obj`, which is written then.
 

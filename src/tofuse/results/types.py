@@ -14,6 +14,7 @@ from tofuse.odometry.base import Status
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
+from tofuse.results.samples import FrameSample
 
 Float64 = NDArray[np.float64]
 
@@ -66,6 +67,8 @@ class Diagnostics:
         The connected parts of the graph, where the optimiser ran and tells them apart.
     outside
         What became of sensors beside the camera.
+    samples
+        Small images of some frames; none of clouds.
     """
 
     verdict: Verdict
@@ -80,6 +83,7 @@ class Diagnostics:
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()
     outside: tuple[OutsideRecord, ...] = ()
+    samples: tuple[FrameSample, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,24 @@
     const raw = bytes(scene.lines[name]);
     lines[name] = { buffer: buffer(raw), count: raw.length / 12 };
   }
+  // The camera of the frame that is chosen further down, drawn larger than the others.
+  lines.chosen = { buffer: buffer(new Float32Array(48)), count: 0 };
+  document.addEventListener("frame-chosen", (e) => {
+    const T = e.detail;
+    lines.chosen.count = 0;
+    if (T) {
+      const s = 0.035 * scene.size, corners = [[-.5, -.4], [.5, -.4], [.5, .4], [-.5, .4]];
+      const at = (x, y, z) => [0, 4, 8].map((k) => T[k] * x + T[k + 1] * y + T[k + 2] * z + T[k + 3]);
+      const tip = at(0, 0, 0), ends = corners.map(([x, y]) => at(x * s, y * s, .8 * s));
+      const all = ends.flatMap((end, k) => [...tip, ...end, ...end, ...ends[(k + 1) % 4]]);
+      gl.bindBuffer(gl.ARRAY_BUFFER, lines.chosen.buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(all), gl.DYNAMIC_DRAW);
+      lines.chosen.count = 16;
+    }
+    draw();
+  });
   const inks = {
+    chosen: [1, 0.88, 0.35],
     before: [0.94, 0.63, 0.24], after: [0.35, 0.69, 0.96],
     reference: [0.92, 0.92, 0.92], loops: [0.37, 0.85, 0.55],
   };
@@ -178,7 +195,7 @@
     gl.uniformMatrix4fv(gl.getUniformLocation(wires, "view"), false, view);
     gl.uniformMatrix4fv(gl.getUniformLocation(wires, "lens"), false, lens);
     for (const name in lines) {
-      if (!lines[name].count || !on(name)) continue;
+      if (!lines[name].count || !(name === "chosen" || on(name))) continue;
       gl.uniform3fv(gl.getUniformLocation(wires, "ink"), inks[name]);
       attribute(wires, "place", lines[name].buffer, gl.FLOAT, false);
       gl.drawArrays(gl.LINES, 0, lines[name].count);
@@ -272,9 +289,54 @@
 })();
 
 (function () {
-  // What is said of a frame on hover can also be tapped.
+  // The images of frames: a slider over time, and the strip above it.
   const strip = document.getElementById("strip");
   const said = document.getElementById("strip-said");
+  const player = document.getElementById("player");
+  const data = document.getElementById("pictures");
+  let show = () => {};
+  if (player && data) {
+    const frames = JSON.parse(data.textContent);
+    const slider = document.getElementById("frame");
+    const words = document.getElementById("frame-said");
+    const last = frames.index.length - 1;
+    show = (row) => {
+      row = Math.max(0, Math.min(last, row));
+      slider.value = String(row);
+      words.textContent = frames.told[row];
+      words.className = frames.status[row];
+      for (const image of player.querySelectorAll("img")) image.src = frames.images[image.dataset.kind][row];
+      document.dispatchEvent(new CustomEvent("frame-chosen", { detail: frames.poses[row] }));
+    };
+    const here = () => Number(slider.value);
+    slider.addEventListener("input", () => show(here()));
+    player.addEventListener("click", (e) => {
+      const button = e.target.closest("button");
+      if (!button) return;
+      if (button.dataset.step) show(here() + Number(button.dataset.step));
+      if (button.dataset.bad) {
+        for (let k = 1; k <= last + 1; k++) {
+          const row = (here() + k) % (last + 1);
+          if (frames.status[row] !== "tracked") { show(row); return; }
+        }
+      }
+    });
+    const bad = player.querySelector("[data-bad]");
+    bad.hidden = frames.status.every((status) => status === "tracked");
+    strip.addEventListener("click", (e) => {
+      const cell = e.target.closest("rect");
+      if (!cell) return;
+      const index = Number(cell.dataset.frame);
+      let best = 0;
+      for (let k = 0; k <= last; k++) {
+        if (Math.abs(frames.index[k] - index) < Math.abs(frames.index[best] - index)) best = k;
+      }
+      show(best);
+    });
+    player.classList.add("live");
+    show(0);
+  }
+  // What is said of a frame on hover can also be tapped.
   if (!strip || !said) return;
   const tell = (e) => {
     const title = e.target.querySelector && e.target.closest("rect") && e.target.querySelector("title");

@@ -1,0 +1,64 @@
+"""The frames' samples as files of images: range, amplitude, colour, and what became of pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.report.images import GONE, REMOVED, encoded, grey, viridis
+from tofuse.results import samples
+from tofuse.results.samples import FrameSample
+
+UInt8 = NDArray[np.uint8]
+
+# What a picture shows, in the order in which they are shown.
+KINDS = ("color", "range", "amplitude", "fate")
+
+# Colours and words of what became of a pixel.
+FATES = {
+    samples.KEPT: ((38, 150, 140), "in the model"),
+    samples.TRACKED: ((236, 170, 60), "tracked only"),
+    samples.REMOVED: (REMOVED, "removed by a filter"),
+    samples.NOTHING: (GONE, "no measurement"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Images of one frame by kind (`KINDS`), as JPEG, that of fates as PNG."""
+
+    index: int
+    images: dict[str, bytes]
+
+
+def depth_range(frames: Sequence[FrameSample]) -> tuple[float, float]:
+    """Return the depths in m between which colours are spread, the same for all frames."""
+    seen = [f.depth[::3, ::3] for f in frames]
+    values = np.concatenate([d[d > 0] for d in seen]) if seen else np.zeros(0, np.float16)
+    if len(values) == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(values.astype(float), [2, 98])
+    return float(low), float(max(high, low + 1e-3))
+
+
+def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
+    """Draw the samples."""
+    low, high = depth_range(frames)
+    table = np.zeros((4, 3), np.uint8)
+    for fate, (color, _) in FATES.items():
+        table[fate] = color
+    out = []
+    for frame in frames:
+        depth = frame.depth.astype(float)
+        picture = viridis((depth - low) / (high - low))
+        picture[depth == 0] = GONE
+        images = {} if frame.color is None else {"color": encoded(frame.color, jpeg=True)}
+        images["range"] = encoded(picture, jpeg=True)
+        if frame.amplitude is not None:
+            images["amplitude"] = encoded(grey(frame.amplitude), jpeg=True)
+        images["fate"] = encoded(table[frame.fate])
+        out.append(Pictures(frame.index, images))
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""`tofuse view`: a result in the browser, and a run while it grows."""

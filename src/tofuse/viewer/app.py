@@ -1,0 +1,391 @@
+"""The page of a result: the model, the cameras, the frames, and distances."""
+
+from __future__ import annotations
+
+import base64
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry.quaternion import from_matrix
+from tofuse.report.pictures import FATES, Pictures
+from tofuse.report.scene import MAX_CAMERAS, camera_lines
+from tofuse.viewer.measure import picked
+from tofuse.viewer.result import Layer, Result, colorings, painted
+
+if TYPE_CHECKING:
+    from viser import GuiEvent, SceneClickEvent, ViserServer
+
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (255, 225, 90)
+FOV = 2 * float(np.arctan(0.5))  # of the cameras as they are drawn
+_TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Points"}
+_REASONS = 4
+
+
+class ResultView:
+    """Shows a result on a server.
+
+    Attributes
+    ----------
+    distance
+        Between the two points that were picked last, m; None before there are two.
+    """
+
+    def __init__(self, server: ViserServer, result: Result) -> None:
+        self.distance: float | None = None
+        self._server, self._result = server, result
+        self._lock = threading.Lock()
+        self._ends: list[Float64] = []
+        self._measuring = False
+        layers = [la for la in (result.mesh, result.cloud) if la is not None]
+        self._scale = _place_camera(server, result)
+        self._by = (colorings(layers) or ["height"])[0]
+        self._model: dict[str, Any] = {}
+        server.gui.main_panel.dock_right()
+        with server.atomic():
+            self._say_verdict()
+            self._add_lines()
+            self._add_toggles(colorings(layers))
+            self._add_frames()
+            self._add_measure()
+            self._paint()
+
+    def _say_verdict(self) -> None:
+        run = self._result.run
+        lines = [f"**{str(run['verdict']).capitalize()}**"]
+        told = list(dict.fromkeys(r["text"] for r in run["reasons"]))
+        lines += [f"- {_plain(text)}" for text in told[:_REASONS]]
+        if len(told) > _REASONS:
+            lines.append(f"- {len(told) - _REASONS} more in report.html")
+        self._server.gui.add_markdown("\n".join(lines))
+
+    def _add_lines(self) -> None:
+        result, scene = self._result, self._server.scene
+        edge = 0.018 * self._scale
+        self._lines = {}
+        for name, poses, color in (
+            ("after", result.after, AFTER),
+            ("before", result.before, BEFORE),
+        ):
+            if not poses:
+                continue
+            stack = np.stack([poses[k] for k in sorted(poses)])
+            step = -(-len(stack) // MAX_CAMERAS)
+            ends = camera_lines(stack, edge, step).reshape(-1, 2, 3).astype(np.float32)
+            self._lines[name] = scene.add_line_segments(
+                f"/cameras/{name}",
+                ends,
+                color,
+                thickness=1.6,
+                thickness_units="screen",
+                visible=name == "after",
+            )
+        if len(result.loops):
+            self._lines["loops"] = scene.add_line_segments(
+                "/loops",
+                result.loops.astype(np.float32),
+                LOOPS,
+                thickness=2.0,
+                thickness_units="screen",
+            )
+
+    def _add_toggles(self, choices: list[str]) -> None:
+        gui, result = self._server.gui, self._result
+        with gui.add_folder("Show"):
+            self._shown = {}
+            surface = result.mesh is not None and len(result.mesh.points) > 0
+            if surface:
+                self._shown["surface"] = gui.add_checkbox("Surface", True)
+            self._shown["points"] = gui.add_checkbox("Points", not surface)
+            if result.model_before is not None:
+                self._shown["model before"] = gui.add_checkbox("Points before optimisation", False)
+            for handle in self._shown.values():
+                handle.on_update(self._repaint)
+            for name, label in (
+                ("after", "Cameras after"),
+                ("before", "Cameras before"),
+                ("loops", "Loops"),
+            ):
+                if name in self._lines:
+                    box = gui.add_checkbox(label, name == "after" or name == "loops")
+                    box.on_update(self._toggle(name))
+            if len(choices) > 1:
+                self._choice = gui.add_dropdown("Colour by", choices, initial_value=self._by)
+                self._choice.on_update(self._recolor)
+            self._legend = gui.add_markdown("")
+
+    def _toggle(self, name: str) -> Any:
+        def toggle(event: GuiEvent[Any]) -> None:
+            self._lines[name].visible = bool(event.target.value)
+
+        return toggle
+
+    def _repaint(self, _: GuiEvent[Any]) -> None:
+        with self._lock:
+            self._paint()
+
+    def _recolor(self, event: GuiEvent[Any]) -> None:
+        with self._lock:
+            self._by = str(event.target.value)
+            for handle in self._model.values():
+                handle.remove()
+            self._model.clear()
+            self._paint()
+
+    def _visible(self) -> dict[str, Layer]:
+        """What of the model is shown, by name."""
+        layers = {
+            "surface": self._result.mesh,
+            "points": self._result.cloud,
+            "model before": self._result.model_before,
+        }
+        return {
+            name: layer
+            for name, layer in layers.items()
+            if layer is not None and name in self._shown and self._shown[name].value
+        }
+
+    def _paint(self) -> None:
+        """Show what is asked for; what was sent before is only shown again."""
+        visible = self._visible()
+        for name, handle in self._model.items():
+            handle.visible = name in visible
+        scale = ""
+        for name, layer in visible.items():
+            by = "colour" if name == "model before" else self._by
+            colors, told = painted(layer, by, self._result.up)
+            scale = told or scale
+            if name not in self._model and len(layer.points):
+                self._model[name] = self._sent(name, layer, colors)
+        self._legend.content = scale
+
+    def _sent(self, name: str, layer: Layer, colors: UInt8) -> Any:
+        scene = self._server.scene
+        if layer.faces is None:
+            return scene.add_point_cloud(
+                f"/model/{name}",
+                layer.points,
+                colors,
+                point_size=_point_size(layer.points),
+                precision="float32",
+                point_shape="circle",
+                point_shading="flat",
+            )
+        import trimesh
+
+        surface = trimesh.Trimesh(
+            layer.points,
+            layer.faces,
+            vertex_normals=layer.normals,
+            vertex_colors=colors,
+            process=False,
+        )
+        return scene.add_mesh_trimesh(
+            f"/model/{name}", surface, cast_shadow=False, receive_shadow=False
+        )
+
+    def _add_frames(self) -> None:
+        result, gui = self._result, self._server.gui
+        self._camera: Any = None
+        if not result.frames:
+            return
+        with gui.add_folder("Frame"):
+            last = max(len(result.frames) - 1, 1)
+            self._slider = gui.add_slider("Frame", 0, last, 1, 0)
+            self._slider.on_update(self._go)
+            self._told = gui.add_markdown("")
+            look = gui.add_button("Look from this camera")
+            look.on_click(self._look)
+            self._images = gui.add_html("")
+        self._show_frame(0)
+
+    def _go(self, event: GuiEvent[Any]) -> None:
+        with self._lock, self._server.atomic():
+            self._show_frame(int(event.target.value))
+
+    def _show_frame(self, row: int) -> None:
+        result = self._result
+        frame = result.frames[min(row, len(result.frames) - 1)]
+        index = frame["index"]
+        words = f"Frame {index}: **{frame['status']}**"
+        if frame["reason"]:
+            words += f" – {_plain(frame['reason'])}"
+        picture = _nearest(result.pictures, index)
+        if picture is not None:
+            self._images.content = _shown(picture)
+            if picture.index != index:
+                words += f"\n\nThe images are of frame {picture.index}, the nearest that was kept."
+        self._told.content = words
+        if self._camera is not None:
+            self._camera.remove()
+            self._camera = None
+        T = result.after.get(index)
+        if T is None:
+            return
+        image = None
+        if picture is not None and picture.index == index:
+            image = decoded(picture.images.get("color") or picture.images["range"])
+        self._camera = self._server.scene.add_camera_frustum(
+            "/cameras/chosen",
+            FOV,
+            1.25 if image is None else image.shape[1] / image.shape[0],
+            scale=0.05 * self._scale,
+            thickness=2.5,
+            thickness_units="screen",
+            color=CHOSEN,
+            image=image,
+            wxyz=wxyz(T),
+            position=T[:3, 3],
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _look(self, event: GuiEvent[Any]) -> None:
+        row = min(int(self._slider.value), len(self._result.frames) - 1)
+        T = self._result.after.get(self._result.frames[row]["index"])
+        if T is None or event.client is None:
+            return
+        event.client.camera.wxyz = wxyz(T)
+        event.client.camera.position = T[:3, 3]
+
+    def _add_measure(self) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Distance"):
+            self._button = gui.add_button("Pick two points")
+            self._button.on_click(self._begin_measuring)
+            self._measured = gui.add_markdown("")
+
+    def _begin_measuring(self, _: GuiEvent[Any]) -> None:
+        with self._lock:
+            self._ends.clear()
+            for name in ("/distance/0", "/distance/1", "/distance/line", "/distance/label"):
+                self._server.scene.remove_by_name(name)
+            self._measured.content = "Click the first point."
+            if not self._measuring:
+                self._measuring = True
+                self._server.scene.on_click()(self._clicked)
+
+    def _clicked(self, event: SceneClickEvent) -> None:
+        with self._lock:
+            if not self._measuring:
+                return
+            point = picked(list(self._visible().values()), event.ray_origin, event.ray_direction)
+            if point is None:
+                self._measured.content = "There is no point of the model; click another."
+                return
+            scene = self._server.scene
+            scene.add_icosphere(
+                f"/distance/{len(self._ends)}",
+                0.006 * self._scale,
+                color=CHOSEN,
+                position=point,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            self._ends.append(point)
+            if len(self._ends) == 1:
+                self._measured.content = "Click the second point."
+                return
+            self._measuring = False
+            scene.remove_click_callback(self._clicked)
+            a, b = self._ends
+            self.distance = float(np.linalg.norm(b - a))
+            text = _length(self.distance)
+            ends = np.stack([a, b])[None].astype(np.float32)
+            scene.add_line_segments(
+                "/distance/line", ends, CHOSEN, thickness=3.0, thickness_units="screen"
+            )
+            scene.add_label("/distance/label", text, position=(a + b) / 2)
+            self._measured.content = f"**{text}**"
+
+
+def _place_camera(server: ViserServer, result: Result) -> float:
+    """Look at the model from above and to the side; return its size in m."""
+    layer = result.mesh if result.mesh is not None and len(result.mesh.points) else result.cloud
+    points = layer.points if len(layer.points) else np.zeros((1, 3), np.float32)
+    low, high = np.percentile(points[:: max(1, len(points) // 20_000)], [2, 98], axis=0)
+    size = max(float(np.linalg.norm(high - low)), 1e-2)
+    forward = np.array([0.0, 0.0, 1.0])
+    forward -= result.up * (forward @ result.up)
+    if np.linalg.norm(forward) < 0.1:
+        forward = np.cross(result.up, [1.0, 0.0, 0.0])
+    forward /= np.linalg.norm(forward)
+    side = np.cross(forward, result.up)
+    middle = (low + high) / 2
+    place = middle + size * (0.6 * result.up - 0.6 * forward + 0.3 * side)
+    server.scene.set_up_direction(result.up)
+    server.initial_camera.look_at = middle
+    server.initial_camera.position = place
+    for client in server.get_clients().values():  # who watched the run
+        client.camera.up_direction = result.up
+        client.camera.position = place
+        client.camera.look_at = middle
+    return size
+
+
+def _point_size(points: NDArray[np.float32]) -> float:
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return 0.01
+    sample = points[:: max(1, len(points) // 2000)]
+    near, _ = cKDTree(points).query(sample, k=2)
+    return float(max(1.3 * np.median(near[:, 1]), 1e-4))
+
+
+def _nearest(pictures: tuple[Pictures, ...], index: int) -> Pictures | None:
+    return min(pictures, key=lambda p: abs(p.index - index), default=None)
+
+
+def decoded(data: bytes) -> UInt8:
+    """Decode an image file to (H, W, 3) RGB."""
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return np.zeros((1, 1, 3), np.uint8)
+    return image[..., ::-1].astype(np.uint8)
+
+
+def wxyz(T: Float64) -> Float64:
+    """Return the quaternion (4,) of a pose, in the order that viser wants."""
+    x, y, z, w = from_matrix(T[:3, :3])
+    return np.array([w, x, y, z])
+
+
+def _length(metres: float) -> str:
+    return f"{1000 * metres:.1f} mm" if metres < 1 else f"{metres:.3f} m"
+
+
+def _plain(text: str) -> str:
+    """Words from a file, without what Markdown or HTML would make of them."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>()#+!|$~" else c for c in text)
+
+
+def _shown(picture: Pictures) -> str:
+    """The images of a frame; as data in the page, as files made by a page may be gone too soon."""
+    cells = []
+    for kind, data in picture.images.items():
+        name, title = ("png" if kind == "fate" else "jpeg"), _TITLES[kind]
+        source = f"data:image/{name};base64,{base64.b64encode(data).decode()}"
+        style = "width:100%;border-radius:4px;image-rendering:pixelated;display:block"
+        cells.append(
+            f'<figure style="margin:0"><img alt="{title}" src="{source}" style="{style}">'
+            f'<figcaption style="font-size:0.8em">{title}</figcaption></figure>'
+        )
+    grid = "display:grid;grid-template-columns:1fr 1fr;gap:6px;padding:0 0.6em 0.4em"
+    return f'<div style="{grid}">{"".join(cells)}</div>{_fates()}'
+
+
+def _fates() -> str:
+    cells = (
+        f'<span style="white-space:nowrap;margin-right:10px"><i style="display:inline-block;'
+        f'width:10px;height:10px;background:rgb{color}"></i> {words}</span>'
+        for color, words in FATES.values()
+    )
+    return f'<div style="font-size:0.8em;padding:0 1em 0.6em">{"".join(cells)}</div>'

@@ -1,0 +1,117 @@
+"""`view.npz`: what the viewer shows that no other file of a result holds."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_bytes
+from tofuse.report.pictures import KINDS, Pictures
+from tofuse.results.types import Reconstruction
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+NAME = "view.npz"
+_POINTS = 60_000  # of the model before
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What `view.npz` holds.
+
+    Attributes
+    ----------
+    before
+        T_world_camera (4, 4) before loops were closed, by frame index.
+    points, color
+        (K, 3) m and (K, 3) of the model before, thinned; empty where nothing moved it.
+    pictures
+        Images of some frames.
+    """
+
+    before: dict[int, Float64]
+    points: Float32
+    color: UInt8
+    pictures: tuple[Pictures, ...]
+
+
+def write_kept(result: Reconstruction, pictures: Sequence[Pictures], path: Path) -> None:
+    """Write it; the same result gives the same bytes.
+
+    Raises
+    ------
+    OSError
+        If the file can't be written.
+    """
+    d = result.diagnostics
+    index = np.array([r.index for r in d.frames], np.int64)
+    known = np.isfinite(d.sequential).all((1, 2)) if len(index) == len(d.sequential) else None
+    points, color = _model_before(result)
+    arrays: dict[str, NDArray[np.generic]] = {
+        "index": index[:0] if known is None else index[known],
+        "before": d.sequential[:0] if known is None else d.sequential[known],
+        "points": points,
+        "color": color,
+        "picture": np.array([p.index for p in pictures], np.int64),
+    }
+    for kind in KINDS:
+        files = [p.images.get(kind, b"") for p in pictures]
+        arrays[f"{kind}_image"] = np.frombuffer(b"".join(files), np.uint8)
+        arrays[f"{kind}_size"] = np.array([len(f) for f in files], np.int64)
+    with path.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def _model_before(result: Reconstruction) -> tuple[Float32, UInt8]:
+    cloud = result.diagnostics.cloud_before
+    if cloud is None or len(cloud) == 0:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    step = -(-len(cloud) // _POINTS)
+    points = (cloud.points[::step] + cloud.offset).astype(np.float32)
+    good = np.isfinite(points).all(1)
+    grey = np.full((len(points), 3), 170, np.uint8)
+    return points[good], (grey if cloud.color is None else cloud.color[::step])[good]
+
+
+def read_kept(folder: Path) -> Kept | None:
+    """Read it from a result's folder; None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it is no such file.
+    """
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    try:
+        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as data:
+            index, before = data["index"].tolist(), data["before"].astype(float)
+            points, color = data["points"].astype(np.float32), data["color"].astype(np.uint8)
+            frames = data["picture"].tolist()
+            images: list[dict[str, bytes]] = [{} for _ in frames]
+            for kind in KINDS:
+                whole, start = data[f"{kind}_image"].tobytes(), 0
+                for k, size in enumerate(data[f"{kind}_size"].tolist()):
+                    if size:
+                        images[k][kind] = whole[start : start + size]
+                    start += size
+            if before.shape != (len(index), 4, 4) or points.shape != color.shape:
+                raise ValueError("its arrays do not fit each other")
+            if points.shape != (len(points), 3):
+                raise ValueError("its points are not (N, 3)")
+    except (ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"can't be read ({error})", where=path, remedy="remove it, or run again"
+        ) from error
+    pictures = tuple(Pictures(k, found) for k, found in zip(frames, images, strict=True))
+    return Kept(dict(zip(index, before, strict=True)), points, color, pictures)

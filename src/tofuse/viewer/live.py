@@ -1,0 +1,171 @@
+"""A run while it works: the model grows in the browser."""
+
+from __future__ import annotations
+
+import threading
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.report.images import data_uri, depth_image, depth_limits, shrink, viridis
+from tofuse.results.types import FrameRecord
+from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, wxyz
+from tofuse.viewer.result import read_result
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from viser import ViserServer
+
+Float64 = NDArray[np.float64]
+
+_POINTS = 4000  # of each view shown
+_CLOUDS = 120  # views shown; then every second one goes
+_MOVED, _TURNED = 0.15, np.radians(8.0)  # m and rad between views that are shown
+_PERIOD = 0.3  # s between updates of what is seen now
+_WIDTH = 240  # px
+
+
+class LiveView:
+    """Hears a job's progress, and shows the views where they lie by what is known so far.
+
+    What is shown is copied, and so little that the job is hardly slower; nothing of it comes back.
+    It is called from one thread at a time, and never raises because of what a browser does.
+    """
+
+    def __init__(self, server: ViserServer) -> None:
+        self._server = server
+        self._shown: list[tuple[Float64, Any]] = []
+        self._path: list[Float64] = []
+        self._lock = threading.Lock()
+        self._stage, self._done, self._total = "opening", 0, 0
+        self._last = -1.0
+        self.first_seconds: float | None = None
+        self._began = perf_counter()
+        self._apart = (_MOVED, _TURNED)
+        server.gui.main_panel.dock_right()
+        server.scene.set_up_direction("-y")
+        server.initial_camera.position = (0.6, -1.2, -2.2)
+        server.initial_camera.look_at = (0.0, 0.0, 1.5)
+        self._words = server.gui.add_markdown("Opening the recording.")
+        self._image = server.gui.add_html("")
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """See `Progress`."""
+        with self._lock:
+            self._stage, self._done, self._total = name, 0, total or 0
+            self._say()
+
+    def advance(self, record: FrameRecord | None = None) -> None:
+        """See `Progress`."""
+        with self._lock:
+            self._done += 1
+            if record is not None and record.status == "lost":
+                self._say(f"frame {record.index} is lost: {record.reason}")
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+        """See `Progress`."""
+        with self._lock:
+            T = np.array(T_world_camera, float)
+            self._path.append(T[:3, 3])
+            if self._is_new(T):
+                self._add(frame, T)
+            now = perf_counter()
+            if now - self._last > _PERIOD:
+                self._last = now
+                self._show_now(frame, T)
+                self._say()
+
+    def finish(self, folder: Path) -> ResultView:
+        """Show the result in place of what was seen on the way."""
+        result = read_result(folder)
+        with self._lock, self._server.atomic():
+            self._server.scene.reset()
+            self._server.gui.reset()
+            self._shown.clear()
+            return ResultView(self._server, result)
+
+    def _say(self, more: str = "") -> None:
+        words = f"**{self._stage}**"
+        if self._total:
+            words += f" {self._done} of {self._total}"
+        self._words.content = f"{words}\n\n{more}" if more else words
+
+    def _is_new(self, T: Float64) -> bool:
+        if not self._shown:
+            return True
+        moves = se3.inverse(T) @ np.stack([known for known, _ in self._shown])
+        far = np.linalg.norm(moves[:, :3, 3], axis=1) > self._apart[0]
+        return bool((far | (se3.angle(moves) > self._apart[1])).all())
+
+    def _add(self, frame: Frame, T: Float64) -> None:
+        points = frame.points
+        if len(points) == 0:
+            return
+        chosen = slice(None, None, -(-len(points) // _POINTS))
+        world = se3.transform(T, points[chosen].astype(float)).astype(np.float32)
+        colors = frame.color
+        if colors is not None:
+            tint = colors[chosen]
+        elif frame.amplitude is not None:
+            level = frame.amplitude[chosen].astype(float)
+            bright = max(float(np.percentile(level, 98)), 1e-9)
+            grey = 255 * (level / bright).clip(0.02, 1) ** (1 / 2.2)
+            tint = np.repeat(grey.astype(np.uint8)[:, None], 3, axis=1)
+        else:
+            low, high = np.percentile(world[:, 1], [2, 98])
+            tint = viridis((high - world[:, 1].astype(float)) / max(float(high - low), 1e-6))
+        handle = self._server.scene.add_point_cloud(
+            f"/live/{frame.index}",
+            world,
+            tint,
+            point_size=0.012,
+            point_shading="flat",
+            precision="float16",
+        )
+        if self.first_seconds is None:
+            self.first_seconds = perf_counter() - self._began
+        self._shown = [item for item in self._shown if item[1].name != handle.name]
+        self._shown.append((T, handle))
+        if len(self._shown) > _CLOUDS:
+            for _, old in self._shown[1::2]:
+                old.remove()
+            del self._shown[1::2]
+            self._apart = (1.5 * self._apart[0], 1.5 * self._apart[1])
+
+    def _show_now(self, frame: Frame, T: Float64) -> None:
+        scene = self._server.scene
+        image = None
+        if isinstance(frame, RangeFrame):
+            drawn = frame.color_image
+            if drawn is None:
+                drawn = depth_image(frame, depth_limits(frame), None)
+            image = shrink(drawn, _WIDTH)
+            source = data_uri(image, jpeg=True)
+            self._image.content = (
+                f'<img alt="The frame" src="{source}" style="width:100%;padding:0 0.6em">'
+            )
+        scene.add_camera_frustum(
+            "/live_camera",
+            FOV,
+            1.25 if image is None else image.shape[1] / image.shape[0],
+            scale=0.15,
+            thickness=2.5,
+            thickness_units="screen",
+            color=CHOSEN,
+            wxyz=wxyz(T),
+            position=T[:3, 3],
+        )
+        path = np.stack(self._path[:: -(-len(self._path) // 2000)])
+        if len(path) > 1:
+            ends = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
+            scene.add_line_segments(
+                "/live_path", ends, AFTER, thickness=2.0, thickness_units="screen"
+            )

@@ -1,0 +1,42 @@
+"""Which point of the model a click means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.viewer.result import Layer
+
+Float64 = NDArray[np.float64]
+
+_NEAR, _FAR = 0.006, 0.02  # rad off the ray: as good as on it, and too far
+
+
+def picked(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> Float64 | None:
+    """Return the point (3,) of the layers that lies on a ray in front, or None.
+
+    Of the points that are as good as on the ray the nearest counts; without any, the one that is
+    least off. What a surface shows from behind is not drawn, so it is not picked.
+    """
+    o, d = np.asarray(origin, float), np.asarray(direction, float)
+    d = d / np.linalg.norm(d)
+    best: tuple[float, float] | None = None
+    found = None
+    for layer in layers:
+        v = layer.points - o
+        along = v @ d
+        ahead = along > 1e-6
+        if layer.faces is not None and layer.normals is not None:
+            ahead &= (layer.normals * v).sum(1) < 0
+        rows = np.flatnonzero(ahead)
+        if len(rows) == 0:
+            continue
+        off = np.linalg.norm(v[rows] - along[rows, None] * d, axis=1) / along[rows]
+        on = np.flatnonzero(off < _NEAR)
+        k = on[np.argmin(along[rows[on]])] if len(on) else int(np.argmin(off))
+        rank = (0.0, float(along[rows[k]])) if len(on) else (float(off[k]), 0.0)
+        if off[k] < _FAR and (best is None or rank < best):
+            best, found = rank, layer.points[rows[k]].astype(float)
+    return found

@@ -1,0 +1,201 @@
+"""What an output folder holds, gathered for the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.ply import Ply, read_ply
+from tofuse.files.trajectory import read_tum
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.upright import upright
+from tofuse.report.images import viridis
+from tofuse.report.pictures import Pictures
+from tofuse.results.output import is_result, read_run_json
+from tofuse.viewer.kept import read_kept
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Points, or a surface, and what they can be coloured by.
+
+    Attributes
+    ----------
+    points, normals
+        (N, 3) m, in the world frame; normals may be None.
+    faces
+        (M, 3) rows of `points`, or None for a cloud.
+    color
+        (N, 3) RGB from colour or amplitude, or None.
+    sigma, views
+        (N,) m and counts, or None.
+    """
+
+    points: Float32
+    normals: Float32 | None
+    faces: NDArray[np.int32] | None
+    color: UInt8 | None
+    sigma: Float64 | None
+    views: Float64 | None
+
+    @classmethod
+    def of(cls, ply: Ply) -> Layer:
+        """Take what a PLY of ours holds."""
+        scalars = {
+            name: ply.vertex[name].astype(float)
+            for name in ("sigma", "views")
+            if name in ply.vertex
+        }
+        return cls(
+            ply.points,
+            ply.normals,
+            ply.faces,
+            ply.color,
+            scalars.get("sigma"),
+            scalars.get("views"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A result, as the viewer shows it.
+
+    Attributes
+    ----------
+    run
+        `run.json`.
+    after, before
+        T_world_camera (4, 4) by frame index, with loops closed and before.
+    model_before
+        Points as they lay before, or None.
+    up
+        (3,) unit vector in the world.
+    """
+
+    folder: Path
+    run: dict[str, Any]
+    cloud: Layer
+    mesh: Layer | None
+    after: dict[int, Float64]
+    before: dict[int, Float64]
+    model_before: Layer | None
+    pictures: tuple[Pictures, ...]
+    up: Float64
+
+    @property
+    def frames(self) -> list[dict[str, Any]]:
+        """What `run.json` says of each frame."""
+        frames: list[dict[str, Any]] = self.run["frames"]
+        return frames
+
+    @property
+    def loops(self) -> Float64:
+        """(L, 2, 3) ends of the accepted loops whose frames have a pose."""
+        pairs = [(p["i"], p["j"]) for p in self.run["loops"] if p["accepted"]]
+        ends = [
+            [self.after[i][:3, 3], self.after[j][:3, 3]]
+            for i, j in pairs
+            if i in self.after and j in self.after
+        ]
+        return np.array(ends, float).reshape(-1, 2, 3)
+
+
+def read_result(folder: Path) -> Result:
+    """Read the output folder of a run.
+
+    Raises
+    ------
+    InputError
+        If it is no such folder, or what it holds is damaged or of different runs.
+    """
+    if not folder.exists():
+        raise InputError("doesn't exist", where=folder, remedy="give the --out of `tofuse run`")
+    if not folder.is_dir() or not is_result(folder):
+        raise InputError(
+            "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"
+        )
+    run = read_run_json(folder / "run.json")
+    posed = [f["index"] for f in run["frames"] if f["status"] in ("tracked", "predicted")]
+    _, poses = read_tum(folder / "trajectory.txt")
+    if len(posed) != len(poses):
+        raise InputError(
+            f"says that {len(posed)} frames have a pose, and trajectory.txt holds {len(poses)}",
+            where=folder / "run.json",
+            remedy="copy the whole folder, or run again",
+        )
+    after = dict(zip(posed, poses, strict=True))
+    cloud = Layer.of(read_ply(folder / "cloud.ply"))
+    mesh = Layer.of(read_ply(folder / "mesh.ply")) if (folder / "mesh.ply").is_file() else None
+    kept = read_kept(folder)
+    model_before = None
+    if kept is not None and len(kept.points):
+        model_before = Layer(kept.points, None, None, kept.color, None, None)
+    return Result(
+        folder,
+        run,
+        cloud,
+        mesh,
+        after,
+        {} if kept is None else kept.before,
+        model_before,
+        () if kept is None else kept.pictures,
+        _up(mesh, poses),
+    )
+
+
+def _up(mesh: Layer | None, poses: Float64) -> Float64:
+    n = 0 if mesh is None else len(mesh.points)
+    if mesh is not None and n and mesh.normals is not None and mesh.faces is not None:
+        nothing = np.zeros(n, np.int32)
+        shape = Mesh(
+            mesh.points, mesh.faces, mesh.normals, None, nothing.astype(np.float32), nothing,
+            np.zeros(3),
+        )  # fmt: skip
+        return upright(shape, poses)[1]
+    up = -poses[:, :3, 1].mean(0) if len(poses) else np.zeros(3)
+    length = float(np.linalg.norm(up))
+    return up / length if length > 0.1 else np.array([0.0, -1.0, 0.0])
+
+
+# What the model can be coloured by, and the unit of the scale.
+COLORINGS = ("colour", "height", "uncertainty", "view count")
+
+
+def colorings(layers: Sequence[Layer]) -> list[str]:
+    """Return what at least one of the layers can be coloured by."""
+    needs: dict[str, list[NDArray[Any] | None]] = {
+        "colour": [la.color for la in layers],
+        "height": [la.points for la in layers],
+        "uncertainty": [la.sigma for la in layers],
+        "view count": [la.views for la in layers],
+    }
+    return [name for name in COLORINGS if any(value is not None for value in needs[name])]
+
+
+def painted(layer: Layer, by: str, up: Float64) -> tuple[UInt8, str]:
+    """Return colours (N, 3) of a layer, and the scale in words; grey if it has no such values."""
+    if by == "colour" and layer.color is not None:
+        return layer.color, ""
+    values, unit = None, ""
+    if by == "height":
+        values, unit = layer.points @ up, "m above the first camera"
+    elif by == "uncertainty" and layer.sigma is not None:
+        values, unit = 1000 * layer.sigma, "mm (one standard deviation)"
+    elif by == "view count":
+        values, unit = layer.views, "views"
+    if values is None:
+        return np.full((len(layer.points), 3), 170, np.uint8), ""
+    good = values[np.isfinite(values)]
+    low, high = np.percentile(good, [2, 98]) if len(good) else (0.0, 1.0)
+    colors = viridis((values - low) / max(high - low, 1e-9))
+    return colors, f"from dark ({low:.3g}) to bright ({high:.3g}) {unit}"

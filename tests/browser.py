@@ -1,0 +1,96 @@
+"""A headless Chromium that may reach nothing but what a test shows it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+# What a screenshot of WebGL makes the browser say.
+_OWN = "GPU stall due to ReadPixels"
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Start one; the test is skipped where there is none."""
+    api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = next((found for found in map(shutil.which, names) if found), None)
+    if path is None:
+        pytest.skip("no Chromium on this machine")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@dataclass
+class Watched:
+    """A page, with what it complained about and what it asked of others."""
+
+    page: Any
+    complaints: list[str] = field(default_factory=list)
+    outside: list[str] = field(default_factory=list)
+
+    def pixels(self, selector: str) -> np.ndarray:
+        """What an element looks like, (H, W, 3)."""
+        data = np.frombuffer(self.page.locator(selector).screenshot(), np.uint8)
+        return cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int)
+
+    def check(self) -> None:
+        """Fail if there was any complaint, or any request to another place."""
+        assert self.complaints == []
+        assert self.outside == []
+
+
+@contextmanager
+def watched(browser: Any, address: str, *, ours: str, **options: Any) -> Iterator[Watched]:
+    """Open a page; requests that do not begin with `ours` are refused and kept."""
+    context = browser.new_context(**options)
+    out = Watched(context.new_page())
+
+    def decide(route: Any) -> None:
+        url = route.request.url
+        if url.startswith((ours, "data:", "blob:")):
+            route.continue_()
+        else:
+            out.outside.append(url)
+            route.abort()
+
+    context.route("**/*", decide)
+    out.page.on("pageerror", lambda error: out.complaints.append(str(error)))
+    out.page.on("console", lambda said: _hear(out, said))
+    try:
+        out.page.goto(address)
+        yield out
+    finally:
+        context.close()
+
+
+def _hear(out: Watched, said: Any) -> None:
+    if said.type == "error" and _OWN not in said.text:
+        out.complaints.append(f"{said.text} ({said.location})")
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> float:
+    """Share of pixels that differ clearly; 1 if the size does."""
+    if before.shape != after.shape:
+        return 1.0
+    return float((np.abs(before - after).max(-1) > 24).mean())
