@@ -196,6 +196,15 @@ def screen(client, point, box):
     )
 
 
+def click(page, place):
+    """Click as a person does, who comes to rest before."""
+    page.mouse.move(*place)
+    page.wait_for_timeout(600)
+    page.mouse.down()
+    page.wait_for_timeout(100)
+    page.mouse.up()
+
+
 def drawn(seen):
     """The picture once it rests."""
     last = seen.pixels(CANVAS)
@@ -256,11 +265,12 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             (client,) = server.get_clients().values()
             box = page.locator(CANVAS).bounding_box()
             ends = [result.mesh.points[40 * 20 + 8], result.mesh.points[40 * 20 + 30]]
-            page.mouse.click(*screen(client, ends[0], box))
+            click(page, screen(client, ends[0], box))
             page.get_by_text("Click the second point.").wait_for(timeout=15_000)
-            page.mouse.click(*screen(client, ends[1], box))
+            click(page, screen(client, ends[1], box))
             true = float(np.linalg.norm(ends[1] - ends[0]))
             page.locator("strong", has_text=" m").first.wait_for(timeout=15_000)
+            np.testing.assert_allclose(view.ends, ends, atol=0.03)
             assert view.distance == pytest.approx(true, abs=0.05)
             assert page.locator("strong", has_text=f"{view.distance:.3f} m").count() == 1
             page.wait_for_timeout(500)

@@ -32,15 +32,17 @@ class ResultView:
 
     Attributes
     ----------
+    ends
+        The points (3,) that were picked, at most two.
     distance
         Between the two points that were picked last, m; None before there are two.
     """
 
     def __init__(self, server: ViserServer, result: Result) -> None:
+        self.ends: list[Float64] = []
         self.distance: float | None = None
         self._server, self._result = server, result
         self._lock = threading.Lock()
-        self._ends: list[Float64] = []
         self._measuring = False
         layers = [la for la in (result.mesh, result.cloud) if la is not None]
         self._scale = _place_camera(server, result)
@@ -262,13 +264,13 @@ class ResultView:
 
     def _begin_measuring(self, _: GuiEvent[Any]) -> None:
         with self._lock:
-            self._ends.clear()
+            self.ends.clear()
             for name in ("/distance/0", "/distance/1", "/distance/line", "/distance/label"):
                 self._server.scene.remove_by_name(name)
-            self._measured.content = "Click the first point."
             if not self._measuring:
                 self._measuring = True
                 self._server.scene.on_click()(self._clicked)
+            self._measured.content = "Click the first point."
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
@@ -280,20 +282,20 @@ class ResultView:
                 return
             scene = self._server.scene
             scene.add_icosphere(
-                f"/distance/{len(self._ends)}",
+                f"/distance/{len(self.ends)}",
                 0.006 * self._scale,
                 color=CHOSEN,
                 position=point,
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            self._ends.append(point)
-            if len(self._ends) == 1:
+            self.ends.append(point)
+            if len(self.ends) == 1:
                 self._measured.content = "Click the second point."
                 return
             self._measuring = False
             scene.remove_click_callback(self._clicked)
-            a, b = self._ends
+            a, b = self.ends
             self.distance = float(np.linalg.norm(b - a))
             text = _length(self.distance)
             ends = np.stack([a, b])[None].astype(np.float32)
@@ -309,6 +311,9 @@ def _place_camera(server: ViserServer, result: Result) -> float:
     layer = result.mesh if result.mesh is not None and len(result.mesh.points) else result.cloud
     points = layer.points if len(layer.points) else np.zeros((1, 3), np.float32)
     low, high = np.percentile(points[:: max(1, len(points) // 20_000)], [2, 98], axis=0)
+    if result.after:
+        centers = np.stack([T[:3, 3] for T in result.after.values()])
+        low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
     size = max(float(np.linalg.norm(high - low)), 1e-2)
     forward = np.array([0.0, 0.0, 1.0])
     forward -= result.up * (forward @ result.up)
