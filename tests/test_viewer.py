@@ -196,15 +196,6 @@ def screen(client, point, box):
     )
 
 
-def click(page, place):
-    """Click as a person does, who comes to rest before."""
-    page.mouse.move(*place)
-    page.wait_for_timeout(600)
-    page.mouse.down()
-    page.wait_for_timeout(100)
-    page.mouse.up()
-
-
 def drawn(seen):
     """The picture once it rests."""
     last = seen.pixels(CANVAS)
@@ -253,9 +244,12 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
 
             shot = page.get_by_alt_text("Range")
             was = shot.get_attribute("src")
-            page.get_by_role("slider").first.focus()
-            for _ in range(10):
-                page.keyboard.press("ArrowRight")
+            track = page.locator(".mantine-Slider-track").first.bounding_box()
+            height = track["y"] + track["height"] / 2
+            page.mouse.move(track["x"], height)
+            page.mouse.down()
+            page.mouse.move(track["x"] + track["width"] * 10 / 23, height, steps=3)
+            page.mouse.up()
             page.get_by_text("Frame 10: lost – too few correspondences").wait_for(timeout=15_000)
             assert shot.get_attribute("src") != was
             page.screenshot(path=tmp_path / "slid.png")
@@ -265,9 +259,9 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             (client,) = server.get_clients().values()
             box = page.locator(CANVAS).bounding_box()
             ends = [result.mesh.points[40 * 20 + 8], result.mesh.points[40 * 20 + 30]]
-            click(page, screen(client, ends[0], box))
+            page.mouse.click(*screen(client, ends[0], box))
             page.get_by_text("Click the second point.").wait_for(timeout=15_000)
-            click(page, screen(client, ends[1], box))
+            page.mouse.click(*screen(client, ends[1], box))
             true = float(np.linalg.norm(ends[1] - ends[0]))
             page.locator("strong", has_text=" m").first.wait_for(timeout=15_000)
             np.testing.assert_allclose(view.ends, ends, atol=0.03)
