@@ -31,16 +31,19 @@ from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
-FILES = {*SAME, "report.html", "run.json"}
+FILES = {*SAME, "report.html", "view.npz", "run.json"}
 
 
 @pytest.fixture(autouse=True)
 def light_report(request, monkeypatch):
     """Leave out the report, half of the time of a run, where the test doesn't look at it."""
     if "full_report" not in request.fixturenames:
-        monkeypatch.setattr(
-            run_module, "_report", lambda *a: (a[-1] / "report.html").write_text("report")
-        )
+        monkeypatch.setattr(run_module, "_report", _stubs)
+
+
+def _stubs(*of_a_run: object) -> None:
+    for name in ("report.html", "view.npz"):
+        (of_a_run[-1] / name).write_text(name)
 
 
 @pytest.fixture

@@ -83,6 +83,7 @@ def run(
     recording = recording.select(options.start, options.end, options.every)
     if options.average_still:
         recording = average_still(recording)
+    _preview(recording, progress)
     config = resolve(options, view_kind(recording))
     _check_guess(options, recording)
     config = learnt(fitted(config, recording), recording, options.threads)
@@ -93,7 +94,6 @@ def run(
     findings = _findings(recording, turning=options.object)
     for warning in (*recording.warnings, *(str(f) for f in findings)):
         progress.note(warning)
-    _preview(recording, progress)
     kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
     folder = OutputFolder(options.out, overwrite=options.overwrite or bool(kept.fresh))
     kept.begin(not is_result(options.out))

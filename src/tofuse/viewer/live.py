@@ -75,7 +75,8 @@ class LiveView:
         with self._lock:
             T = np.array(T_world_camera, float)
             self._path.append(T[:3, 3])
-            if self._is_new(T):
+            seen = {handle.name for _, handle in self._shown}
+            if f"/live/{frame.index}" in seen or self._is_new(T):
                 self._add(frame, T)
             now = perf_counter()
             if now - self._last > _PERIOD:
