@@ -47,6 +47,7 @@ _ROOMS = (
     "posegraph",
     "recordings.frames",
     "registration",
+    "results.samples",
     "results.types",
     "sensor",
 )
