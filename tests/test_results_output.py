@@ -211,6 +211,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "schema",
         "version",
         "input",
+        "warnings",
         "seed",
         "threads",
         "config",
