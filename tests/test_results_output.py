@@ -212,6 +212,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "version",
         "input",
         "warnings",
+        "findings",
         "seed",
         "threads",
         "config",
