@@ -264,11 +264,18 @@ def _watched(function: Any, spent: dict[str, Spent]) -> Callable[..., Any]:
         found = spent.setdefault(function.__name__, Spent())
         found.calls += 1
         found.seconds += seconds
-        arrays = [a for a in arguments if isinstance(a, np.ndarray)]
-        found.bytes += _share(arguments, arrays) * sum(a.nbytes for a in arrays)
+        arrays = [a for a in _flat(arguments) if isinstance(a, np.ndarray)]
+        # All iterations of a level are one call, which says last how many they were.
+        passes = result[-1] if function.__name__ == "settle" else 1
+        found.bytes += passes * _share(arguments, arrays) * sum(a.nbytes for a in arrays)
         return result
 
     return called
+
+
+def _flat(arguments: Sequence[Any]) -> Iterator[Any]:
+    for argument in arguments:
+        yield from argument if isinstance(argument, tuple) else (argument,)
 
 
 def _share(arguments: Sequence[Any], arrays: Sequence[NDArray[Any]]) -> float:

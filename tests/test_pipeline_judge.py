@@ -140,8 +140,9 @@ CASES = {
 
 
 def test_every_reason_has_a_case() -> None:
-    # Whether there is a surface is no question of trust: fusion tells.
-    assert set(CASES) == set(REASONS) - {"no_surface"}
+    # Whether there is a surface is no question of trust: fusion tells. What is wrong with the
+    # recording itself is found before it is run.
+    assert set(CASES) == set(REASONS) - {"no_surface", "faulty_recording"}
 
 
 @pytest.mark.parametrize("code", CASES)
