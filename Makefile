@@ -42,6 +42,7 @@ lock: .venv/.ready          ## pin the newest versions that pyproject.toml allow
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group dev pyproject.toml requirements/build.in -o requirements/dev.txt --upgrade
 	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group docs -c requirements/dev.txt -o requirements/docs.txt --upgrade
+	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --all-extras pyproject.toml -o requirements/extras.txt --upgrade
 
 clean:
 	rm -rf .venv build dist

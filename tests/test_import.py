@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 import tofuse
 
@@ -56,3 +62,20 @@ def test_errors_say_what_where_and_what_to_do_on_one_line() -> None:
     assert str(tofuse.OutputError("can't be written")) == "can't be written"
     for kind in (tofuse.InputError, tofuse.OutputError, tofuse.RegistrationError):
         assert issubclass(kind, tofuse.TofuseError)
+
+
+def test_all_extras_go_together() -> None:
+    """`make lock` resolves the package with every extra at once: one version of each serves all."""
+    root = Path(__file__).resolve().parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"].values()
+    wanted = [*project["dependencies"], *(line for extra in extras for line in extra)]
+    pins: dict[str, set[Version]] = {}
+    for line in (root / "requirements" / "extras.txt").read_text().splitlines():
+        found = re.match(r"([\w.-]+)==([^\s;]+)", line)
+        if found:
+            pins.setdefault(canonicalize_name(found[1]), set()).add(Version(found[2]))
+    for line in wanted:
+        requirement = Requirement(line)
+        versions = pins[canonicalize_name(requirement.name)]
+        assert all(version in requirement.specifier for version in versions), line
