@@ -76,7 +76,8 @@ def test_whole_run_as_a_process(scripts, small_room):
     assert spent.peak_mb > 50  # what it imports alone
     lines = list(end_to_end.table([("tofuse run", [spent])]))
     assert f"{spent.ms_a_frame:.1f}" in lines[1]
-    assert any("tracking" in line for line in lines[2:])
+    named = sum(stage in line for stage in spent.stages for line in lines[2:])
+    assert named >= 1  # those that took more than a tenth of a second
     with pytest.raises(RuntimeError, match=r"nothing: doesn.t exist"):
         end_to_end.tofuse_run(room / "nothing", [], 1)
 

@@ -18,8 +18,9 @@ from tofuse.files.images import read_image
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole
-from tofuse.inspection.finding import CODES
+from tofuse.inspection.finding import CODES, Finding
 from tofuse.inspection.inspect import inspect_recording
+from tofuse.pipeline.run import with_findings
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
@@ -388,3 +389,14 @@ def test_real_recordings_raise_only_what_is_true_of_them(shared_data) -> None:
     ):  # fmt: skip
         said = {f.code for f in tofuse.inspect(shared_data / name).findings}
         assert said <= explained.get(name, set()) | {"static"}, name
+
+
+def test_wraps_behind_a_turning_object_are_told_but_do_not_matter(room_recording: Path) -> None:
+    result = tofuse.reconstruct(tofuse.open(room_recording))
+    result = replace(result, recording={**result.recording, "warnings": []})
+    wrap = Finding("phase_wrap", "Far surfaces look near.", "Drop them.", {})
+    moving = with_findings(result, [wrap])
+    turning = with_findings(result, [wrap], turning=True)
+    assert "faulty_recording" in {r.code for r in moving.diagnostics.reasons}
+    assert "faulty_recording" not in {r.code for r in turning.diagnostics.reasons}
+    assert turning.recording["findings"] == moving.recording["findings"]

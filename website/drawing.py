@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from tofuse.files.ply import Ply
 from tofuse.geometry import se3
-from tofuse.simulation.mesh import Mesh
-from tofuse.simulation.scene import Body
+from tofuse.kernels import bvh
 
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -61,11 +60,15 @@ class Picture:
             axis=-1,
         ).reshape(-1, 3)
         directions = np.broadcast_to([0.0, 0.0, 1.0], origins.shape).copy()
-        hit, weights = Body(Mesh.of(vertices, faces)).cast(
-            origins, directions, np.full(len(origins), np.inf)
-        )
+        triangles = vertices[faces].reshape(-1, 9)
+        box, first, count, order = bvh.build_tree(triangles)
+        hit, weights = np.full(len(origins), -1, np.int32), np.zeros((len(origins), 2))
+        bvh.cast_rays(
+            box, first, count, np.ascontiguousarray(triangles[order]),
+            origins, directions, np.full(len(origins), np.inf), hit, weights,
+        )  # fmt: skip
         seen = hit >= 0
-        face, weights = hit[seen], weights[seen]
+        face, weights = order[hit[seen]], weights[seen]
         shade = 0.3 + 0.7 * light[face]
         color = mesh.color if mesh.color is not None else np.full((len(vertices), 3), 150, np.uint8)
         at = faces[face]
