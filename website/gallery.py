@@ -98,7 +98,7 @@ FAILURES = (
     ),
     Exhibit(
         "unit", "A depth unit ten times too large",
-        Made("room", camera_file={"depth_unit_m": 0.01}), {},
+        Made("room", camera_file={"depth_unit_m": 0.001}), {},
         "The model has the right shape and the wrong size, so nothing in it disagrees: only what"
         " is known of rooms and cameras speaks against it.",
     ),
