@@ -235,7 +235,7 @@ def _solved(
         left, share = _between(_expected(true, knots, curve), knots)
         bias = curve[left] * (1 - share) + curve[left + 1] * share
         residual = measured - true - bias - offsets[pixel]
-        scale = max(float(np.median(np.abs(residual) / sigma)) / 0.6745, 0.1)
+        scale = max(_middle(residual / sigma), 0.1)
         weight = 1 / (sigma * scale) ** 2
         weight *= np.minimum(1, _HUBER * scale * sigma / np.maximum(np.abs(residual), 1e-12))
         # Columns: two knots, three numbers of the plane. d(true) = -true^2 ray . d(plane).
@@ -351,7 +351,7 @@ def _offsets(
     sums, weights = np.zeros(size), np.zeros(size)
     joined = np.concatenate(residuals)
     sigma = np.hypot(np.concatenate([view.sigma_m for view in views]), _FLOOR_M)
-    scale = max(float(np.median(np.abs(joined) / sigma)) / 0.6745, 0.1)
+    scale = max(_middle(joined / sigma), 0.1)
     for view, residual in zip(views, residuals, strict=True):
         own = np.hypot(view.sigma_m, _FLOOR_M) * scale
         # The residual holds the offset itself: only what is far off is an outlier.
@@ -364,7 +364,7 @@ def _offsets(
     smooth = _filled(sums, weights, max(2.0, _SMOOTH * shape[1]))
     seen = weights > 0
     apart = (mean - smooth)[seen]
-    limit = 3 * max(float(np.median(np.abs(apart))) / 0.6745, 1e-6)
+    limit = 3 * max(_middle(apart), 1e-6)
     typical = np.abs(apart) < limit
     variance = float(np.mean(apart[typical] ** 2 - 1 / weights[seen][typical]))
     own_share = np.zeros(shape)

@@ -12,6 +12,7 @@ from tofuse.calibration.depth import calibrate_depth, composed
 from tofuse.calibration.lens import calibrate_lens
 from tofuse.calibration.lens_files import read_lens_file
 from tofuse.calibration.plane_views import board_planes, scene_planes
+from tofuse.cli.inputs import selected
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder, replacing
 from tofuse.geometry.cameras import Pinhole, RayTable
@@ -30,7 +31,7 @@ _MOST_PLANES = 20
 def lens(arguments: argparse.Namespace) -> Told:
     """``tofuse calibrate lens``."""
     board = _board(arguments)
-    recording = _recording(arguments)
+    recording = selected(arguments)
     fit = calibrate_lens(recording, board, arguments.model, arguments.image)
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
@@ -49,7 +50,7 @@ def lens(arguments: argparse.Namespace) -> Told:
 
 def depth(arguments: argparse.Namespace) -> Told:
     """``tofuse calibrate depth``."""
-    recording = _recording(arguments)
+    recording = selected(arguments)
     earlier = _earlier_correction(arguments, recording)
     if arguments.board is not None:
         board = Board.parse(arguments.board)
@@ -126,16 +127,6 @@ def import_lens(arguments: argparse.Namespace) -> Told:
         )
         lines += [f"written to {path}" for path in written]
     return {"format": found.format, "warnings": warnings} | fields, lines, warnings
-
-
-def _recording(arguments: argparse.Namespace) -> Recording:
-    recording = open_recording(
-        *arguments.inputs,
-        format=arguments.format,
-        camera=arguments.camera,
-        topic=arguments.topic,
-    )
-    return recording.select(arguments.start, arguments.end, arguments.every)
 
 
 def _board(arguments: argparse.Namespace) -> Board:

@@ -204,15 +204,10 @@ def simulate(arguments: argparse.Namespace) -> int:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
+    from tofuse.cli.inputs import opened
     from tofuse.inspection.inspect import inspect_recording
-    from tofuse.recordings.open import open_recording
 
-    recording = open_recording(
-        *arguments.inputs,
-        format=arguments.format,
-        camera=arguments.camera,
-        topic=arguments.topic,
-    )
+    recording = opened(arguments)
     found = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
     if arguments.sheet is not None:
         found.save_sheet(arguments.sheet)
@@ -238,17 +233,11 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
+    from tofuse.cli.inputs import selected
     from tofuse.recordings.convert import convert as convert_recording
     from tofuse.recordings.layouts import convert_to
-    from tofuse.recordings.open import open_recording
 
-    recording = open_recording(
-        *arguments.inputs,
-        format=arguments.format,
-        camera=arguments.camera,
-        topic=arguments.topic,
-    )
-    recording = recording.select(arguments.start, arguments.end, arguments.every)
+    recording = selected(arguments)
     if arguments.to == "native":
         done = convert_recording(recording, arguments.out)
     else:
@@ -342,19 +331,14 @@ def calibrate(arguments: argparse.Namespace) -> int:
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
     from tofuse.calibration.noise import estimate_noise
+    from tofuse.cli.inputs import opened
     from tofuse.errors import OutputError
-    from tofuse.recordings.open import open_recording
 
     if arguments.out is not None and arguments.out.exists() and not arguments.overwrite:
         raise OutputError(
             "is there already", where=arguments.out, remedy="give --overwrite to replace it"
         )
-    recording = open_recording(
-        *arguments.inputs,
-        format=arguments.format,
-        camera=arguments.camera,
-        topic=arguments.topic,
-    )
+    recording = opened(arguments)
     fit = estimate_noise(recording, arguments.name)
     if arguments.out is not None:
         fit.model.save(arguments.out)

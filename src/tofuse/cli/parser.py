@@ -93,12 +93,8 @@ def _run(commands: Any) -> None:
     )
     _page(g)
     g = p.add_argument_group("what to read")
-    g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
-    g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    g.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
-    g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
-    g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
-    g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    _source(g)
+    _selection(g)
     g.add_argument(
         "--average-still",
         action="store_true",
@@ -106,6 +102,18 @@ def _run(commands: Any) -> None:
     )
     g.add_argument("--min-depth", type=_metres, metavar="M", help="drop points nearer than this")
     g.add_argument("--max-depth", type=_metres, metavar="M", help="drop points beyond this")
+
+
+def _source(p: Any) -> None:
+    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
+    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
+    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
+
+
+def _selection(p: Any) -> None:
+    p.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
+    p.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
+    p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
 
 
 def _processing(p: argparse.ArgumentParser) -> None:
@@ -179,9 +187,7 @@ def _simulate(commands: Any) -> None:
 def _inspect(commands: Any) -> None:
     p = _command(commands, "inspect", "say what a recording is, and what is wrong with it")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
-    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
-    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
+    _source(p)
     p.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet of the frames")
     p.add_argument("--object", action="store_true", help="an object turns before a still camera")
     p.add_argument("--quick", action="store_true", help="only what a run does at its start")
@@ -198,12 +204,8 @@ def _convert(commands: Any) -> None:
         default="native",
         help="layout of the folder (native; the others lose what they have no place for)",
     )
-    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
-    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
-    p.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
-    p.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
-    p.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    _source(p)
+    _selection(p)
 
 
 def _record(commands: Any) -> None:
@@ -247,12 +249,8 @@ def _calibrate(commands: Any) -> None:
         default="amplitude",
         help="where the board is looked for (amplitude)",
     )
-    g.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
-    g.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    g.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
-    g.add_argument("--start", type=_whole, default=0, metavar="I", help="first frame (0)")
-    g.add_argument("--end", type=_whole, metavar="I", help="stop before this frame")
-    g.add_argument("--every", type=_count, default=1, metavar="N", help="use every N-th frame")
+    _source(g)
+    _selection(g)
     g = p.add_argument_group("depth")
     g.add_argument(
         "--wall", action="store_true", help="the board lies flat on a wall, all of which is used"
@@ -283,9 +281,7 @@ def _noise(commands: Any) -> None:
     p.add_argument("--out", type=Path, metavar="FILE", help="write the model, e.g. noise.json")
     p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
     p.add_argument("--name", metavar="NAME", help="what to call the camera")
-    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
-    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
+    _source(p)
     p.add_argument("--json", action="store_true", help="as JSON")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -82,3 +83,30 @@ def make_folder(path: str | Path) -> Path:
     except OSError as error:
         raise output_error(error, path) from error
     return path
+
+
+@contextmanager
+def new_folder(path: str | Path) -> Iterator[Path]:
+    """Give an empty folder beside `path`, renamed to it if the block succeeds, else removed.
+
+    The block should only write: its OSErrors are taken for trouble with the output.
+
+    Raises
+    ------
+    OutputError
+        If `path` is there and is not an empty folder, or can't be written.
+    """
+    path = Path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise OutputError("isn't empty", where=path, remedy="choose a new folder")
+    parent = make_folder(path.absolute().parent)
+    try:
+        # The folder made by `tempfile` is private; the one inside has the usual permissions.
+        with tempfile.TemporaryDirectory(prefix=".tofuse-", dir=parent) as private:
+            beside = make_folder(Path(private) / "made")
+            yield beside
+            if path.exists():
+                path.rmdir()
+            os.replace(beside, path)
+    except OSError as error:
+        raise output_error(error, path) from error

@@ -14,6 +14,7 @@ from tofuse.filters.correction import Correction, Corrector
 from tofuse.filters.multipath import light_image
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.sensor.multipath_surfaces import FALLOFF
 from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
 
 Float32 = NDArray[np.float32]
@@ -123,7 +124,7 @@ def wrapped_light(frame: Frame, period_m: float | None) -> tuple[Float32, Float3
     cosine2 = 1 / (1 + (rays * rays).sum(-1))
     radial = np.where(frame.valid, frame.radial_range, np.float32(0))
     with np.errstate(invalid="ignore"):
-        light = np.nan_to_num(image.light / cosine2**2)
+        light = np.nan_to_num(image.light / cosine2 ** (FALLOFF / 2))
     return radial, light.astype(np.float32), image.period_m
 
 

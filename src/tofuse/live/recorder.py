@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import queue
-import shutil
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 
-from tofuse.errors import InputError, OutputError
-from tofuse.files.atomic import make_folder
+from tofuse.errors import InputError
+from tofuse.files.atomic import new_folder
 from tofuse.live.device import DeviceError, Stream
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
@@ -79,20 +79,13 @@ def record(
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError("isn't empty", where=folder, remedy="choose a new folder")
     if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
         raise InputError("nothing is to be recorded", remedy="give more seconds, or frames")
-    make_folder(folder.absolute().parent)
-    beside = Path(tempfile.mkdtemp(prefix=".tofuse-", dir=folder.absolute().parent))
-    reader = _Reader(stream)
-    try:
+    with new_folder(folder) as beside, _Reader(stream) as reader:
         first = reader.next()
         if first is None:
             raise reader.error or DeviceError("sent no frame", where=stream.settings.sensor)
-        made = beside / "recording"
-        writer = _writer(stream, first, made)
+        writer = _writer(stream, first, beside)
         frame: RangeFrame | None = first
         while frame is not None:
             if seconds is not None and frame.timestamp - first.timestamp >= seconds:
@@ -105,15 +98,7 @@ def record(
             frame = reader.next()
         ended = str(reader.error) if frame is None and reader.error else "asked"
         writer.finish()
-        if folder.exists():
-            folder.rmdir()
-        made.replace(folder)
-    except OSError as error:
-        raise OutputError(f"can't be written ({error})", where=folder) from error
-    finally:
-        reader.end()
-        shutil.rmtree(beside, ignore_errors=True)
-    return Recorded(folder, len(writer), reader.dropped, ended)
+    return Recorded(Path(folder), len(writer), reader.dropped, ended)
 
 
 class _Reader:
@@ -132,7 +117,12 @@ class _Reader:
         """Wait for the next frame; None when the camera has failed."""
         return self._queue.get()
 
-    def end(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
+    ) -> None:
         self._stop.set()
         self._thread.join()
 

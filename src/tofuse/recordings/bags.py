@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.recordings.ros_messages import taken
+from tofuse.geometry.cameras import Camera
+from tofuse.recordings.ros_messages import GREY, check_size, image, taken
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 MISSING = "give `pip install 'tofuse[ros]'`, which brings rosbags"
+APART_S = 0.02  # amplitude farther from its depth than this is of another frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
 
@@ -28,40 +32,34 @@ def open_bag(path: Path) -> Any:
     InputError
         If rosbags is missing, or can't open it.
     """
-    try:
-        highlevel = importlib.import_module("rosbags.highlevel")
-        typesys = importlib.import_module("rosbags.typesys")
-    except ImportError as error:
-        raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
-    try:
-        store = typesys.get_typestore(typesys.Stores.LATEST)
-        bag = highlevel.AnyReader([path], default_typestore=store)
-        bag.open()
-        return bag
-    except Exception as error:
-        raise InputError(
-            f"can't be opened as a bag ({type(error).__name__}: {str(error)[:200]})",
-            where=path,
-            remedy="check the bag, or reindex it",
-        ) from error
+    highlevel, typesys = _rosbags(path, "highlevel", "typesys")
+    return _opened(
+        path,
+        lambda: highlevel.AnyReader(
+            [path], default_typestore=typesys.get_typestore(typesys.Stores.LATEST)
+        ),
+    )
 
 
 def open_container(path: Path) -> Any:
-    """Open a ROS 1 bag whose messages rosbags is not to decode.
+    """Open a ROS 1 bag whose messages rosbags is not to decode; else as `open_bag`.
 
     Makers' own definitions of them are often incomplete.
-
-    Raises
-    ------
-    InputError
-        If rosbags is missing, or can't open it.
     """
+    (rosbag1,) = _rosbags(path, "rosbag1")
+    return _opened(path, lambda: rosbag1.Reader(path))
+
+
+def _rosbags(path: Path, *modules: str) -> list[ModuleType]:
     try:
-        rosbag1 = importlib.import_module("rosbags.rosbag1")
+        return [importlib.import_module(f"rosbags.{name}") for name in modules]
     except ImportError as error:
         raise InputError("is a ROS bag", where=path, remedy=MISSING) from error
+
+
+def _opened(path: Path, make: Callable[[], Any]) -> Any:
     try:
-        bag = rosbag1.Reader(path)
+        bag = make()
         bag.open()
         return bag
     except Exception as error:
@@ -139,6 +137,44 @@ class Track:
             connections=[self.connection], start=start
         )
         return found
+
+
+def amplitude_beside(
+    track: Track | None,
+    time: float,
+    camera: Camera,
+    where: str,
+    read: Callable[[Track, int], Any] = Track.message,
+) -> Float32 | None:
+    """Return the amplitude (H, W) taken with a depth image; zeros where there is none of its time.
+
+    Parameters
+    ----------
+    track
+        Images of the active brightness; None where the bag has none.
+    time
+        Of the depth image, s.
+    camera
+        Of the depth image.
+    where
+        For errors.
+    read
+        Gives a message of a track.
+
+    Raises
+    ------
+    InputError
+        If the image is of another size or kind, or cut off.
+    """
+    if track is None:
+        return None
+    k = track.near(time, APART_S)
+    if k is None:
+        return np.zeros((camera.height, camera.width), np.float32)
+    counts = image(read(track, k), f"{where}, amplitude", GREY)
+    check_size(counts, camera, f"{where}, amplitude")
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(counts.astype(np.float32), posinf=0, neginf=0)
 
 
 def first_message(bag: Any, topic: str) -> Any:

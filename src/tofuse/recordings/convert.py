@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.errors import InputError, OutputError, UnreadableFrameError
-from tofuse.files.atomic import make_folder, output_error
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.atomic import new_folder
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.native import (
@@ -68,31 +66,9 @@ def convert(
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError("isn't empty", where=folder, remedy="choose a new folder")
-    make_folder(folder.absolute().parent)
-    try:
-        beside = Path(tempfile.mkdtemp(prefix=".tofuse-", dir=folder.absolute().parent))
-    except OSError as error:
-        raise output_error(error, folder) from error
-    try:
-        beside.chmod(0o777 & ~_umask())
+    with new_folder(folder) as beside:
         count, warnings = _write(recording, beside, progress)
-        if folder.exists():
-            folder.rmdir()
-        os.replace(beside, folder)
-    except OSError as error:
-        raise output_error(error, folder) from error
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return Conversion(folder, count, tuple(warnings))
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
+    return Conversion(Path(folder), count, tuple(warnings))
 
 
 def _write(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -12,8 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.errors import InputError, OutputError, UnreadableFrameError
-from tofuse.files.atomic import make_folder, output_error, write_text
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.atomic import make_folder, new_folder, write_text
 from tofuse.files.images import write_png
 from tofuse.files.trajectory import write_log, write_tum
 from tofuse.geometry.cameras import Pinhole
@@ -59,25 +57,9 @@ def convert_to(
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError("isn't empty", where=folder, remedy="choose a new folder")
-    make_folder(folder.absolute().parent)
-    try:
-        beside = Path(tempfile.mkdtemp(prefix=".tofuse-", dir=folder.absolute().parent))
-    except OSError as error:
-        raise output_error(error, folder) from error
-    try:
-        made = make_folder(beside / "made")
-        count, warnings = _write(recording, made, layout, progress)
-        if folder.exists():
-            folder.rmdir()
-        made.replace(folder)
-    except OSError as error:
-        raise output_error(error, folder) from error
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-    return Conversion(folder, count, tuple(warnings))
+    with new_folder(folder) as beside:
+        count, warnings = _write(recording, beside, layout, progress)
+    return Conversion(Path(folder), count, tuple(warnings))
 
 
 def _write(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.images import parse_image
-from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
 from tofuse.recordings.camera_file import checked_lens
 
 Float32 = NDArray[np.float32]
@@ -77,36 +77,73 @@ def decompressed(message: Any, where: str) -> NDArray[Any]:
     return np.where(counts > 0, depth, np.float32(np.nan)).astype(np.float32)
 
 
-def lens(info: Any, where: str) -> Pinhole:
-    """Return the lens of a CameraInfo; rows 1 and 2 are called k and d in ROS 2, K and D in 1."""
-    K = np.asarray(getattr(info, "k", getattr(info, "K", ())), float)
-    D = [float(v) for v in getattr(info, "d", getattr(info, "D", ()))]
+@dataclass(frozen=True)
+class Info:
+    """A CameraInfo: size, focal lengths and centre by name, model and coefficients of the lens."""
+
+    size: tuple[int, int]
+    values: dict[str, float]
+    model: str
+    coefficients: list[float]
+
+
+def camera_info(message: Any, where: str) -> Info:
+    """Read a CameraInfo; its matrices are called k and d in ROS 2, K and D in ROS 1.
+
+    Raises
+    ------
+    InputError
+        If it holds no matrix K.
+    """
+    K = np.asarray(getattr(message, "k", getattr(message, "K", ())), float)
+    D = [float(v) for v in getattr(message, "d", getattr(message, "D", ()))]
     if K.shape != (9,):
         raise InputError("has no 3x3 matrix K", where=where, remedy="give --camera camera.json")
-    values = {"fx": K[0], "fy": K[4], "cx": K[2], "cy": K[5]}
-    model = str(info.distortion_model)
-    cls: type[Pinhole] = Pinhole
-    names: tuple[str, ...] = ()
+    values = {"fx": float(K[0]), "fy": float(K[4]), "cx": float(K[2]), "cy": float(K[5])}
+    return Info((int(message.width), int(message.height)), values, str(message.distortion_model), D)
+
+
+def lens(message: Any, where: str) -> Pinhole:
+    """Return the lens of a CameraInfo.
+
+    Raises
+    ------
+    InputError
+        If its model is none of ROS's own, or has more coefficients than that takes.
+    """
+    info = camera_info(message, where)
+    model, D = info.model, info.coefficients
+    name = "pinhole"
     if any(D):
         if model in ("equidistant", "fisheye"):
-            cls, names = Fisheye, ("k1", "k2", "k3", "k4")
+            name = "fisheye"
         elif model == "plumb_bob" or (not model and len(D) == 5):
-            cls, names = BrownConrady, ("k1", "k2", "p1", "p2", "k3")
+            name = "brown"
         elif model == "rational_polynomial":
-            cls, names = Rational, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+            name = "rational"
         else:
             raise InputError(
                 f"has the distortion model {model!r:.40}",
                 where=where,
                 remedy="give --camera camera.json",
             )
-        if any(D[len(names) :]):
+        if any(D[len(DISTORTION_ORDER[name]) :]):
             raise InputError(
                 f"has {len(D)} coefficients for {model}", where=where, remedy="give --camera"
             )
-    values |= dict(zip(names, D, strict=False))
-    numbers = {name: float(v) for name, v in values.items()}
-    return checked_lens(cls, (int(info.width), int(info.height)), numbers, where)
+    coefficients = dict(zip(DISTORTION_ORDER[name], D, strict=False))
+    return checked_lens(MODELS[name], info.size, info.values | coefficients, where)
+
+
+def check_size(counts: NDArray[Any], camera: Camera, where: str) -> None:
+    """Refuse an image (H, W) that isn't of its camera's size, by an InputError."""
+    if counts.shape != (camera.height, camera.width):
+        raise InputError(
+            f"is {counts.shape[1]} x {counts.shape[0]} pixels, its camera "
+            f"{camera.width} x {camera.height}",
+            where=where,
+            remedy="give the camera of these images by --camera",
+        )
 
 
 @dataclass(frozen=True)

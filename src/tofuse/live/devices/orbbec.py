@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
+from tofuse.geometry.cameras import DISTORTION_ORDER, Camera
 from tofuse.live.device import (
     TIMEOUT_S,
     DeviceError,
@@ -21,9 +21,9 @@ from tofuse.live.device import (
 )
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.lenses import plainest_lens
 
 _POLL_MS = 100
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @part("device", "orbbec")
@@ -142,10 +142,6 @@ def _image(frame: Any) -> NDArray[np.float32]:
 
 
 def _camera(lens: Any, distortion: Any, size: tuple[int, int]) -> Camera:
-    focal = (float(lens.fx), float(lens.fy), float(lens.cx), float(lens.cy))
-    k = [float(getattr(distortion, name)) for name in _DISTORTION]
-    if any(k[5:]):
-        return Rational(*size, *focal, *k)
-    if any(k):
-        return BrownConrady(*size, *focal, *k[:5])
-    return Pinhole(*size, *focal)
+    values = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
+    k = {name: float(getattr(distortion, name)) for name in DISTORTION_ORDER["rational"]}
+    return plainest_lens(size, values, k, "Orbbec")

@@ -19,7 +19,7 @@ from tofuse.live.device import (
 )
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.inverse_lens import inverse_brown
+from tofuse.recordings.lenses import inverse_brown
 
 
 @part("device", "realsense")

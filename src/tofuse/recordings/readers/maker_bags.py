@@ -6,20 +6,21 @@ import re
 import struct
 import weakref
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
-from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
+from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole
 from tofuse.parts import part
 from tofuse.recordings.bags import (
     ROS1_MAGIC,
     Track,
+    amplitude_beside,
     damaged,
     first_message,
     open_bag,
@@ -27,20 +28,35 @@ from tofuse.recordings.bags import (
 )
 from tofuse.recordings.camera_file import checked_lens, load_camera
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.inverse_lens import inverse_brown
+from tofuse.recordings.lenses import inverse_brown, plainest_lens
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.ros_messages import ENCODINGS, GREY, image
+from tofuse.recordings.ros_messages import (
+    ENCODINGS,
+    GREY,
+    Info,
+    camera_info,
+    check_size,
+    image,
+)
 from tofuse.recordings.sources import FileSource
 
-_APART_S = 0.02
-_BROWN = ("k1", "k2", "p1", "p2", "k3")
 # The order in which Orbbec writes them.
 _ORBBEC = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def _topics(path: Path) -> set[str]:
+def _topics(path: Path) -> frozenset[str]:
     """Return the topics of a bag, none if it can't be opened."""
+    try:
+        now = path.stat()
+    except OSError:
+        return frozenset()
+    return _topics_of(path, now.st_mtime_ns, now.st_size)
+
+
+@lru_cache(maxsize=4)
+def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
+    """As `_topics`; both readers ask, and opening a large bag takes a while."""
     try:
         if is_folder(path):
             whole = is_file(path / "metadata.yaml") and bool(files_with(path, ".db3", ".mcap"))
@@ -50,12 +66,12 @@ def _topics(path: Path) -> set[str]:
             old = head.startswith(ROS1_MAGIC)
             whole = old or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
         if not whole:
-            return set()
+            return frozenset()
         bag = open_container(path) if old else open_bag(path)
     except InputError:
-        return set()
+        return frozenset()
     try:
-        return {c.topic for c in bag.connections}
+        return frozenset(c.topic for c in bag.connections)
     finally:
         bag.close()
 
@@ -112,38 +128,20 @@ class _BagSource(FileSource):
         time = float(self.timestamps[index])
         try:
             counts = image(self.message(self.depth, index), where, ENCODINGS)
-            if counts.shape != (self.camera.height, self.camera.width):
-                raise InputError(
-                    f"is {counts.shape[1]} x {counts.shape[0]} pixels, its camera "
-                    f"{self.camera.width} x {self.camera.height}",
-                    where=where,
-                    remedy="give the camera of these images by --camera",
-                )
+            check_size(counts, self.camera, where)
             return RangeFrame(
                 index,
                 time,
                 self.camera,
                 depth_from_counts(counts.astype(np.uint16), self.unit),
                 "z",
-                self._amplitude(time, where),
+                amplitude_beside(self.amplitude, time, self.camera, where, self.message),
                 amplitude_kind="ir",
             )
         except InputError:
             raise
         except Exception as error:
             raise damaged(error, where) from error
-
-    def _amplitude(self, time: float, where: str) -> NDArray[np.float32] | None:
-        if self.amplitude is None:
-            return None
-        shape = (self.camera.height, self.camera.width)
-        k = self.amplitude.near(time, _APART_S)
-        if k is None:
-            return np.zeros(shape, np.float32)
-        found = image(self.message(self.amplitude, k), f"{where}, infrared", GREY)
-        if found.shape != shape:
-            raise InputError(f"has infrared of {found.shape[1]} x {found.shape[0]}", where=where)
-        return found.astype(np.float32)
 
     def track(self, topic: str) -> Track | None:
         """Return the messages of a topic, None if there are none."""
@@ -212,41 +210,40 @@ class RealSenseSource(_BagSource):
 
     def _lens(self, stream: str) -> Camera:
         where = f"{self.path}: {stream}"
-        info = first_message(self.bag, f"{stream}/info/camera_info")
-        if info is not None:
-            K = np.asarray(getattr(info, "k", getattr(info, "K", ())), float)
-            D = [float(d) for d in getattr(info, "d", getattr(info, "D", ()))]
-            if K.shape != (9,):
-                raise InputError("has no 3x3 matrix K", where=where, remedy="give --camera")
-            size, numbers = (int(info.width), int(info.height)), (K[0], K[4], K[2], K[5])
-            model = str(info.distortion_model)
-        else:  # newer versions write it as text
-            text = first_message(self.bag, f"{stream}/camera_info")
-            if text is None:
-                raise InputError("has no camera_info", where=where, remedy="give --camera")
-            fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
-            try:
-                size = (int(fields["width"]), int(fields["height"]))
-                numbers = tuple(float(fields[n]) for n in ("fx", "fy", "ppx", "ppy"))  # type: ignore[assignment]
-                D = [float(d) for d in fields.get("coeffs", "").split(",") if d]
-            except (KeyError, ValueError) as error:
-                raise InputError(
-                    f"has a camera_info that can't be read ({error})", where=where
-                ) from error
-            model = fields.get("model", "")
-        values = dict(zip(("fx", "fy", "cx", "cy"), map(float, numbers), strict=True))
-        if not any(D):
-            return checked_lens(Pinhole, size, values, where)
-        brown = checked_lens(BrownConrady, size, values | dict(zip(_BROWN, D, strict=False)), where)
-        words = model.lower().replace("_", " ")
+        message = first_message(self.bag, f"{stream}/info/camera_info")
+        # Newer versions write it as text.
+        info = self._as_text(stream, where) if message is None else camera_info(message, where)
+        if not any(info.coefficients):
+            return checked_lens(Pinhole, info.size, info.values, where)
+        k = dict(zip(DISTORTION_ORDER["brown"], info.coefficients, strict=False))
+        brown = checked_lens(BrownConrady, info.size, info.values | k, where)
+        words = info.model.lower().replace("_", " ")
         if words.startswith("inverse brown"):
             assert isinstance(brown, BrownConrady)
             return inverse_brown(brown)
         if words.startswith("brown"):
             return brown
         raise InputError(
-            f"has the distortion model {model!r:.40}", where=where, remedy="give --camera"
+            f"has the distortion model {info.model!r:.40}", where=where, remedy="give --camera"
         )
+
+    def _as_text(self, stream: str, where: str) -> Info:
+        text = first_message(self.bag, f"{stream}/camera_info")
+        if text is None:
+            raise InputError("has no camera_info", where=where, remedy="give --camera")
+        fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
+        names = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
+        try:
+            return Info(
+                (int(fields["width"]), int(fields["height"])),
+                {ours: float(fields[theirs]) for ours, theirs in names.items()},
+                fields.get("model", ""),
+                [float(d) for d in fields.get("coeffs", "").split(",") if d],
+            )
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                f"has a camera_info that can't be read ({error})", where=where
+            ) from error
 
     def _unit(self, sensor: str) -> float:
         message = first_message(self.bag, f"{sensor}/option/Depth_Units/value")
@@ -316,13 +313,7 @@ class OrbbecSource(_BagSource):
         size, rate = (fields[14], fields[15]), fields[16]
         values = dict(zip(("fx", "fy", "cx", "cy"), fields[17:21], strict=True))
         k = dict(zip(_ORBBEC, fields[21:29], strict=True))
-        if any(k[name] for name in ("k4", "k5", "k6")):
-            self.camera = checked_lens(Rational, size, values | k, where)
-        elif any(k.values()):
-            brown = {name: k[name] for name in _BROWN}
-            self.camera = checked_lens(BrownConrady, size, values | brown, where)
-        else:
-            self.camera = checked_lens(Pinhole, size, values, where)
+        self.camera = plainest_lens(size, values, k, where)
         self.unit = 0.001
         self.metadata |= {"sensor": "Orbbec", "frame_rate_hz": float(rate)}
         infrared = self.track(_ORBBEC_INFRARED)

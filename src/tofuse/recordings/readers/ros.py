@@ -14,7 +14,14 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera
 from tofuse.parts import part
-from tofuse.recordings.bags import MAGIC, Track, damaged, open_bag
+from tofuse.recordings.bags import (
+    APART_S,
+    MAGIC,
+    Track,
+    amplitude_beside,
+    damaged,
+    open_bag,
+)
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
@@ -23,6 +30,7 @@ from tofuse.recordings.ros_messages import (
     ENCODINGS,
     GREY,
     Cloud,
+    check_size,
     cloud,
     decompressed,
     image,
@@ -37,7 +45,6 @@ INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 # Depth in whole numbers is in mm by convention (REP 118).
 _UNIT_M = {"u": 0.001, "f": 1.0}
 _AMPLITUDE_WORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
-_APART_S = 0.02  # amplitude farther from its depth than this is of another frame
 
 
 @part("reader", "ros")
@@ -126,7 +133,7 @@ class RosSource(FileSource):
                 self.camera,
                 self._depth(message, where),
                 self.kind,
-                self._amplitude(time, where),
+                amplitude_beside(self.amplitude, time, self.camera, where),
                 amplitude_kind="ir",
             )
         except InputError:
@@ -203,35 +210,17 @@ class RosSource(FileSource):
             first = track.message(0)
             if (first.height, first.width) != (self.camera.height, self.camera.width):
                 continue
-            beside = [track.near(t, _APART_S) is not None for t in self.timestamps]
+            beside = [track.near(t, APART_S) is not None for t in self.timestamps]
             if sum(beside) > 0.5 * len(beside):
                 self.metadata["amplitude_topic"] = connection.topic
                 return track
         return None
 
-    def _amplitude(self, time: float, where: str) -> Float32 | None:
-        """Return the amplitude taken with a depth image; nothing but zeros where there is none."""
-        if self.amplitude is None:
-            return None
-        k = self.amplitude.near(time, _APART_S)
-        if k is None:
-            assert self.camera is not None
-            return np.zeros((self.camera.height, self.camera.width), np.float32)
-        with np.errstate(all="ignore"):
-            counts = image(self.amplitude.message(k), f"{where}, amplitude", GREY)
-            return np.nan_to_num(counts.astype(np.float32), posinf=0, neginf=0)
-
     def _depth(self, message: Any, where: str) -> Float32:
         turn = decompressed if self.connection.msgtype == COMPRESSED else image
         counts = turn(message, where)
-        camera = self.camera
-        if camera is not None and counts.shape != (camera.height, camera.width):
-            raise InputError(
-                f"is {counts.shape[1]} x {counts.shape[0]} pixels, its camera "
-                f"{camera.width} x {camera.height}",
-                where=where,
-                remedy="give the camera of these images by --camera",
-            )
+        assert self.camera is not None
+        check_size(counts, self.camera, where)
         unit = self.unit if self.unit and counts.dtype.kind == "u" else _UNIT_M[counts.dtype.kind]
         with np.errstate(all="ignore"):
             depth = counts.astype(np.float32) * np.float32(unit)

@@ -1,0 +1,23 @@
+"""The recording that the arguments of a command name."""
+
+from __future__ import annotations
+
+import argparse
+
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+
+
+def opened(arguments: argparse.Namespace) -> Recording:
+    """Open INPUT by --format, --camera and --topic; see `open_recording` for errors."""
+    return open_recording(
+        *arguments.inputs,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+    )
+
+
+def selected(arguments: argparse.Namespace) -> Recording:
+    """Open INPUT, and take the frames of --start, --end and --every."""
+    return opened(arguments).select(arguments.start, arguments.end, arguments.every)
