@@ -164,8 +164,15 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     )
 
 
-def load_camera(path: str | Path) -> tuple[CameraFile, Camera]:
+def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[CameraFile, Camera]:
     """Read a camera.json and the rays.npy beside it, which overrides the lens model.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Width and height of the images that the camera is given for, where they are known.
 
     Raises
     ------
@@ -174,6 +181,13 @@ def load_camera(path: str | Path) -> tuple[CameraFile, Camera]:
     """
     path = Path(path)
     description = read_camera_file(path)
+    if size is not None and description.size != size:
+        raise InputError(
+            f"is of {' x '.join(map(str, description.size or ()))} pixels, depth of "
+            f"{size[0]} x {size[1]}",
+            where=path,
+            remedy="give the camera of these images",
+        )
     table = path.parent / "rays.npy"
     if not is_file(table):
         if description.camera is None:

@@ -97,10 +97,12 @@ class NativeSource(FileSource):
         self.sigma = self._channel("sigma", ".png")
         self.rays = self._channel("rays", ".npy")
         self.by_frequency = self._frequencies()
+        if camera_file is not None:
+            self.rays = []  # the given camera is that of all frames
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
-        self.cameras = self._frame_lenses()
+        self.cameras = self._frame_lenses() if camera_file is None else []
         if self.sigma and self.description.sigma_unit_m is None:
             raise InputError(
                 "is missing, and there is sigma/",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,7 +23,7 @@ from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, load_camera
 from tofuse.recordings.color import sampled_color
-from tofuse.recordings.frames import RangeFrame, UInt8
+from tofuse.recordings.frames import DepthKind, RangeFrame, UInt8
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FileSource
@@ -158,8 +159,8 @@ class AzureKinectSource(FileSource):
         self.metadata |= {
             "sensor": self._sensor(),
             "depth_mode": self.mode,
-            "depth_unit_m": DEPTH_UNIT_M,
-            "depth_kind": "z",
+            "depth_unit_m": self.unit,
+            "depth_kind": self.kind,
             "amplitude_kind": "ir",
         }
         if depth.duration_ns:
@@ -167,31 +168,20 @@ class AzureKinectSource(FileSource):
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        z = self._image(self.depth[index]).astype(np.float32) * np.float32(DEPTH_UNIT_M)
+        depth = self._image(self.depth[index]).astype(np.float32) * np.float32(self.unit)
         block = self.infrared[index]
         infrared = None if block is None else self._image(block).astype(np.float32)
         frame = RangeFrame(
             index,
             float(self.timestamps[index]),
             self.camera,
-            z,
-            "z",
+            depth,
+            self.kind,
             infrared,
             amplitude_kind="ir",
         )
         color = self._color_image(index, frame)
-        if color is None:
-            return frame
-        return RangeFrame(
-            index,
-            frame.timestamp,
-            self.camera,
-            z,
-            "z",
-            infrared,
-            color_image=color,
-            amplitude_kind="ir",
-        )
+        return frame if color is None else replace(frame, color_image=color)
 
     def _image(self, block: Block) -> UInt16:
         width, height = self.size
@@ -229,28 +219,28 @@ class AzureKinectSource(FileSource):
         return [track.blocks[k] if k >= 0 else None for k in pairs]
 
     def _read_cameras(self, options: ReaderOptions, color: Track | None) -> None:
-        path = self.file.path
+        self.unit = DEPTH_UNIT_M
+        self.kind: DepthKind = "z"
         self.color_camera: ColorCamera | None = None
-        if options.camera is not None:
-            description, self.camera = load_camera(options.camera)
-            if (self.camera.width, self.camera.height) != self.size:
-                raise InputError(
-                    f"is of {self.camera.width} x {self.camera.height} pixels, depth of "
-                    f"{self.size[0]} x {self.size[1]}",
-                    where=options.camera,
-                    remedy="give the camera of these images",
-                )
-            self.color_camera = description.color
+        if options.camera is None:
+            self._read_own_cameras(color)
         else:
-            name = self.file.tags.get("K4A_CALIBRATION_FILE", "calibration.json")
-            where = f"{path}: {name}"
-            self.calibration = _calibration(self.file.attachments.get(name), where)
-            lens, T_depth = _lens(self.calibration, "depth", DEPTH_MODES[self.mode], where)
-            self.camera = depth_camera(lens)
-            if color is not None and color.blocks:
-                self.color_camera = self._color_camera(color, T_depth, where)
+            with suppress(InputError):  # which may be why another camera is given
+                self._read_own_cameras(color)
+            about, self.camera = load_camera(options.camera, self.size)
+            self.unit, self.kind = about.depth_unit_m, about.depth_kind
+            self.color_camera = about.color or self.color_camera
         if self.color_camera is None:
             self.color = [None] * len(self.depth)
+
+    def _read_own_cameras(self, color: Track | None) -> None:
+        name = self.file.tags.get("K4A_CALIBRATION_FILE", "calibration.json")
+        where = f"{self.file.path}: {name}"
+        self.calibration = _calibration(self.file.attachments.get(name), where)
+        lens, T_depth = _lens(self.calibration, "depth", DEPTH_MODES[self.mode], where)
+        self.camera = depth_camera(lens)
+        if color is not None and color.blocks:
+            self.color_camera = self._color_camera(color, T_depth, where)
 
     def _color_camera(self, track: Track, T_depth: Float64, where: str) -> ColorCamera | None:
         fourcc = track.private[16:20]

@@ -27,7 +27,7 @@ from tofuse.recordings.bags import (
     open_container,
 )
 from tofuse.recordings.camera_file import checked_lens, load_camera
-from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.lenses import inverse_brown, plainest_lens
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
@@ -81,6 +81,7 @@ class _BagSource(FileSource):
 
     camera: Camera
     unit: float
+    kind: DepthKind = "z"
     depth: Track
     amplitude: Track | None = None
 
@@ -99,7 +100,7 @@ class _BagSource(FileSource):
             self.find()
             if options.camera is not None:
                 about, self.camera = load_camera(options.camera)
-                self.unit = about.depth_unit_m
+                self.unit, self.kind = about.depth_unit_m, about.depth_kind
         except InputError:
             raise
         except Exception as error:
@@ -107,7 +108,7 @@ class _BagSource(FileSource):
         self.timestamps = self.depth.times
         if (np.diff(self.timestamps) <= 0).any():
             self.warnings.append("time goes back or repeats; frames stay in the order of the bag")
-        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": "z"}
+        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
 
     @staticmethod
     def open_bag(path: Path) -> Any:
@@ -134,7 +135,7 @@ class _BagSource(FileSource):
                 time,
                 self.camera,
                 depth_from_counts(counts.astype(np.uint16), self.unit),
-                "z",
+                self.kind,
                 amplitude_beside(self.amplitude, time, self.camera, where, self.message),
                 amplitude_kind="ir",
             )

@@ -140,8 +140,10 @@ class NpzSource(FileSource):
         height, width = self.depth.shape[1:]
         camera: Camera
         if options.camera is not None:
-            about, camera = load_camera(options.camera)
-            unit, self.kind = about.depth_unit_m, about.depth_kind
+            about, camera = load_camera(options.camera, (width, height))
+            self.kind = about.depth_kind
+            if self.depth.dtype.kind != "f":  # which are metres already
+                unit = about.depth_unit_m
         elif "rays" in arrays:
             rays = self._floats(arrays, "rays")
             if rays.shape != (height, width, 2):

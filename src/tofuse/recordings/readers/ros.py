@@ -104,6 +104,10 @@ class RosSource(FileSource):
         if self.connection.msgtype != CLOUD:
             self._read_camera(options)
             self.amplitude = self._find_amplitude()
+            self.metadata["depth_kind"] = self.kind
+            if self.connection.msgtype == IMAGE:
+                kind = np.dtype(ENCODINGS[self._encoding(self.connection)]).kind
+                self.metadata["depth_unit_m"] = self._unit(kind)
         else:
             if options.camera is not None:
                 raise InputError(
@@ -221,12 +225,15 @@ class RosSource(FileSource):
         counts = turn(message, where)
         assert self.camera is not None
         check_size(counts, self.camera, where)
-        unit = self.unit if self.unit and counts.dtype.kind == "u" else _UNIT_M[counts.dtype.kind]
         with np.errstate(all="ignore"):
-            depth = counts.astype(np.float32) * np.float32(unit)
+            depth = counts.astype(np.float32) * np.float32(self._unit(counts.dtype.kind))
         if counts.dtype.kind == "u":
             depth[counts == 65535] = 0
         return np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+
+    def _unit(self, kind: str) -> float:
+        """Return the metres of a count; floats are in metres, whatever a camera says."""
+        return self.unit if self.unit and kind == "u" else _UNIT_M[kind]
 
     def _organised(self) -> Camera | None:
         """Return the camera whose images the clouds are, or None: in x right, y down, z forward."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, ClassVar
 
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.reading import input_error, read_head
-from tofuse.geometry.cameras import Pinhole
+from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.geometry.se3 import inverse
 from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, checked_lens, load_camera
 from tofuse.recordings.color import sampled_color
-from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, needed_file
@@ -73,6 +73,11 @@ class _Entry:
 class SensSource(FileSource):
     """Frames found by walking over the file once, and read one by one."""
 
+    camera: Camera
+    unit: float
+    kind: DepthKind = "z"
+    color: ColorCamera | None = None
+
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
         super().__init__(np.zeros(0))
@@ -94,18 +99,13 @@ class SensSource(FileSource):
             self.warnings.append(f"{path}: cut off after {len(found)} of {count} frames")
         self.reference = self._poses([pose for _, _, pose in found])
         if options.camera is not None:
-            about, camera = load_camera(options.camera)
-            if (camera.width, camera.height) != self.depth_size or not isinstance(camera, Pinhole):
-                raise InputError(
-                    f"isn't a lens of {self.depth_size[0]} x {self.depth_size[1]} pixels",
-                    where=options.camera,
-                    remedy="give the depth camera's",
-                )
-            self.camera, self.unit = camera, about.depth_unit_m
+            about, self.camera = load_camera(options.camera, self.depth_size)
+            self.unit, self.kind = about.depth_unit_m, about.depth_kind
+            self.color = about.color or self.color
         self.metadata |= {
             "sensor": self.sensor,
             "depth_unit_m": self.unit,
-            "depth_kind": "z",
+            "depth_kind": self.kind,
             "frame_rate_hz": _RATE_HZ,
         }
 
@@ -120,17 +120,11 @@ class SensSource(FileSource):
             raise input_error(error, self.path) from error
         counts = self._depth(packed_depth, where)
         depth = depth_from_counts(counts, self.unit)
-        frame = RangeFrame(index, float(self.timestamps[index]), self.camera, depth)
+        frame = RangeFrame(index, float(self.timestamps[index]), self.camera, depth, self.kind)
         if not packed_color or self.color is None:
             return frame
         image = self._color(packed_color, where)
-        return RangeFrame(
-            index,
-            frame.timestamp,
-            self.camera,
-            depth,
-            color_image=sampled_color(frame, image, self.color),
-        )
+        return replace(frame, color_image=sampled_color(frame, image, self.color))
 
     def _read_header(self, file: BinaryIO) -> int:
         version, length = struct.unpack("<IQ", self._take(file, 12))
@@ -153,7 +147,6 @@ class SensSource(FileSource):
         self.unit = 1.0 / per_metre
         color_lens, color_place, depth_lens, depth_place = matrices
         self.camera = self._lens(depth_lens, self.depth_size, "depth")
-        self.color: ColorCamera | None = None
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
             self.color = ColorCamera(
                 self._lens(color_lens, color_size, "color"),
