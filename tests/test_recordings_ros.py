@@ -9,6 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,16 +17,20 @@ from test_recordings_fuzz import damage
 from test_recordings_fuzz_cameras import read_through
 from tofuse.errors import InputError
 from tofuse.files.images import png_bytes
+from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
+from tofuse.geometry.se3 import exp, inverse
 from tofuse.recordings import bags
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.readers import ros
+from tofuse.recordings.readers.realsense_bag import RealSenseSource
 
 RNG = np.random.default_rng(100)
 COUNTS = RNG.integers(300, 5000, (3, 12, 16)).astype(np.uint16)
 KINDS = ("ros1", "ros2", "mcap")
 TOPIC = "/camera/depth/image_rect_raw"
+DEPTH_LENS = Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
 
 
 class Bag:
@@ -67,9 +72,15 @@ class Bag:
         self.writer.write(self.connections[topic], stamp, turn(message, kind))
 
     def image(
-        self, topic: str, time: float, image: np.ndarray, encoding: str, pad: int = 0
+        self,
+        topic: str,
+        time: float,
+        image: np.ndarray,
+        encoding: str,
+        pad: int = 0,
+        width: int | None = None,
     ) -> None:
-        height, width = image.shape
+        height, width = len(image), width or image.shape[1]
         rows = np.ascontiguousarray(image).view(np.uint8).reshape(height, -1)
         rows = np.pad(rows, ((0, 0), (0, pad)))
         self.write(
@@ -87,13 +98,25 @@ class Bag:
         message = self.make(ros.COMPRESSED, self.header(time), format_, content)
         self.write(topic, ros.COMPRESSED, time, message)
 
+    def transform(self, topic: str, T: np.ndarray) -> None:
+        q = quaternion.from_matrix(T[:3, :3])
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        kind = "geometry_msgs/msg/Transform"
+        self.write(topic, kind, 1.0, self.make(kind, vector, turn))
+
     def info(
-        self, topic: str, model: str = "plumb_bob", D: tuple[float, ...] = (0.1, 0.02)
+        self,
+        topic: str,
+        model: str = "plumb_bob",
+        D: tuple[float, ...] = (0.1, 0.02),
+        lens: Pinhole = DEPTH_LENS,
     ) -> None:
-        K = np.array([20.0, 0, 7.5, 0, 21.0, 5.5, 0, 0, 1])
+        K = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
         roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         D = (*D, *(0.0,) * (5 - len(D)))
-        values = (12, 16, model, np.array(D), K, np.eye(3).ravel(), np.zeros(12), 0, 0, roi)
+        size = (lens.height, lens.width)
+        values = (*size, model, np.array(D), K, np.eye(3).ravel(), np.zeros(12), 0, 0, roi)
         self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
 
     def cloud(
@@ -247,7 +270,56 @@ def test_the_topic_can_be_chosen(tmp_path: Path) -> None:
         open_recording(path, topic="/c")
 
 
-def real_sense(folder: Path, kind: str, model: str, *, name: str) -> Path:
+# Colour beside depth: places of both from a reference, and an image that tells its pixels apart.
+T_DEPTH = exp([0.01, 0.02, -0.005, 0.02, -0.03, 0.01])
+T_COLOR = exp([-0.06, 0.01, 0.004, 0.01, 0.12, -0.05])
+COLOR_LENS = Pinhole(48, 40, 40.0, 41.0, 23.0, 20.0)
+COLOR_V, COLOR_U = np.mgrid[:40, :48]
+COLORS = np.stack([5 * COLOR_U, 6 * COLOR_V, 0 * COLOR_U + 200], -1).astype(np.uint8)
+STEP = np.full((12, 16), 8000, np.uint16)  # a wall at 2 m, and a box at 1 m before it
+STEP[4:8, 6:10] = 4000
+
+
+def expected_colors(z: np.ndarray, T: np.ndarray, lens: Pinhole = COLOR_LENS) -> np.ndarray:
+    """Colour (12, 16, 3) of each depth pixel, black where nearer points cover it, one by one."""
+    v, u = np.mgrid[:12, :16]
+    points = np.stack([(u - 7.5) / 20 * z, (v - 5.5) / 21 * z, z], -1) @ T[:3, :3].T + T[:3, 3]
+    uv = np.nan_to_num(lens.project(points), nan=-1)
+    pixel = np.rint(uv).astype(int)
+    out = np.zeros((12, 16, 3), np.uint8)
+    for i in range(12):
+        for j in range(16):
+            a, b = pixel[i, j]
+            if 0 <= a < 48 and 0 <= b < 40:
+                near = np.abs(uv - uv[i, j]).max(-1) < 2
+                if not (points[near, 2] < 0.9 * points[i, j, 2]).any():
+                    out[i, j] = COLORS[b, a]
+    return out
+
+
+def check_colors(found: np.ndarray | None, expected: np.ndarray, off: int = 0) -> None:
+    """Where both say a colour, it is the same; most of what is seen is coloured, hidden parts not.
+
+    What is hidden depends on how wide a point is taken to be, so single pixels may differ there.
+    """
+    assert found is not None
+    both = found.any(-1) & expected.any(-1)
+    assert np.abs(found[both].astype(int) - expected[both]).max() <= off
+    assert both.sum() > 0.8 * expected.any(-1).sum()
+    seen_behind = found.any(-1) & ~expected.any(-1)
+    assert seen_behind.sum() < 8
+    assert (~found.any(-1)).sum() > 5
+
+
+def real_sense(
+    folder: Path,
+    kind: str,
+    model: str,
+    *,
+    name: str,
+    color: str = "",
+    distortion: tuple[float, ...] = (0.0,) * 5,
+) -> Path:
     """A bag as RealSense's SDK writes it: .bag with CameraInfo, newer .db3 with text."""
     bag = Bag(folder, kind)
     stream = "/device_0/sensor_0/Depth_0"
@@ -257,17 +329,34 @@ def real_sense(folder: Path, kind: str, model: str, *, name: str) -> Path:
         bag.info(f"{stream}/info/camera_info", model, D if model != "None" else (0.0,))
         bag.write("/device_0/sensor_0/option/Depth_Units/value", number, 1.0,
                   bag.make(number, 0.00025))  # fmt: skip
+        if color:
+            bag.info(COLOR_STREAM + "/info/camera_info", "Brown Conrady", distortion, COLOR_LENS)
+            for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
+                bag.transform(f"{part}/tf/0", T)
     else:
         coeffs = ",".join(map(str, D if model != "None" else (0,) * 5))
         lens = f"width=16;height=12;fx=20;ppx=7.5;fy=21;ppy=5.5;model={model};coeffs={coeffs}"
         bag.write(f"{stream}/camera_info", text, 1.0, bag.make(text, lens))
+        if color:
+            coeffs = ",".join(map(str, distortion))
+            lens = "width=48;height=40;fx=40;ppx=23;fy=41;ppy=20;model=Inverse Brown Conrady;"
+            bag.write(
+                COLOR_STREAM + "/camera_info", text, 1.0, bag.make(text, f"{lens}coeffs={coeffs}")
+            )
+            for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
+                told = "rotation=" + ",".join(map(str, T[:3, :3].T.ravel()))  # by columns
+                told += ";translation=" + ",".join(map(str, T[:3, 3]))
+                bag.write(f"{part}/tf/0", text, 1.0, bag.make(text, told))
         bag.write("/device_0/sensor_0/option/Depth_Units/value", text, 1.0,
                   bag.make(text, "0.000250"))  # fmt: skip
     pair = "diagnostic_msgs/msg/KeyValue"
     for key, value in (("Serial Number", "f0001"), ("Name", name)):
         bag.write("/device_0/info", pair, 1.0, bag.make(pair, key, value))
     for k in range(3):
-        bag.image(f"{stream}/image/data", 10 + k / 30, COUNTS[k], "mono16")
+        bag.image(f"{stream}/image/data", 10 + k / 30, STEP if color else COUNTS[k], "mono16")
+        if color and k != 1:
+            image = packed(COLORS, color)
+            bag.image(COLOR_STREAM + "/image/data", 10.004 + k / 30, image, color, width=48)
         infrared = (COUNTS[k] % 250).astype(np.uint8)
         bag.image("/device_0/sensor_0/Infrared_0/image/data", 10 + k / 30, infrared, "mono8")
     return bag.close()
@@ -301,34 +390,128 @@ def test_realsense_stereo_and_lenses(tmp_path: Path, kind: str) -> None:
         open_recording(path, topic="/device_0/sensor_0/Depth_0/image/data")
 
 
-def orbbec(folder: Path, distortion: tuple[float, ...]) -> Path:
+COLOR_STREAM = "/device_0/sensor_1/Color_0"
+
+
+def packed(image: np.ndarray, encoding: str) -> np.ndarray:
+    """Rows of bytes of an RGB image."""
+    if encoding == "rgb8":
+        return image.reshape(len(image), -1)
+    if encoding == "bgra8":
+        alpha = np.full((*image.shape[:2], 1), 255, np.uint8)
+        return np.concatenate([image[..., ::-1], alpha], -1).reshape(len(image), -1)
+    assert encoding == "yuyv"
+    y, cr, cb = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb).astype(float), -1, 0)
+    y, cb, cr = 16 + y * 219 / 255, 128 + (cb - 128) * 224 / 255, 128 + (cr - 128) * 224 / 255
+    rows = np.empty((len(image), 2 * image.shape[1]), np.uint8)
+    rows[:, 0::2], rows[:, 1::4], rows[:, 3::4] = y, cb[:, ::2], cr[:, ::2]
+    return rows
+
+
+def jpeg_bytes(image: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 99])[1])
+
+
+@pytest.mark.parametrize(("kind", "encoding", "off"), [
+    ("ros1", "rgb8", 0), ("ros1", "bgra8", 0), ("ros1", "yuyv", 12), ("ros2", "rgb8", 0),
+])  # fmt: skip
+def test_realsense_color_is_that_of_each_point(
+    tmp_path: Path, kind: str, encoding: str, off: int
+) -> None:
+    path = real_sense(tmp_path, kind, "None", name="Intel RealSense D435", color=encoding)
+    recording = open_recording(path)
+    assert recording.warnings == []
+    expected = expected_colors(STEP * 0.00025, T_COLOR @ inverse(T_DEPTH))
+    for k in (0, 2):
+        frame = recording[k]
+        assert isinstance(frame, RangeFrame)
+        check_colors(frame.color_image, expected, off)
+    without = recording[1]
+    assert isinstance(without, RangeFrame)
+    assert without.color_image is None
+
+
+def test_realsense_color_through_an_inverse_lens(tmp_path: Path) -> None:
+    """The lens is told from pixels to rays; it must bring each ray back to its pixel."""
+    k = (0.12, -0.05, 0.002, -0.001, 0.01)
+    name = "Intel RealSense D455"
+    path = real_sense(tmp_path, "ros2", "None", name=name, color="rgb8", distortion=k)
+    source = open_recording(path).source
+    assert isinstance(source, RealSenseSource)
+    assert source.color_camera is not None
+    lens = source.color_camera.camera
+    told = BrownConrady(48, 40, 40.0, 41.0, 23.0, 20.0, k[0], k[1], k[2], k[3], k[4])
+    slopes = np.stack([(COLOR_U - 23.0) / 40, (COLOR_V - 20.0) / 41, 0.0 * COLOR_U + 1], -1)
+    rays = (told.project(slopes) - (23.0, 20.0)) / (40.0, 41.0)
+    points = np.concatenate([rays, np.ones((40, 48, 1))], -1)
+    np.testing.assert_allclose(lens.project(points), np.stack([COLOR_U, COLOR_V], -1), atol=0.1)
+
+
+def test_color_without_its_place_is_left_out(tmp_path: Path) -> None:
+    recording = open_recording(orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=np.zeros((3, 3))))
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.color_image is None
+    assert ["colour is left out" in line for line in recording.warnings] == [True]
+
+
+@pytest.mark.parametrize(("encoding", "off"), [("jpeg", 14), ("rgb8", 0)])
+def test_orbbec_color_is_that_of_each_point(tmp_path: Path, encoding: str, off: int) -> None:
+    R = T_COLOR[:3, :3] * 0.999  # as it is stored
+    frame = open_recording(orbbec(tmp_path, (0.0,) * 8, color=encoding, R=R))[2]
+    assert isinstance(frame, RangeFrame)
+    check_colors(frame.color_image, expected_colors(STEP * 0.00025, T_COLOR), off)
+
+
+def orbbec(
+    folder: Path,
+    distortion: tuple[float, ...],
+    *,
+    color: str = "",
+    R: np.ndarray | None = None,
+) -> Path:
     """A bag as Orbbec's SDK writes it: ROS's images with more fields behind, an own profile."""
     bag = Bag(folder, "ros1")
     header = struct.pack("<4I", 0, 10, 0, 3) + b"cam"
+    R = np.eye(3) if R is None else R
     profile = header + struct.pack(
-        "<2B9f3f3H4f8fB", 3, 10, *np.eye(3).ravel(), 0, 0, 0, 16, 12, 15, 20, 21, 7.5, 5.5,
-        *distortion, 1,
+        "<2B9f3f3H4f8fB", 3, 10, *R.ravel(), *(1000 * T_COLOR[:3, 3]), 16, 12, 15, 20, 21, 7.5,
+        5.5, *distortion, 1,
     )  # fmt: skip
+    color_profile = header + struct.pack(
+        "<2B9f3f3H4f8fB", 2, 5, *np.zeros(12), 48, 40, 15, 40, 41, 23, 20, *np.zeros(8), 1
+    )
     kinds = {
         "/cam/streamProfileType_3": "custom_msg/msg/OBStreamProfileInfo",
         "/cam/sensor_3/frameType_3": "sensor_msgs/msg/Image",
         "/cam/sensor_1/frameType_1": "sensor_msgs/msg/Image",
     }
+    if color:
+        kinds["/cam/streamProfileType_2"] = "custom_msg/msg/OBStreamProfileInfo"
+        kinds["/cam/sensor_2/frameType_2"] = "sensor_msgs/msg/Image"
     definition = "Header header\nuint8 streamType\n"
     connections = {
         topic: bag.writer.add_connection(topic, kind, msgdef=definition, md5sum="0" * 32)
         for topic, kind in kinds.items()
     }
     bag.writer.write(connections["/cam/streamProfileType_3"], 10**10, profile)
+    if color:
+        bag.writer.write(connections["/cam/streamProfileType_2"], 10**10, color_profile)
+    depth = np.stack([STEP // 4] * 3) if color else COUNTS
+    data = COLORS.tobytes() if color == "rgb8" else jpeg_bytes(COLORS)
     for k in range(3):
-        for topic, counts in (
-            ("/cam/sensor_3/frameType_3", COUNTS[k]),
-            ("/cam/sensor_1/frameType_1", COUNTS[k] // 2),
-        ):
+        images = {
+            "/cam/sensor_3/frameType_3": ((12, 16), b"mono16", 32, depth[k].tobytes()),
+            "/cam/sensor_1/frameType_1": ((12, 16), b"mono16", 32, (COUNTS[k] // 2).tobytes()),
+        }
+        if color:
+            images["/cam/sensor_2/frameType_2"] = ((40, 48), color.encode(), 3 * 48, data)
+        for topic, (size, encoding, step, content) in images.items():
             time = 10 + k / 15
             head = struct.pack("<4I", k, int(time), round(time % 1 * 1e9), 3) + b"cam"
-            body = struct.pack("<3I", 12, 16, 6) + b"mono16" + struct.pack("<BII", 0, 32, 384)
-            raw = head + body + counts.astype("<u2").tobytes() + struct.pack("<QQ", 5, 6)
+            body = struct.pack("<3I", *size, len(encoding)) + encoding
+            body += struct.pack("<BII", 0, step, len(content)) + content
+            raw = head + body + struct.pack("<QQ", 5, 6)
             bag.writer.write(connections[topic], round(time * 1e9), raw)
     return bag.close()
 
@@ -350,9 +533,9 @@ def test_orbbec_bags(tmp_path: Path) -> None:
 @pytest.mark.parametrize("maker", ["realsense", "orbbec"])
 def test_damaged_bags_of_makers(tmp_path: Path, maker: str) -> None:
     if maker == "realsense":
-        path = real_sense(tmp_path, "ros1", "None", name="Intel RealSense L515")
+        path = real_sense(tmp_path, "ros1", "None", name="Intel RealSense L515", color="yuyv")
     else:
-        path = orbbec(tmp_path, (0.0,) * 8)
+        path = orbbec(tmp_path, (0.0,) * 8, color="jpeg", R=T_COLOR[:3, :3])
     content, seen = path.read_bytes(), np.zeros(3, int)
     for k in range(40):
         damage([path], np.random.default_rng([102, k]))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from tofuse.errors import InputError
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
 from tofuse.recordings.camera_file import checked_lens
 
@@ -15,6 +18,44 @@ def inverse_brown(lens: BrownConrady) -> RayTable:
     slopes = (np.stack([u, v], axis=-1) - centre) / focal
     points = np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
     return RayTable(((lens.project(points) - centre) / focal).astype(np.float32))
+
+
+def forward_brown(table: RayTable, lens: BrownConrady) -> BrownConrady:
+    """Return the Brown-Conrady lens that projects as `inverse_brown` of `lens` (`table`) does.
+
+    Focal lengths and centre are those of `lens`; the coefficients are fitted to the table's rays.
+
+    Raises
+    ------
+    InputError
+        If none comes as near as half a pixel everywhere.
+    """
+    focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
+    step = max(1, lens.width // 64)
+    rays = table.rays()[::step, ::step].reshape(-1, 2).astype(float)
+    v, u = np.mgrid[: lens.height : step, : lens.width : step]
+    slopes = (np.stack([u, v], axis=-1).reshape(-1, 2) - centre) / focal
+    x, y = rays.T
+    r2 = x * x + y * y
+    radial = np.stack([r2, r2**2, r2**3], axis=-1)
+    tangential = np.stack(
+        [
+            np.stack([2 * x * y, r2 + 2 * x * x], axis=-1),
+            np.stack([r2 + 2 * y * y, 2 * x * y], axis=-1),
+        ]
+    )
+    rows = np.concatenate(
+        [
+            np.concatenate([rays[:, axis : axis + 1] * radial, tangential[axis]], axis=-1)
+            for axis in (0, 1)
+        ]
+    )
+    k1, k2, k3, p1, p2 = np.linalg.lstsq(rows, (slopes - rays).T.ravel(), rcond=None)[0]
+    found = replace(lens, k1=float(k1), k2=float(k2), k3=float(k3), p1=float(p1), p2=float(p2))
+    points = np.concatenate([rays, np.ones((len(rays), 1))], axis=-1)
+    if not np.nanmax(np.abs(found.project(points) - slopes * focal - centre)) < 0.5:
+        raise InputError("bends too much to be turned around", where="lens")
+    return found
 
 
 def plainest_lens(

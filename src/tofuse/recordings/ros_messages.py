@@ -10,14 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.images import parse_image
+from tofuse.files.images import as_color, parse_image
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
 from tofuse.recordings.camera_file import checked_lens
 
 Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
 
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = {"mono8": "u1", "8UC1": "u1", **ENCODINGS}
+# Bytes a pixel, and the channels that are red, green and blue, or how YUV is packed.
+_COLORS: dict[str, tuple[int, list[int] | str]] = {
+    "rgb8": (3, [0, 1, 2]),
+    "bgr8": (3, [2, 1, 0]),
+    "rgba8": (4, [0, 1, 2]),
+    "bgra8": (4, [2, 1, 0]),
+    "mono8": (1, [0, 0, 0]),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, "uyvy")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "yuyv")),
+}
+_JPEG = b"\xff\xd8"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COMPRESSED_HEAD = 12
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -58,6 +70,39 @@ def image(message: Any, where: str, encodings: dict[str, str] = ENCODINGS) -> ND
         raise InputError("is cut off", where=where, remedy="check the bag")
     rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
     return np.ascontiguousarray(rows).view(kind)
+
+
+def color_image(message: Any, where: str) -> UInt8:
+    """Return the (H, W, 3) RGB image of a message.
+
+    Raises
+    ------
+    InputError
+        If it has another encoding, is cut off or damaged.
+    """
+    height, width = int(message.height), int(message.width)
+    data = bytes(message.data)
+    if data.startswith(_JPEG):
+        return as_color(parse_image(data, where, size=(width, height)))
+    encoding = str(message.encoding).lower()
+    if encoding not in _COLORS:
+        raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
+    channels, order = _COLORS[encoding]
+    step = int(message.step)
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * channels:
+        raise InputError(f"claims {width} x {height} pixels of {step} bytes a row", where=where)
+    if len(data) < step * height:
+        raise InputError("is cut off", where=where, remedy="check the bag")
+    rows = np.frombuffer(data, np.uint8)[: step * height].reshape(height, step)
+    pixels = rows[:, : width * channels].reshape(height, width, channels)
+    if isinstance(order, str):
+        if width % 2:
+            raise InputError(f"is {width} pixels wide and {encoding}", where=where)
+        import cv2
+
+        code = {"uyvy": cv2.COLOR_YUV2RGB_UYVY, "yuyv": cv2.COLOR_YUV2RGB_YUY2}[order]
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), code), np.uint8)
+    return np.ascontiguousarray(pixels[..., order])
 
 
 def decompressed(message: Any, where: str) -> NDArray[Any]:

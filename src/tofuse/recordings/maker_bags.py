@@ -1,0 +1,187 @@
+"""What bags of makers' viewers have in common: ROS containers with own messages."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder, read_head
+from tofuse.geometry.cameras import Camera
+from tofuse.recordings.bags import (
+    APART_S,
+    ROS1_MAGIC,
+    Track,
+    amplitude_beside,
+    damaged,
+    open_bag,
+    open_container,
+)
+from tofuse.recordings.camera_file import ColorCamera, load_camera
+from tofuse.recordings.color import sampled_color
+from tofuse.recordings.frames import DepthKind, RangeFrame
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.reader import ReaderOptions
+from tofuse.recordings.ros_messages import ENCODINGS, check_size, color_image, image
+from tofuse.recordings.sources import FileSource
+
+
+def topics(path: Path) -> frozenset[str]:
+    """Return the topics of a bag, none if it can't be opened."""
+    try:
+        now = path.stat()
+    except OSError:
+        return frozenset()
+    return _topics_of(path, now.st_mtime_ns, now.st_size)
+
+
+@lru_cache(maxsize=4)
+def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
+    """As `_topics`; both readers ask, and opening a large bag takes a while."""
+    try:
+        if is_folder(path):
+            whole = is_file(path / "metadata.yaml") and bool(files_with(path, ".db3", ".mcap"))
+            old = False
+        else:
+            head = read_head(path, 16)
+            old = head.startswith(ROS1_MAGIC)
+            whole = old or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
+        if not whole:
+            return frozenset()
+        bag = open_container(path) if old else open_bag(path)
+    except InputError:
+        return frozenset()
+    try:
+        return frozenset(c.topic for c in bag.connections)
+    finally:
+        bag.close()
+
+
+class BagSource(FileSource):
+    """Depth images of one track, and amplitude of another."""
+
+    camera: Camera
+    unit: float
+    kind: DepthKind = "z"
+    depth: Track
+    amplitude: Track | None = None
+    color: Track | None = None
+    color_camera: ColorCamera | None = None
+
+    def __init__(self, path: Path, options: ReaderOptions) -> None:
+        self.path = path
+        if options.topic is not None:
+            raise InputError(
+                "means nothing for this maker's bags",
+                where="--topic",
+                remedy="leave it out, or give --format ros",
+            )
+        self.bag = self.open_bag(path)
+        weakref.finalize(self, self.bag.close)
+        super().__init__(np.zeros(0))
+        try:
+            self.find()
+            if options.camera is None:
+                self.camera = self.lens()
+            else:
+                about, self.camera = load_camera(options.camera)
+                self.unit, self.kind = about.depth_unit_m, about.depth_kind
+                self.color_camera = about.color
+            self._find_color()
+        except InputError:
+            raise
+        except Exception as error:
+            raise damaged(error, path) from error
+        self.timestamps = self.depth.times
+        if (np.diff(self.timestamps) <= 0).any():
+            self.warnings.append("time goes back or repeats; frames stay in the order of the bag")
+        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
+
+    @staticmethod
+    def open_bag(path: Path) -> Any:
+        """Open the bag, so that its messages can be decoded."""
+        return open_bag(path)
+
+    def find(self) -> None:
+        """Set `unit`, `depth`, and where there are any `amplitude` and `color`."""
+        raise NotImplementedError
+
+    def lens(self) -> Camera:
+        """Return the camera of the depth images."""
+        raise NotImplementedError
+
+    def color_lens(self) -> ColorCamera:
+        """Return the camera of the colour images; raise InputError if it isn't told."""
+        raise NotImplementedError
+
+    def _find_color(self) -> None:
+        if self.color is None or self.color_camera is not None:
+            return
+        try:
+            self.color_camera = self.color_lens()
+        except InputError as error:
+            self.warnings.append(f"colour is left out: {error}")
+            self.color = None
+
+    def message(self, track: Track, index: int) -> Any:
+        """Return an image message of a track."""
+        return track.message(index)
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        where = f"{self.path}: frame {index}"
+        time = float(self.timestamps[index])
+        try:
+            counts = image(self.message(self.depth, index), where, ENCODINGS)
+            check_size(counts, self.camera, where)
+            frame = RangeFrame(
+                index,
+                time,
+                self.camera,
+                depth_from_counts(counts.astype(np.uint16), self.unit),
+                self.kind,
+                amplitude_beside(self.amplitude, time, self.camera, where, self.message),
+                amplitude_kind="ir",
+            )
+            return self._colored(frame, where)
+        except InputError:
+            raise
+        except Exception as error:
+            raise damaged(error, where) from error
+
+    def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
+        """Return the frame with the colour of its moment, where there is any."""
+        k = None if self.color is None else self.color.near(frame.timestamp, APART_S)
+        if k is None or self.color is None or self.color_camera is None:
+            return frame
+        image = color_image(self.message(self.color, k), f"{where}, colour")
+        camera = self.color_camera.camera
+        if image.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
+                f"{camera.width} x {camera.height}",
+                where=f"{where}, colour",
+            )
+        return replace(frame, color_image=sampled_color(frame, image, self.color_camera))
+
+    def track(self, topic: str) -> Track | None:
+        """Return the messages of a topic, None if there are none."""
+        for connection in self.bag.connections:
+            if connection.topic == topic:
+                found = Track(self.bag, connection)
+                return found if len(found) else None
+        return None
+
+    def needed(self, topic: str, what: str) -> Track:
+        """Return the messages of a topic that must be there."""
+        found = self.track(topic)
+        if found is None:
+            raise InputError(
+                f"has no {what} ({topic})", where=self.path, remedy="record the depth stream"
+            )
+        return found

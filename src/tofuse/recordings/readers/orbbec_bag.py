@@ -1,0 +1,148 @@
+"""Reader of the bags that Orbbec's viewer and SDK write."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import Camera, Pinhole
+from tofuse.geometry.se3 import check_pose, orthonormalise
+from tofuse.parts import part
+from tofuse.recordings.bags import Track, open_container
+from tofuse.recordings.camera_file import ColorCamera
+from tofuse.recordings.lenses import plainest_lens
+from tofuse.recordings.maker_bags import BagSource, topics
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.ros_messages import GREY
+
+Float64 = NDArray[np.float64]
+
+# The order in which Orbbec writes them.
+_ORBBEC = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+@part("reader", "orbbec-bag")
+@dataclass(frozen=True)
+class OrbbecBag:
+    """A .bag of Orbbec's viewer or SDK: depth, infrared of the same pixels, and colour."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if _ORBBEC_DEPTH in topics(path):
+            return Sniff(1.0, "a bag of Orbbec's SDK")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> OrbbecSource:
+        """See `Reader.open`."""
+        return OrbbecSource(path, options)
+
+
+_ORBBEC_DEPTH = "/cam/sensor_3/frameType_3"
+_ORBBEC_DEPTH_PROFILE = "/cam/streamProfileType_3"
+_ORBBEC_COLOR = "/cam/sensor_2/frameType_2"
+_ORBBEC_COLOR_PROFILE = "/cam/streamProfileType_2"
+_ORBBEC_INFRARED = "/cam/sensor_1/frameType_1"
+_PROFILE = struct.Struct("<2B9f3f3H4f8fB")
+
+
+@dataclass(frozen=True, eq=False)
+class _Profile:
+    """Size, frames a second, lens and place of a stream: its motion into the colour stream."""
+
+    size: tuple[int, int]
+    rate: int
+    values: dict[str, float]
+    k: dict[str, float]
+    rotation: Float64
+    translation_m: Float64
+
+    def lens(self, where: str) -> Pinhole:
+        return plainest_lens(self.size, self.values, self.k, where)
+
+
+class OrbbecSource(BagSource):
+    """See `OrbbecBag`. Its messages have more fields than ROS's own, so they are read here."""
+
+    @staticmethod
+    def open_bag(path: Path) -> Any:
+        """See `BagSource.open_bag`."""
+        return open_container(path)
+
+    def find(self) -> None:
+        """See `BagSource.find`."""
+        self.depth = self.needed(_ORBBEC_DEPTH, "depth")
+        self.profile = self._profile(_ORBBEC_DEPTH_PROFILE)
+        self.unit = 0.001
+        self.metadata |= {"sensor": "Orbbec", "frame_rate_hz": float(self.profile.rate)}
+        infrared = self.track(_ORBBEC_INFRARED)
+        if infrared is not None:
+            first = self.message(infrared, 0)
+            if (first.width, first.height) == self.profile.size and first.encoding in GREY:
+                self.amplitude = infrared
+        self.color = self.track(_ORBBEC_COLOR)
+
+    def lens(self) -> Camera:
+        """See `BagSource.lens`."""
+        return self.profile.lens(f"{self.path}: {_ORBBEC_DEPTH_PROFILE}")
+
+    def color_lens(self) -> ColorCamera:
+        """See `BagSource.color_lens`."""
+        where = f"{self.path}: {_ORBBEC_DEPTH_PROFILE}"
+        lens = self._profile(_ORBBEC_COLOR_PROFILE).lens(f"{self.path}: {_ORBBEC_COLOR_PROFILE}")
+        R = self.profile.rotation
+        # As single precision, and not made orthogonal before.
+        if not (np.abs(R @ R.T - np.eye(3)).max() < 0.05 and np.linalg.det(R) > 0):
+            raise InputError("has no place beside colour", where=where)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, self.profile.translation_m
+        return ColorCamera(lens, check_pose(orthonormalise(T), where=where))
+
+    def _profile(self, topic: str) -> _Profile:
+        where = f"{self.path}: {topic}"
+        raw = bytes(self.needed(topic, "profile of the stream").raw(0))
+        at = _header_end(raw, where)
+        if len(raw) < at + _PROFILE.size:
+            raise InputError("is cut off", where=where, remedy="check the bag")
+        fields = _PROFILE.unpack_from(raw, at)
+        return _Profile(
+            (fields[14], fields[15]),
+            fields[16],
+            dict(zip(("fx", "fy", "cx", "cy"), fields[17:21], strict=True)),
+            dict(zip(_ORBBEC, fields[21:29], strict=True)),
+            np.reshape(fields[2:11], (3, 3)),
+            np.array(fields[11:14]) / 1000,
+        )
+
+    def message(self, track: Track, index: int) -> Any:
+        """Read the part of an image message that is as in ROS 1."""
+        raw = bytes(track.raw(index))
+        where = f"{self.path}: {track.connection.topic}, message {index}"
+        at = _header_end(raw, where)
+        try:
+            height, width, length = struct.unpack_from("<3I", raw, at)
+            at += 12
+            encoding = raw[at : at + length].decode("ascii", "replace")
+            at += length
+            big, step, count = struct.unpack_from("<BII", raw, at)
+        except struct.error as error:
+            raise InputError("is cut off", where=where, remedy="check the bag") from error
+        data = raw[at + 9 : at + 9 + count]
+        return SimpleNamespace(
+            height=height, width=width, encoding=encoding, is_bigendian=big, step=step, data=data
+        )
+
+
+def _header_end(raw: bytes, where: str) -> int:
+    """Return where a ROS 1 header (counter, time, name of the frame) ends."""
+    if len(raw) < 16:
+        raise InputError("is cut off", where=where, remedy="check the bag")
+    return 16 + int.from_bytes(raw[12:16], "little")

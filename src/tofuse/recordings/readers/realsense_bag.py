@@ -1,0 +1,193 @@
+"""Reader of the bags that RealSense's viewer and SDK write."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
+from tofuse.geometry.quaternion import to_matrix
+from tofuse.geometry.se3 import check_pose, inverse, orthonormalise
+from tofuse.parts import part
+from tofuse.recordings.bags import first_message
+from tofuse.recordings.camera_file import ColorCamera, checked_lens
+from tofuse.recordings.lenses import forward_brown, inverse_brown
+from tofuse.recordings.maker_bags import BagSource, topics
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.ros_messages import Info, camera_info
+
+Float64 = NDArray[np.float64]
+
+
+@part("reader", "realsense-bag")
+@dataclass(frozen=True)
+class RealSenseBag:
+    """A .bag (or .db3) of RealSense's viewer or SDK: depth, colour, and infrared of the L515."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        if any(re.fullmatch(_REALSENSE_DEPTH, topic) for topic in topics(path)):
+            return Sniff(1.0, "a bag of RealSense's SDK")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> RealSenseSource:
+        """See `Reader.open`."""
+        return RealSenseSource(path, options)
+
+
+_REALSENSE_DEPTH = r"/device_\d+/sensor_\d+/Depth_\d+/image/data"
+
+
+class RealSenseSource(BagSource):
+    """See `RealSenseBag`."""
+
+    def find(self) -> None:
+        """See `BagSource.find`."""
+        found = sorted(
+            c.topic for c in self.bag.connections if re.fullmatch(_REALSENSE_DEPTH, c.topic)
+        )
+        if not found:
+            raise InputError("has no depth of a RealSense", where=self.path, remedy="record it")
+        stream = found[0].removesuffix("/image/data")
+        sensor = stream.rsplit("/", 1)[0]
+        self.depth = self.needed(found[0], "depth")
+        self.stream = stream
+        self.unit = self._unit(sensor)
+        name = self._name(sensor.rsplit("/", 1)[0])
+        self.metadata["sensor"] = name
+        if "L5" in name:  # of stereo cameras infrared is another view
+            found = [
+                c.topic
+                for c in self.bag.connections
+                if re.fullmatch(re.escape(sensor) + r"/Infrared_\d+/image/data", c.topic)
+            ]
+            if found:
+                self.amplitude = self.track(sorted(found)[0])
+        device = sensor.rsplit("/", 1)[0]
+        pattern = re.escape(device) + r"/sensor_\d+/Color_\d+/image/data"
+        found = [c.topic for c in self.bag.connections if re.fullmatch(pattern, c.topic)]
+        if found:
+            self.color = self.track(sorted(found)[0])
+
+    def lens(self) -> Camera:
+        """See `BagSource.lens`."""
+        return self._lens(self.stream)
+
+    def color_lens(self) -> ColorCamera:
+        """See `BagSource.color_lens`."""
+        assert self.color is not None
+        stream = self.color.connection.topic.removesuffix("/image/data")
+        lens = self._lens(stream)
+        if isinstance(lens, RayTable):
+            lens = forward_brown(lens, self._brown(stream))
+        assert isinstance(lens, Pinhole)
+        depth, color = self._places(self.stream), self._places(stream)
+        common = sorted(depth.keys() & color.keys())
+        if not common:
+            raise InputError("has no place beside depth", where=f"{self.path}: {stream}")
+        return ColorCamera(lens, color[common[0]] @ inverse(depth[common[0]]))
+
+    def _places(self, stream: str) -> dict[str, Float64]:
+        """Return motions (4, 4) into a stream's frame, each from a reference that a number names.
+
+        In ROS 1 bags they are transforms, later text: a rotation by columns, and a translation.
+        """
+        out = {}
+        for connection in self.bag.connections:
+            if not re.fullmatch(re.escape(stream) + r"/tf/\d+", connection.topic):
+                continue
+            message = first_message(self.bag, connection.topic)
+            where = f"{self.path}: {connection.topic}"
+            T = np.eye(4)
+            try:
+                if hasattr(message, "data"):
+                    text = dict(p.partition("=")[::2] for p in str(message.data).split(";"))
+                    T[:3, :3] = _numbers(text["rotation"]).reshape(3, 3).T
+                    T[:3, 3] = _numbers(text["translation"])
+                elif message is not None:
+                    q, t = message.rotation, message.translation
+                    T[:3, :3] = to_matrix([q.x, q.y, q.z, q.w])
+                    T[:3, 3] = (t.x, t.y, t.z)
+            except (AttributeError, KeyError, ValueError) as error:
+                raise InputError(f"can't be read ({error})", where=where) from error
+            out[connection.topic.rsplit("/", 1)[1]] = orthonormalise(check_pose(T, where=where))
+        return out
+
+    def _lens(self, stream: str) -> Camera:
+        info, where = self._info(stream), f"{self.path}: {stream}"
+        if not any(info.coefficients):
+            return checked_lens(Pinhole, info.size, info.values, where)
+        brown = self._brown(stream)
+        words = info.model.lower().replace("_", " ")
+        if words.startswith("inverse brown"):
+            return inverse_brown(brown)
+        if words.startswith("brown"):
+            return brown
+        raise InputError(
+            f"has the distortion model {info.model!r:.40}", where=where, remedy="give --camera"
+        )
+
+    def _brown(self, stream: str) -> BrownConrady:
+        info = self._info(stream)
+        k = dict(zip(DISTORTION_ORDER["brown"], info.coefficients, strict=False))
+        lens = checked_lens(BrownConrady, info.size, info.values | k, f"{self.path}: {stream}")
+        assert isinstance(lens, BrownConrady)
+        return lens
+
+    def _info(self, stream: str) -> Info:
+        where = f"{self.path}: {stream}"
+        message = first_message(self.bag, f"{stream}/info/camera_info")
+        # Newer versions write it as text.
+        return self._as_text(stream, where) if message is None else camera_info(message, where)
+
+    def _as_text(self, stream: str, where: str) -> Info:
+        text = first_message(self.bag, f"{stream}/camera_info")
+        if text is None:
+            raise InputError("has no camera_info", where=where, remedy="give --camera")
+        fields = dict(p.partition("=")[::2] for p in str(text.data).split(";"))
+        names = {"fx": "fx", "fy": "fy", "cx": "ppx", "cy": "ppy"}
+        try:
+            return Info(
+                (int(fields["width"]), int(fields["height"])),
+                {ours: float(fields[theirs]) for ours, theirs in names.items()},
+                fields.get("model", ""),
+                [float(d) for d in fields.get("coeffs", "").split(",") if d],
+            )
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                f"has a camera_info that can't be read ({error})", where=where
+            ) from error
+
+    def _unit(self, sensor: str) -> float:
+        message = first_message(self.bag, f"{sensor}/option/Depth_Units/value")
+        try:
+            unit = float(message.data) if message is not None else 0.0
+        except ValueError:
+            unit = 0.0
+        if not 1e-6 < unit < 0.1:
+            self.warnings.append(f"{self.path}: no depth unit is told; 1 mm is taken")
+            return 0.001
+        return float(np.float32(unit))
+
+    def _name(self, device: str) -> str:
+        """Return the camera's name, which is a message (key, value) among others."""
+        for connection in self.bag.connections:
+            if connection.topic != f"{device}/info":
+                continue
+            for _, _, raw in self.bag.messages(connections=[connection]):
+                message = self.bag.deserialize(raw, connection.msgtype)
+                if getattr(message, "key", "") == "Name":
+                    return str(message.value)[:200]
+        return "RealSense"
+
+
+def _numbers(text: str) -> Float64:
+    return np.array([float(word) for word in text.split(",")])
