@@ -1,20 +1,20 @@
 """How often the verdict is right: many runs, each judged without the truth and then against it.
 
 A result is right if its absolute trajectory error is below 1 cm and 1 % of the path, and half of
-the frames have a pose. Simulated scenes are run with several seeds and strides, by the default
-method, by the default without its refinement, and by the method of the thesis; with and without
-the camera's factory correction, and in rooms of a single albedo. Also printed is how honest the
-covariances of the final poses are: the share of their errors within the regions that should hold
-50, 90 and 95 %.
+the frames have a pose; for real recordings, what their reference itself is good for is added.
+Simulated scenes are run with several seeds and strides, by the default method, by the default
+without its refinement, and by the method of the thesis; with and without the camera's factory
+correction, and in rooms of a single albedo. Also printed is how honest the covariances of the final
+poses are: the share of their errors within the regions that should hold 50, 90 and 95 %.
 
-    python benchmarks/verdict.py --seeds 2
+    python benchmarks/verdict.py --seeds 5 --real
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+import sequences
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.filters.foreground import Foreground
@@ -43,6 +44,15 @@ LEVELS = (0.5, 0.9, 0.95)
 # Stride among the raw frames of each scene, and what is farther is not the object.
 EVERY = {"room": 6, "empty-room": 6, "rail": 5, "torso": 6, "box": 10, "corridor": 3}
 FARTHEST_M = {"torso": 2.2, "box": 1.8}
+# Real recordings: what the reference is good for (m), and which frames are runs of their own.
+REAL = {
+    "kitchen": (0.04, [slice(k, k + 100, every) for k in range(0, 500, 100) for every in (1, 4)]),
+    "kitchen-whole": (0.04, [slice(0, None, 2), slice(0, None, 10)]),
+    "iphone": (0.02, [slice(0, None, every) for every in (1, 2, 3)]),
+    "kinect": (0.07, [slice(0, None, 1), slice(0, 9, 1), slice(8, None, 1)]),
+    "stray": (0.02, [slice(0, None, every) for every in (1, 4, 10)]),
+    "record3d": (0.02, [slice(0, None, every) for every in (1, 3)]),
+}
 KINDS = {"plain": {}, "uncorrected": {"correction": False}, "uniform": {"texture": False}}
 
 
@@ -93,12 +103,20 @@ def recorded(scene: str, seed: int, kind: str) -> Recording:
     return open_recording(path)
 
 
-def judged(name: str, recording: Recording, config: Config, farthest_m: float | None) -> Run:
-    """Run a method, and compare its verdict with the truth."""
+def judged(
+    name: str,
+    recording: Recording,
+    config: Config,
+    farthest_m: float | None,
+    reference_m: float = 0.0,
+) -> Run:
+    """Run a method, and compare its verdict with a reference that is good to `reference_m`."""
     reference = recording.reference
     assert reference is not None
-    allowed = GOOD_M + GOOD_SHARE * float(
-        np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1).sum()
+    allowed = (
+        reference_m
+        + GOOD_M
+        + GOOD_SHARE * float(np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1).sum())
     )
     if farthest_m is not None:
         config = replace(config, filters=(Foreground(farthest_m), *config.filters))
@@ -149,6 +167,16 @@ def cases(seeds: int, scenes: list[str]) -> Iterator[tuple[str, int, str, str, i
                         yield scene, seed, kind, "thesis", stride
 
 
+def real(name: str, data: Path) -> Recording:
+    """A real recording with its reference; FileNotFoundError where it is not there."""
+    if name in ("stray", "record3d"):
+        path = data / f"iphone_{name}"
+        if not path.is_dir():
+            raise FileNotFoundError(path)
+        return open_recording(path)
+    return sequences.KINDS[name.removesuffix("-whole")].open(data)
+
+
 def table(runs: list[Run]) -> str:
     """The confusion table, and the honesty of the covariances."""
     counts = Counter((run.right, run.verdict) for run in runs)
@@ -176,21 +204,43 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=2, help="of the simulation; 0: none")
     parser.add_argument("--scenes", nargs="+", default=list(EVERY), choices=list(EVERY))
+    parser.add_argument("--real", action="store_true", help="the real recordings too")
+    parser.add_argument("--data", type=Path, default=sequences.DATA, help="real recordings")
     options = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     configs = methods()
     runs = []
-    for scene, seed, kind, method, stride in cases(options.seeds, options.scenes):
-        recording = recorded(scene, seed, kind).select(every=stride)
-        name = f"{scene} {seed} {kind} {method} every {stride}"
-        run = judged(name, recording, configs[method], FARTHEST_M.get(scene))
+
+    def done(run: Run) -> None:
         runs.append(run)
         mark = "right" if run.right else "wrong"
         size = f"{1e3 * run.error_m:7.1f} of {1e3 * run.allowed_m:5.1f} mm"
-        print(f"{name:44} {mark} {size}  {run.verdict:9} {' '.join(run.codes)}", flush=True)
+        print(f"{run.name:44} {mark} {size}  {run.verdict:9} {' '.join(run.codes)}", flush=True)
+
+    for scene, seed, kind, method, stride in cases(options.seeds, options.scenes):
+        recording = recorded(scene, seed, kind).select(every=stride)
+        name = f"{scene} {seed} {kind} {method} every {stride}"
+        done(judged(name, recording, configs[method], FARTHEST_M.get(scene)))
+    if options.real:
+        of_real(options.data, configs, done)
     print(table(runs))
+
+
+def of_real(data: Path, configs: dict[str, Config], done: Callable[[Run], None]) -> None:
+    """Run the methods that measure for themselves on every real recording that is there."""
+    for name, (reference_m, parts) in REAL.items():
+        try:
+            recording = real(name, data)
+        except FileNotFoundError as missing:
+            print(f"{name}: not run, {missing} is not there")
+            continue
+        for part in parts:
+            selected = recording.select(part.start, part.stop, part.step)
+            for method in ("default", "unrefined"):
+                title = f"{name} {part.start}:{part.stop or ''}:{part.step} {method}"
+                done(judged(title, selected, configs[method], None, reference_m))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from tofuse.registration.uncertainty import (
     UncertaintyOptions,
     covariance,
     covariance_of_patches,
+    no_worse_than,
     patches,
     with_prior,
 )
@@ -165,6 +166,19 @@ def test_prior_takes_only_the_unobservable_directions():
     out = with_prior(C, directions, np.full(6, 0.3))
     np.testing.assert_allclose(out[0, 0], 0.09)
     np.testing.assert_allclose(out[1:, 1:], C[1:, 1:], atol=1e-18)
+
+
+def test_no_direction_is_less_certain_than_the_prediction():
+    prior = np.array([0.3] * 3 + [0.2] * 3)
+    turned = se3.exp(np.array([0.0, 0, 0, 0.4, -0.3, 0.2]))[:3, :3]
+    axes = np.kron(np.eye(2), turned)
+    known = axes @ np.diag([1e-6, 1e-5, 1e-4, 1e-6, 1e-5, 1e-4]) @ axes.T
+    np.testing.assert_array_equal(no_worse_than(known, prior), known)
+    loose = known + 36.0 * np.outer(axes[:, 1], axes[:, 1])
+    cut = no_worse_than(loose, prior)
+    np.testing.assert_allclose(axes[:, 1] @ cut @ axes[:, 1], 0.09, rtol=1e-4)
+    for k in (0, 2, 3, 4, 5):
+        np.testing.assert_allclose(axes[:, k] @ cut @ axes[:, k], axes[:, k] @ known @ axes[:, k])
 
 
 @pytest.mark.parametrize(

@@ -226,7 +226,8 @@ def covariance(
 ) -> Float64:
     """(6, 6) covariance of an alignment: m and rad, right perturbation in the source's frame.
 
-    Directions that the data does not hold have the uncertainty of the prediction.
+    Directions that the data does not hold have the uncertainty of the prediction, and none is less
+    certain than that.
 
     Parameters
     ----------
@@ -238,7 +239,7 @@ def covariance(
     chosen = options or UncertaintyOptions()
     C = covariance_of_patches(patches(source, targets, aligned, alignment, chosen), chosen)
     prior = np.array([alignment.prior_m] * 3 + [alignment.prior_rad] * 3)
-    return with_prior(C, aligned.unobservable, prior)
+    return with_prior(no_worse_than(C, prior), aligned.unobservable, prior)
 
 
 def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
@@ -260,6 +261,19 @@ def with_prior(C: Float64, unobservable: Float64, prior: Float64) -> Float64:
     kept = np.eye(6) - P
     scaled = kept @ scaled @ kept + P @ np.diag((prior / UNITS) ** 2) @ P
     return 0.5 * (scaled + scaled.T) * np.outer(UNITS, UNITS)
+
+
+def no_worse_than(C: Float64, prior: Float64) -> Float64:
+    """Cut the covariance (6, 6) to that of the prediction, sigma (6,), where it is larger.
+
+    Where surfaces disagree, so that the robust loss has no minimum along a direction, X^-1 B X^-1
+    is a number of any size.
+    """
+    values, vectors = np.linalg.eigh(C / np.outer(prior, prior))
+    if values[-1] <= 1:
+        return C
+    cut: Float64 = ((vectors * np.minimum(values, 1.0)) @ vectors.T) * np.outer(prior, prior)
+    return 0.5 * (cut + cut.T)
 
 
 def _seen_variance(
