@@ -450,6 +450,16 @@ def test_a_real_camera_that_was_carried_on_is_found_again(shared_data):
     assert steps[-1].status == "tracked"
 
 
+def test_a_real_camera_close_to_a_door_stays_where_it_is(shared_data):
+    """A quarter of a metre from it, moved by less than 1 cm: nothing must slide along it."""
+    recording = open_recording(shared_data / "iphone_record3d")
+    steps = run([recording[k] for k in range(0, len(recording), 3)])
+    for k, step in enumerate(steps):
+        true = se3.inverse(recording.reference[0]) @ recording.reference[3 * k]
+        assert step.status == "tracked"
+        assert np.linalg.norm((se3.inverse(true) @ step.T_world_camera)[:3, 3]) < 0.02
+
+
 def test_what_is_searched_for_in_vain_stays_lost(room, elsewhere):
     steps = run([room.frames[0], elsewhere[0]])
     assert_marked(steps[1])

@@ -144,6 +144,28 @@ def test_outliers_do_not_move_it(room):
     assert found.inlier_share < 0.95
 
 
+def test_a_scene_under_a_magnifying_glass_is_as_robust(room):
+    """The slack of the coarse level is metres, but must not bridge what stands out up close."""
+    coarse = replace(GEOMETRY, levels=OPTIONS.levels[:1])
+    scale = 0.1  # the room becomes 0.3 m deep
+    target, source = room.frames[:2]
+    depth = source.depth.copy()
+    depth[30:100, 50:120] *= 0.85
+    source = replace(source, depth=depth)
+    found = []
+    for size in (1.0, scale):
+        views = [
+            surface_map(replace(f, depth=f.depth * np.float32(size)), SurfaceOptions())
+            for f in (target, source)
+        ]
+        aligned = align(views[1], [Target(views[0], np.eye(4))], np.eye(4), coarse)
+        T = aligned.T_world_source.copy()
+        T[:3, 3] /= size
+        found.append(error(replace(aligned, T_world_source=T), room.poses[1])[0])
+    assert found[0] < 0.003
+    assert found[1] < 0.003
+
+
 @pytest.mark.parametrize("gain", [1.5, 0.5])
 def test_an_exposure_that_changed_is_allowed_for(room, wall, gain):
     for pair in (room, wall):

@@ -24,6 +24,8 @@ Float64 = NDArray[np.float64]
 
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+# What is nearer than this is looked at as through a magnifying glass: slack shrinks with it.
+_NEAR_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -226,6 +228,7 @@ def align(
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
         most = max(3.0, options.most_sigma_m / median(sigma))
+    near = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
     views = tuple(t.view.target for t in targets)
     lookups = tuple(t.view.projection.lookup for t in targets)
     lookup_frames = np.stack([t.view.projection.frame for t in targets])
@@ -246,7 +249,7 @@ def align(
             guessed,
             most,
             level.iterations,
-            level.slack_m,
+            level.slack_m * near,
             level.photo_slack,
             options.robust,
             math.cos(options.max_angle),
