@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import made_arrays
+import made_exports
 import made_ifm
 import made_kinect
 import made_phones
@@ -28,18 +29,22 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "npz": (made_arrays.make_npz, "a.npz", "npz"),
     "sens": (made_sens.make_sens, "a.sens", "sens"),
     "zense": (made_arrays.make_zense, None, "zense"),
+    "helios": (made_exports.make_helios, None, "grid"),
+    "csv": (made_exports.make_csv, None, "grid"),
     "r3d": (made_phones.make_r3d, "scan.r3d", "record3d"),
 }
-ROUNDS = {"mkv": 30}
+ROUNDS = {"mkv": 30, "helios": 30, "csv": 30}
 CUTS = 30
 
 
-def read_through(path: Path, format_: str | None) -> tuple[int, int, int]:
+def read_through(
+    path: Path, format_: str | None, camera: Path | None = None
+) -> tuple[int, int, int]:
     """Read every frame; return how many were whole, how many not, and whether all was refused."""
     whole = unread = 0
     errors: list[TofuseError] = []
     try:
-        for item in open_recording(path, format=format_).read_all():
+        for item in open_recording(path, format=format_, camera=camera).read_all():
             if isinstance(item, TofuseError):
                 unread += 1
                 errors.append(item)

@@ -13,6 +13,15 @@ from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource, LimitedSource
 
+# Recordings that only their maker's program can read: what they hold, and what to do.
+CLOSED = {
+    ".rrf": (
+        "holds raw phases of a pmd camera, whose layout and calibration aren't published",
+        "play it by pmd's Royale and export its frames as PLY (sampleExportPLY), or record the "
+        "camera's ROS topics, and give those",
+    ),
+}
+
 
 def readers() -> dict[str, Reader]:
     """Return the readers by name."""
@@ -102,6 +111,10 @@ def _resolve(path: Path, format: str | None) -> list[_Found]:  # noqa: A002
         )
     if not sniffs and (parts := _parts(path)):
         return parts
+    suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
+    for suffix in suffixes & CLOSED.keys():
+        problem, remedy = CLOSED[suffix]
+        raise InputError(problem, where=path, remedy=remedy)
     raise _unsure(path, sniffs, children)
 
 

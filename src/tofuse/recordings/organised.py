@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,112 @@ TOLERANCE_SHARE = 1e-4
 # A lens this near to a pinhole is one: 0.01 px is 0.2 mm at 10 m.
 PINHOLE_PIXELS = 0.01
 STEEPEST = 100.0  # slope of a ray: 89.4 degrees off the axis
+# Along a column of pixels x/z changes little: by less than this share of the image's width.
+COLUMN_SHARE = 0.05
+MIN_CELLS = 256
+MIN_SPREAD_M = 0.1  # of z in a pixel, to tell where its ray begins
+
+
+@dataclass(frozen=True)
+class Raster:
+    """How points lie in rows and columns.
+
+    Attributes
+    ----------
+    width, height
+        Of the image.
+    signs
+        Of x, y and z, so that x is right, y down and z forward.
+    """
+
+    width: int
+    height: int
+    signs: tuple[int, int, int] = (1, 1, 1)
+
+    @property
+    def turned(self) -> str:
+        """Which axes run against the pixels, in words; empty if none."""
+        names = [name for name, sign in zip("xyz", self.signs, strict=True) if sign < 0]
+        return f"{' and '.join(names)} run{'s'[: len(names) == 1]}" if names else ""
+
+    def image(self, points: Float32) -> Float32:
+        """Return points (N, 3) as (H, W, 3)."""
+        return points.reshape(self.height, self.width, 3) * np.array(self.signs, np.float32)
+
+
+def find_raster(points: Float32, width: int | None = None) -> Raster | None:
+    """Return how points (N, 3), written row by row, lie in the pixels of an image, or None.
+
+    The width, where it isn't told, is that of N's divisors with which x/z changes least along
+    columns: the image is at most twice as wide as it is high, or twice as high as wide.
+    """
+    count = len(points)
+    measured = np.isfinite(points).all(1) & (points[:, 2] != 0)
+    if count < MIN_CELLS or measured.sum() < 0.05 * count:
+        return None
+    forward = np.median(np.sign(points[measured, 2])) >= 0
+    with np.errstate(all="ignore"):
+        slopes = points[:, :2] / np.abs(points[:, 2:])
+        measured &= (np.abs(slopes) < STEEPEST).all(1)
+        slopes = np.where(measured[:, None], slopes, np.float32(np.nan))
+    widths = [width] if width else range(math.isqrt(count // 2), math.isqrt(2 * count) + 1)
+    best: tuple[float, Raster] | None = None
+    for candidate in widths:
+        if candidate < 2 or count % candidate:
+            continue
+        fit = _raster_fit(slopes.reshape(-1, candidate, 2), 1 if forward else -1)
+        if fit is not None and (best is None or fit[0] < best[0]):
+            best = fit
+    return None if best is None else best[1]
+
+
+def _raster_fit(slopes: Float32, forward: int) -> tuple[float, Raster] | None:
+    """Return how much slopes (H, W, 2) change along columns and rows, and the raster."""
+    height, width = slopes.shape[:2]
+    signs, worst = [], 0.0
+    for axis in (0, 1):
+        lines = slopes[..., axis] if axis == 0 else slopes[..., axis].T
+        lines = lines[:: max(1, len(lines) // 64)]
+        seen = np.isfinite(lines)
+        used = seen.sum(0) >= 2
+        if used.sum() < 0.5 * lines.shape[1]:
+            return None
+        middle = np.nanmedian(lines[:, used], axis=0)
+        spread = float(np.nanpercentile(middle, 95) - np.nanpercentile(middle, 5))
+        off = float(np.nanmean(np.abs(lines[:, used] - middle)))
+        rising = np.diff(middle)
+        sign = 1 if np.median(rising) > 0 else -1
+        if not off < COLUMN_SHARE * spread or np.mean(rising * sign > 0) < 0.8:
+            return None
+        signs.append(sign)
+        worst = max(worst, off / spread)
+    return worst, Raster(width, height, (signs[0], signs[1], forward))
+
+
+def origin_behind(images: Sequence[Float32]) -> float:
+    """Return how far behind the origin the rays of the pixels meet, in m; 0 if it can't be told.
+
+    A pixel whose z changes from image to image tells it: x is a (z + behind).
+    """
+    if len({image.shape for image in images}) != 1:
+        return 0.0
+    z = np.stack([np.where(_measured(image), image[..., 2], np.nan) for image in images])
+    z = z.astype(float)
+    top = bottom = 0.0
+    with np.errstate(all="ignore"):
+        count = np.isfinite(z).sum(0)
+        mean = np.nansum(z, 0) / count
+        around = np.where(np.isfinite(z), z - mean, 0.0)
+        spread = (around**2).sum(0)
+        told = (count > 1) & (spread > MIN_SPREAD_M**2)
+        for axis in (0, 1):
+            x = np.stack([image[..., axis] for image in images]).astype(float)
+            x = np.where(np.isfinite(z), x, 0.0)
+            slope = (around * x).sum(0) / spread
+            start = x.sum(0) / count - slope * mean
+            top += float((spread * slope * start)[told].sum())
+            bottom += float((spread * slope**2)[told].sum())
+    return top / bottom if bottom > 0 else 0.0
 
 
 def common_camera(images: Sequence[Float32]) -> Camera | None:

@@ -1,0 +1,112 @@
+"""TIFF images of one channel, checked before they are decoded."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import MAX_IMAGE_BYTES, MAX_PIXELS
+from tofuse.files.reading import read_bytes
+
+# Tags of the TIFF 6.0 specification.
+_WIDTH, _HEIGHT, _SAMPLES = 256, 257, 277
+_PIECES = ((273, 279), (324, 325))  # offsets and sizes of strips, or of tiles
+_CODES = {1: "B", 3: "H", 4: "I"}  # of the types that hold whole numbers
+_MAX_TAGS = 256
+
+
+def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Read the first image of a TIFF file: (H, W) of uint8, uint16, float32 or float64.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        (width, height) that it must have.
+
+    Raises
+    ------
+    InputError
+        If it is no TIFF of one channel, is cut off or damaged, or of another size.
+    """
+    import cv2
+
+    data = read_bytes(path, limit=MAX_IMAGE_BYTES)
+    width, height = tiff_size(data, path)
+    if size is not None and (width, height) != size:
+        raise InputError(
+            f"is {width} x {height} pixels, the camera {size[0]} x {size[1]}",
+            where=path,
+            remedy="use the camera description of these images",
+        )
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError("can't be decoded", where=path, remedy="copy the file again") from error
+    if image is None or image.shape != (height, width) or image.dtype.kind not in "uf":
+        raise InputError("can't be decoded", where=path, remedy="store one channel as TIFF")
+    return image
+
+
+def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
+    """Return width and height of the first image, after a look at all that its tags promise.
+
+    Raises
+    ------
+    InputError
+        See `read_tiff`.
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        what = "is empty" if not data else "is no TIFF image"
+        raise InputError(what, where=path, remedy="check the file")
+    try:
+        tags = _tags(data, order)
+        width, height = tags[_WIDTH][0], tags[_HEIGHT][0]
+        channels = tags.get(_SAMPLES, [1])[0]
+        pieces = [(tags[a], tags[b]) for a, b in _PIECES if a in tags and b in tags]
+        whole = bool(pieces) and all(
+            len(starts) == len(sizes)
+            and all(at + count <= len(data) for at, count in zip(starts, sizes, strict=True))
+            for starts, sizes in pieces
+        )
+    except (struct.error, KeyError, IndexError, ValueError) as error:
+        raise InputError("is a damaged TIFF", where=path, remedy="copy the file again") from error
+    if not 0 < width * height <= MAX_PIXELS:
+        raise InputError(
+            f"claims to be {width} x {height} pixels",
+            where=path,
+            remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
+        )
+    if channels != 1:
+        raise InputError(f"has {channels} channels", where=path, remedy="store one channel")
+    if not whole:
+        raise InputError("is cut off before its end", where=path, remedy="copy the file again")
+    return width, height
+
+
+def _tags(data: bytes, order: str) -> dict[int, list[int]]:
+    """Return the whole numbers of the first directory's tags."""
+    (at,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, at)
+    if count > _MAX_TAGS:
+        raise ValueError(count)
+    tags = {}
+    for k in range(count):
+        tag, kind, number = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
+        if kind not in _CODES:
+            continue
+        start = at + 2 + 12 * k + 8
+        values = struct.calcsize(order + _CODES[kind]) * number
+        if values > 4:
+            (start,) = struct.unpack_from(order + "I", data, start)
+        if start + values > len(data):
+            raise ValueError(number)
+        tags[tag] = list(struct.unpack_from(f"{order}{number}{_CODES[kind]}", data, start))
+    return tags

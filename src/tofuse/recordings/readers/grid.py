@@ -1,0 +1,214 @@
+"""Reader of clouds with a point for each pixel, as viewers of ToF cameras export them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.pcd import read_pcd
+from tofuse.files.ply import read_ply
+from tofuse.files.reading import is_file, is_folder, read_text
+from tofuse.files.tables import parse_numbers
+from tofuse.geometry.cameras import Camera
+from tofuse.parts import part
+from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, needed_files
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.organised import (
+    SAMPLES,
+    Raster,
+    common_camera,
+    find_raster,
+    organised_frame,
+    origin_behind,
+)
+from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.sources import FARTHEST_M
+
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+
+_SUFFIXES = (".ply", ".csv", ".pcd")
+_AMPLITUDES = ("intensity", "amplitude", "i")
+MAX_POINTS = 1 << 22
+# Nothing that a ToF camera sees is 50 m away on average, nor as near as 50 mm.
+MM_FROM = 50.0
+
+
+@part("reader", "grid")
+@dataclass(frozen=True)
+class Grid:
+    """A folder of .ply, .csv or .pcd files with a point for each pixel, row by row; m or mm."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            files = cloud_files(path, *_SUFFIXES)
+            if not files or (is_folder(path) and is_file(path / "run.json")):
+                return None
+            now = files[0].stat()
+            found = _first(files[0], now.st_mtime_ns, now.st_size)
+        except (InputError, OSError):
+            return None
+        if found is None:
+            return None
+        return Sniff(1.0, f"{len(files)} clouds of {found.width} x {found.height} pixels")
+
+    def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
+        """See `Reader.open`."""
+        refuse_camera(options, "grid")
+        files = needed_files(path, *_SUFFIXES)
+        step = max(1, len(files) // SAMPLES)
+        images: list[Float32] = []
+        raster: Raster | None = None
+        for file in files[::step][:SAMPLES]:
+            try:
+                cells = read_cells(file)
+            except InputError:
+                continue
+            raster = raster or cells.raster()
+            if raster is not None and len(cells.points) == raster.width * raster.height:
+                images.append(raster.image(cells.points))
+        if raster is None or not images:
+            raise _refusal(path)
+        scale = 1e-3 if _median_z(images[0]) > MM_FROM else 1.0
+        images = [image * np.float32(scale) for image in images]
+        behind, camera = 0.0, common_camera(images)
+        if camera is None:
+            behind = origin_behind(images)
+            camera = common_camera([_moved(image, behind) for image in images])
+        if camera is None:
+            raise _refusal(path)
+        frames = _Frames(raster, camera, scale, behind)
+        source = CloudFileSource(path, files, frames.load)
+        source.metadata |= {"depth_kind": "z", "depth_unit_m": scale}
+        if behind:
+            source.warnings.append(
+                f"points are measured from {1000 * behind:.1f} mm in front of where the pixels' "
+                "rays meet; they are moved to be seen from there"
+            )
+        if raster.turned:
+            source.warnings.append(f"{raster.turned} against the pixels, and turned around")
+        return source
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Points (N, 3) in the file's unit, amplitude (N,), colour (N, 3), and its width if told."""
+
+    points: Float32
+    amplitude: Float32 | None = None
+    color: UInt8 | None = None
+    width: int | None = None
+
+    def raster(self) -> Raster | None:
+        """See `find_raster`."""
+        return find_raster(self.points, self.width) if len(self.points) <= MAX_POINTS else None
+
+
+def read_cells(path: Path) -> Cells:
+    """Read a file, NaN where a point is no measurement; raise InputError if it can't be."""
+    cells = _read(path)
+    sound = np.asarray((np.abs(cells.points) < FARTHEST_M).all(1))
+    return replace(cells, points=np.where(sound[:, None], cells.points, np.float32(np.nan)))
+
+
+def _read(path: Path) -> Cells:
+    suffix = path.suffix.lower()
+    if suffix == ".pcd":
+        pcd = read_pcd(path)
+        return Cells(pcd.points, pcd.amplitude, pcd.color, pcd.width if pcd.organised else None)
+    if suffix == ".ply":
+        ply = read_ply(path)
+        told = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
+        width = told.get("num_cols", "")
+        return Cells(
+            ply.points, ply.amplitude, ply.color, int(width) if width.isdecimal() else None
+        )
+    return _read_csv(path)
+
+
+def _read_csv(path: Path) -> Cells:
+    text = read_text(path)
+    head = text[: text.find("\n")].lower().replace(";", ",").replace("\t", ",")
+    names = [word.strip(' "#').split("[")[0].split("(")[0].strip() for word in head.split(",")]
+    named = {"x", "y", "z"} <= set(names)
+    table = parse_numbers(text, path, skip=int(named))
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise InputError("has no x, y and z in a line", where=path, remedy="export x, y, z")
+    columns = {n: k for k, n in enumerate(names) if k < table.shape[1]} if named else {}
+    at = [columns.get(name, k) for k, name in enumerate("xyz")]
+    light = next((columns[name] for name in _AMPLITUDES if name in columns), None)
+    if not named and table.shape[1] == 4:
+        light = 3
+    with np.errstate(over="ignore"):
+        points = table[:, at].astype(np.float32)
+        amplitude = None if light is None else table[:, light].astype(np.float32)
+    return Cells(points, amplitude)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """How the points of each file become an image."""
+
+    raster: Raster
+    camera: Camera
+    scale: float
+    behind: float
+
+    def load(self, path: Path, index: int, timestamp: float) -> RangeFrame:
+        cells = read_cells(path)
+        if len(cells.points) != self.raster.width * self.raster.height:
+            raise InputError(
+                f"has {len(cells.points)} points, not {self.raster.width} x {self.raster.height}",
+                where=path,
+                remedy="export all points, invalid ones too",
+            )
+        points = _moved(self.raster.image(cells.points) * np.float32(self.scale), self.behind)
+        return organised_frame(
+            points,
+            self.camera,
+            index,
+            timestamp,
+            path,
+            amplitude=cells.amplitude,
+            color=cells.color,
+        )
+
+
+def _moved(points: Float32, behind: float) -> Float32:
+    """Return points (H, W, 3) as seen from `behind` metres farther back; the origin stays."""
+    z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(behind), points[..., 2])
+    return np.concatenate([points[..., :2], z[..., None]], axis=-1)
+
+
+def _median_z(image: Float32) -> float:
+    z = image[..., 2]
+    z = z[np.isfinite(z) & (z > 0)]
+    return float(np.median(z)) if len(z) else 0.0
+
+
+def _refusal(path: Path) -> InputError:
+    return InputError(
+        "doesn't hold a point for each pixel of a camera",
+        where=path,
+        remedy="export all points, invalid ones too, or give --format ply, pcd or xyz",
+    )
+
+
+@lru_cache(maxsize=4)
+def _first(file: Path, changed_ns: int, size: int) -> Raster | None:
+    """Return how a file's points lie in rows and columns; None if they don't, or pcd reads it."""
+    cells = read_cells(file)
+    raster = cells.raster()
+    if raster is None:
+        return None
+    ours = file.suffix.lower() != ".pcd" or _median_z(raster.image(cells.points)) > MM_FROM
+    return raster if ours else None

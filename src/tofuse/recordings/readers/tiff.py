@@ -1,0 +1,143 @@
+"""Reader of depth images stored as TIFF: DLR's Tiff3D, and what viewers export."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.tables import read_numbers
+from tofuse.files.tiff import read_tiff
+from tofuse.parts import part
+from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.sources import FARTHEST_M, FileSource, check_timestamps, tum_poses
+
+_SUFFIXES = (".tif", ".tiff")
+_RANGE = ".range"
+_AMPLITUDE = ("intens", "ampl")
+_OTHER = (*_AMPLITUDE, "conf")
+
+
+@part("reader", "tiff")
+@dataclass(frozen=True)
+class Tiff:
+    """A folder of depth images as TIFF, with a camera.json given; amplitude in *intens*.tif."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            files = files_with(path, *_SUFFIXES) if is_folder(path) else []
+        except InputError:
+            return None
+        if any(_is_range(file) for file in files):
+            return Sniff(1.0, f"{len(files)} .tif files, *.range.tif among them")
+        if not files:
+            return None
+        return Sniff(
+            UNSURE, f"{len(files)} .tif files", "give --format tiff and --camera camera.json"
+        )
+
+    def open(self, path: Path, options: ReaderOptions) -> TiffSource:
+        """See `Reader.open`."""
+        files = files_with(path, *_SUFFIXES) if is_folder(path) else []
+        depth = [f for f in files if _is_range(f)] or [f for f in files if not _is_other(f)]
+        if not depth:
+            raise InputError("has no .tif of depth", where=path, remedy="give the folder of images")
+        if options.camera is None:
+            raise InputError(
+                "has no camera: the layout of .t3c files isn't published, and TIFF has none",
+                where=path,
+                remedy="give --camera camera.json with lens, depth_unit_m and depth_kind",
+            )
+        amplitude = [f for f in files if f not in depth and _is_amplitude(f)]
+        return TiffSource(path, depth, amplitude, options.camera)
+
+
+class TiffSource(FileSource):
+    """Depth, and amplitude where there is an image for each; times and poses as in native folders.
+
+    Values are times `depth_unit_m`, floats too, as the images don't tell their unit.
+    """
+
+    concurrent = True
+
+    def __init__(
+        self, folder: Path, depth: Sequence[Path], amplitude: Sequence[Path], camera: Path
+    ) -> None:
+        about, self.camera = load_camera(camera)
+        rate = about.frame_rate_hz
+        super().__init__(np.arange(len(depth)) / (rate or 1.0))
+        self.depth, self.amplitude = list(depth), list(amplitude)
+        self.unit, self.kind = about.depth_unit_m, about.depth_kind
+        self.amplitude_kind = about.amplitude_kind or "raw"
+        self.ambiguity_m = about.ambiguity_m
+        if self.amplitude and len(self.amplitude) != len(self.depth):
+            self.warnings.append(
+                f"{len(self.amplitude)} images of amplitude for {len(self.depth)} of depth: "
+                "left out"
+            )
+            self.amplitude = []
+        times = folder / "timestamps.txt"
+        if is_file(times):
+            table = read_numbers(times)
+            if table.shape != (len(self.depth), 1):
+                raise InputError(
+                    f"has {len(table)} lines for {len(self.depth)} images",
+                    where=times,
+                    remedy="give one time in seconds for each image",
+                )
+            self.timestamps = table[:, 0]
+            check_timestamps(self.timestamps, times, self.warnings)
+        if is_file(folder / "groundtruth.txt"):
+            self.reference = tum_poses(self, folder / "groundtruth.txt")
+        if is_file(folder / "odometry.txt"):
+            self.odometry = tum_poses(self, folder / "odometry.txt")
+        self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
+        told = {"sensor": about.sensor, "frame_rate_hz": rate, "ambiguity_m": self.ambiguity_m}
+        self.metadata |= {key: value for key, value in told.items() if value is not None}
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        size = (self.camera.width, self.camera.height)
+        values = read_tiff(self.depth[index], size)
+        with np.errstate(all="ignore"):
+            depth = values.astype(np.float32) * np.float32(self.unit)
+            if values.dtype == np.uint16:
+                depth[values == 65535] = 0
+            depth = np.where(np.abs(depth) < FARTHEST_M, depth, np.float32(0))
+        amplitude = None
+        if self.amplitude:
+            with np.errstate(all="ignore"):
+                image = read_tiff(self.amplitude[index], size).astype(np.float32)
+            amplitude = np.nan_to_num(image, posinf=0, neginf=0)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth,
+            self.kind,
+            amplitude,
+            amplitude_kind=self.amplitude_kind,
+            ambiguity_m=self.ambiguity_m,
+        )
+
+
+def _is_range(file: Path) -> bool:
+    return Path(file.stem).suffix.lower() == _RANGE
+
+
+def _is_amplitude(file: Path) -> bool:
+    return any(word in file.stem.lower() for word in _AMPLITUDE)
+
+
+def _is_other(file: Path) -> bool:
+    return any(word in file.stem.lower() for word in _OTHER)
