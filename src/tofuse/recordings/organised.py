@@ -72,7 +72,7 @@ def find_raster(points: Float32, width: int | None = None) -> Raster | None:
     with np.errstate(all="ignore"):
         slopes = points[:, :2] / np.abs(points[:, 2:])
         measured &= (np.abs(slopes) < STEEPEST).all(1)
-        slopes = np.where(measured[:, None], slopes, np.float32(np.nan))
+        slopes[~measured] = np.nan
     widths = [width] if width else range(math.isqrt(count // 2), math.isqrt(2 * count) + 1)
     best: tuple[float, Raster] | None = None
     for candidate in widths:
@@ -84,7 +84,7 @@ def find_raster(points: Float32, width: int | None = None) -> Raster | None:
     return None if best is None else best[1]
 
 
-def _raster_fit(slopes: Float32, forward: int) -> tuple[float, Raster] | None:
+def _raster_fit(slopes: NDArray[np.floating], forward: int) -> tuple[float, Raster] | None:
     """Return how much slopes (H, W, 2) change along columns and rows, and the raster."""
     height, width = slopes.shape[:2]
     signs, worst = [], 0.0
