@@ -12,9 +12,9 @@ from tofuse.posegraph.suspicion import Gap, longest_loop, suspicion
 from tofuse.posegraph.views import KeptView
 
 
-def kept(offset: float) -> tuple[list[KeptView], Refined]:
+def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
     """Views of a camera whose ranges are short by `offset`, refined as if they were right."""
-    truth = path(12)
+    truth = path(12)[:views]
     views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
     return views, refine(views, truth, OPTIONS)
 
@@ -39,6 +39,13 @@ def test_a_camera_that_does_not_err_is_not():
     found = suspicion(views, refined, OPTIONS, Beside.nothing())
     assert not found.alarm
     assert found.gap is None
+
+
+def test_few_views_suspect_nothing():
+    views, refined = kept(0.06, views=5)
+    found = suspicion(views, refined, OPTIONS, Beside.nothing())
+    assert not found.alarm
+    assert not found.errors
 
 
 def test_what_does_not_close_a_loop_is_no_cure():

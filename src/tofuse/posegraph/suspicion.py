@@ -36,6 +36,8 @@ _SURE, _LIKELY, _WORTH = 4.0, 2.5, 0.2
 _CLOSED = (0.01, np.radians(0.5))
 # Of the tolerance: an error that is known less well is not told.
 _VAGUE = 0.4
+# How much views differ is not known from fewer.
+_LEAST_VIEWS = 8
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
 # The way to what fits may be long.
 _ROUNDS = (Round(4, 0.02, 0.1), Round(4, 0.005, 0.03), Round(6, 0.0, 0.0))
@@ -99,7 +101,7 @@ def suspicion(
 ) -> Suspicion:
     """Ask refined views for the errors of their camera."""
     pairs, poses = refined.pairs, refined.poses
-    if not len(pairs):
+    if not len(pairs) or len(views) < _LEAST_VIEWS:
         return Suspicion()
     said = response(views, poses, pairs, options, beside=beside)
     estimate, sigma = said.estimate(), said.sigma(pairs, len(views))
