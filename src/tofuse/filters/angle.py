@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.filters._options import within
 from tofuse.filters.base import Bool, Filter
+from tofuse.geometry.cameras import unknown_rays
 from tofuse.kernels.neighbourhood import is_steeper, largest_angle
 from tofuse.kernels.threads import run_chunks
 from tofuse.parts import part
@@ -50,10 +51,12 @@ class NeighbourhoodAngle(Filter):
         assert isinstance(frame, RangeFrame)
         steep = np.zeros(frame.depth.shape, bool)
         if self.threshold < math.pi:
-            z = np.where(frame.valid, frame.z, np.float32(0))
+            z = frame.z
+            if unknown_rays(frame.camera) is not None:
+                z = np.where(frame.valid, z, np.float32(0))
             rays, cosine2 = frame.camera.rays(), np.float32(math.cos(self.threshold) ** 2)
             run_chunks(lambda a, b: is_steeper(z, rays, cosine2, a, b, steep), len(z))
-        return ~steep
+        return np.logical_not(steep, out=steep)
 
 
 def neighbourhood_angle(frame: RangeFrame) -> NDArray[np.float32]:

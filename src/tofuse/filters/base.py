@@ -88,6 +88,8 @@ def apply_filters(
     for item in filters:
         before = len(frame)
         past = history[-(item.window - 1) :] if item.window > 1 else ()
-        frame = frame.keep(item.mask(frame, past))
+        mask = item.mask(frame, past)
+        if not mask.all():
+            frame = frame.keep(mask)
         removals.append(Removal(name_of(item), before, before - len(frame)))
     return frame, removals

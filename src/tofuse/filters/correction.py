@@ -29,6 +29,13 @@ class Corrector(Protocol):
         """
         ...
 
+    def alone(self, frame: Frame) -> bool:
+        """Whether `apply` asks for nothing but this frame: then it may come out of turn.
+
+        Neither frames before it nor where the camera is then play a part, and nothing is kept.
+        """
+        return False
+
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """Hear where the view that was corrected last has been found to be.
 

@@ -100,6 +100,12 @@ class MultipathCorrector(Corrector):
         self._map = LightMap()
         self._last: tuple[int, Interference] | None = None
 
+    def alone(self, frame: Frame) -> bool:
+        """See `Corrector.alone`: so are views that are passed on."""
+        if not isinstance(frame, RangeFrame):
+            return True
+        return _period(frame, self._options.period_m) is None or frame.amplitude_image is None
+
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. The amplitude loses its indirect share as well."""
         if not isinstance(frame, RangeFrame):
@@ -132,11 +138,8 @@ class MultipathCorrector(Corrector):
 
 def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage | None:
     """Return the frame's depth and raw light; None if its light or its period is not known."""
-    if period_m is None:
-        period_m = frame.ambiguity_m
-        if period_m is None or period_m > _LONGEST_PERIOD_M or frame.amplitude_kind == "ir":
-            return None
-    if frame.amplitude_image is None or not len(frame):
+    period_m = _period(frame, period_m)
+    if period_m is None or frame.amplitude_image is None or not len(frame):
         return None
     z = np.where(frame.valid, frame.z, np.float32(0))
     rays = frame.camera.rays()
@@ -149,6 +152,16 @@ def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage 
         # z squared times the square of the ray's length is the range's.
         light = light / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
     return LightImage(z, rays, light.astype(np.float32, copy=False), period_m)
+
+
+def _period(frame: RangeFrame, given: float | None) -> float | None:
+    """Range after which the phase of a frame's one frequency repeats; None where not known."""
+    period_m = frame.ambiguity_m
+    if given is not None:
+        return given
+    if period_m is None or period_m > _LONGEST_PERIOD_M or frame.amplitude_kind == "ir":
+        return None
+    return period_m
 
 
 def _corrected(

@@ -34,6 +34,10 @@ class Noise(Correction, Corrector):
         """See `Correction.start`. Nothing is learnt from frames."""
         return self
 
+    def alone(self, frame: Frame) -> bool:
+        """See `Corrector.alone`."""
+        return True
+
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`."""
         if self.model is None or not isinstance(frame, RangeFrame):

@@ -105,6 +105,10 @@ class ScatteringCorrector(Corrector):
             else None
         )
 
+    def alone(self, frame: Frame) -> bool:
+        """See `Corrector.alone`."""
+        return True
+
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. The amplitude loses its scattered share as well."""
         if self._model is None or not isinstance(frame, RangeFrame):

@@ -91,6 +91,10 @@ class UnwrapCorrector(Corrector):
     def __init__(self, part: Unwrap) -> None:
         self.part = part
 
+    def alone(self, frame: Frame) -> bool:
+        """See `Corrector.alone`."""
+        return True
+
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. Range-compensated amplitude is that of the new range."""
         known = wrapped_light(frame, self.part.period_m)

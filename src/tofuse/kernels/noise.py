@@ -58,6 +58,9 @@ def range_sigma(
     ceiling, floor, shot, dark, falloff, a, b, power, footprint = parameters
     width = depth.shape[1]
     slanted = cosine.shape[0] > 0 and footprint > 0
+    if law == BY_RANGE and not slanted:
+        _by_range(depth, is_range, rays, a, b, ceiling, start, stop, out)
+        return
     for i in range(start, stop):
         for j in range(width):
             out[i, j] = 0
@@ -102,3 +105,26 @@ def range_sigma(
                     change = footprint * step * math.sqrt(distance2 / length2 * (1 - c * c)) / c
                     variance += change * change
             out[i, j] = math.sqrt(variance)
+
+
+@kernel
+def _by_range(
+    depth: Float32,
+    is_range: bool,
+    rays: Float32,
+    a: float,
+    b: float,
+    ceiling: float,
+    start: int,
+    stop: int,
+    out: Float32,
+) -> None:
+    """Do the same by the range alone, without a branch, so that several pixels are done at once."""
+    for i in range(start, stop):
+        for j in range(depth.shape[1]):
+            x, y = float(rays[i, j, 0]), float(rays[i, j, 1])
+            measured = float(depth[i, j])
+            known = (measured > 0) & (x == x) & (y == y)
+            length2 = 1.0 if is_range else 1 + x * x + y * y
+            sigma = min(a + b * (measured * measured * length2), ceiling)
+            out[i, j] = sigma if known else 0.0

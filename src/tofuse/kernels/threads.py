@@ -80,6 +80,25 @@ def _mark_inside() -> None:
     _here.inside = True
 
 
+def side_threads(count: int, name: str) -> ThreadPoolExecutor:
+    """Make threads that do whole jobs beside others: what they call does its chunks there and then.
+
+    Cutting the work of a thread that has others beside it would only add hand-overs.
+    """
+    return ThreadPoolExecutor(count, thread_name_prefix=name, initializer=_mark_inside)
+
+
+@contextmanager
+def undivided(wanted: bool = True) -> Iterator[None]:
+    """Do chunks there and then inside the block, while other threads have work of their own."""
+    before = getattr(_here, "inside", False)
+    _here.inside = before or wanted
+    try:
+        yield
+    finally:
+        _here.inside = before
+
+
 def run_all(tasks: Sequence[Callable[[], R]]) -> list[R]:
     """Run independent tasks on the pool and return their results in the order given."""
     return run_chunks(lambda a, _b: tasks[a](), len(tasks), chunks=max(1, len(tasks)))

@@ -53,12 +53,26 @@ class Step:
 class Tracker(Protocol):
     """Odometry at work: holds what it needs of the frames so far."""
 
-    def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
+    def push(
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+    ) -> Step:
         """Find the pose of the next (filtered) frame.
 
-        `T_odometry` is the frame's T_world_camera from an odometry file, if there is one.
+        Parameters
+        ----------
+        T_odometry
+            The frame's T_world_camera from an odometry file, if there is one.
+        surface
+            What `prepare` made of the frame, if it was asked to.
         """
         ...
+
+    def prepare(self, frame: Frame) -> SurfaceMap | None:
+        """Make a frame ready before its turn, if there is something to be made of it alone.
+
+        Other threads may ask for it while frames before it are tracked.
+        """
+        return None
 
     def interrupt(self) -> None:
         """Hear that the next frame begins another recording: the motion need not go on."""

@@ -280,18 +280,32 @@ class _KeyframeTracker(Tracker):
         self._glance = np.zeros((0, 0), np.float32)
         self._mended: _Mended | None = None  # what the frame before was, if that was wrong
 
-    def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
+    def prepare(self, frame: Frame) -> SurfaceMap | None:
+        """See `Tracker.prepare`."""
+        if not isinstance(frame, RangeFrame) or self._unfit(frame):
+            return None
+        return surface_map(frame, self._options.surface)
+
+    def _unfit(self, frame: RangeFrame) -> str:
+        """Why nothing can be made of a frame; empty if something can."""
+        least = self._options.minimum_points
+        if len(frame) < least:
+            return f"{len(frame)} valid points, {least} are needed"
+        first = frame.depth.flat[np.argmax(frame.valid)]
+        if not np.any((frame.depth != first) & frame.valid):
+            return f"every depth is {first:.3g} m"
+        return ""
+
+    def push(
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+    ) -> Step:
         """See `Tracker.push`."""
         options = self._options
         if not isinstance(frame, RangeFrame):
             raise InputError("is a cloud; this tracker needs images", where=f"frame {frame.index}")
-        if len(frame) < options.minimum_points:
-            reason = f"{len(frame)} valid points, {options.minimum_points} are needed"
+        if surface is None and (reason := self._unfit(frame)):
             return self._lose(reason)
-        first = frame.depth.flat[np.argmax(frame.valid)]
-        if not np.any((frame.depth != first) & frame.valid):
-            return self._lose(f"every depth is {first:.3g} m")
-        view = surface_map(frame, options.surface)
+        view = surface_map(frame, options.surface) if surface is None else surface
         if np.count_nonzero(view.planes[..., 3]) < options.minimum_points:
             return self._lose("nearly no surface in what is left of the image")
         now, look = Moment(frame.index, frame.timestamp), glance(view.z)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
@@ -92,7 +93,9 @@ class _SequentialTracker(Tracker):
         """See `Tracker.interrupt`."""
         self._motion = np.eye(4)
 
-    def push(self, frame: Frame, T_odometry: Float64 | None = None) -> Step:
+    def push(
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+    ) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
         options, last = self._options, self._last
         if len(frame) < options.minimum_points:

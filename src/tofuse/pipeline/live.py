@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.loops import ClosedLoop, Loops
 
 # A job begins at one frame and counts this many frames later, however soon it was done: the poses
@@ -41,7 +42,7 @@ class LiveLoops:
             work = self._loops.look()
             if work is not None:
                 if self._pool is None:
-                    self._pool = ThreadPoolExecutor(1, thread_name_prefix="tofuse-loops")
+                    self._pool = side_threads(1, "tofuse-loops")
                 self._job = self._pool.submit(work)
                 self._due = self._frames + DELAY
         return bool(found)

@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.evaluation.sightings import Sightings, sightings, whole
-from tofuse.filters.base import apply_filters
+from tofuse.filters.base import Removal, apply_filters
 from tofuse.fusion.cloud import Cloud, as_cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.geometry import se3
-from tofuse.kernels.threads import thread_count, threads
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.kernels.threads import thread_count, threads, undivided
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Motion
 from tofuse.odometry.prediction import prediction_sigma, with_prediction
+from tofuse.pipeline.behind import Behind
 from tofuse.pipeline.checkpoint import NotKept, Stages
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
@@ -52,6 +55,33 @@ class _Place:
     position: int
     frame: Frame
     clean: Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What can be made of a frame before its turn, by `Mapper.prepare`.
+
+    Attributes
+    ----------
+    frame
+        Corrected by so many (`corrected`) of the corrections: those up to the first that must wait.
+    ready
+        What was made of it then, if none had to.
+    """
+
+    frame: Frame
+    corrected: int
+    ready: _Ready | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Ready:
+    """A frame, filtered for tracking and cleaned for the model, and what that removed."""
+
+    filtered: Frame
+    clean: Frame
+    removals: tuple[Removal, ...]
+    surface: SurfaceMap | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +158,7 @@ class Mapper:
         self.threads = threads if threads is not None else thread_count()
         self._given_loops = tuple(loops)
         self._progress = progress or Silent()
-        self._watch = Stopwatch()
+        self.watch = Stopwatch()
         self._kind: ViewKind | None = None
         self._begin()
         self._records: list[FrameRecord] = []
@@ -157,6 +187,7 @@ class Mapper:
         self._refiner = self.config.refinement.start()
         self._motion = Motion()
         self._model = ModelBuilder(self.config.fusion)
+        self._behind = Behind()
         self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
 
     def push(
@@ -166,6 +197,7 @@ class Mapper:
         T_odometry: Float64 | None = None,
         gravity: Float64 | None = None,
         history: Sequence[Frame] | None = None,
+        prepared: Prepared | None = None,
     ) -> Float64 | None:
         """Add the next frame.
 
@@ -180,6 +212,8 @@ class Mapper:
         history
             Unfiltered frames just before this one, oldest first, for temporal filters; the
             frames pushed before it unless given.
+        prepared
+            What `prepare` made of the frame, if it was asked to.
 
         Returns
         -------
@@ -195,19 +229,23 @@ class Mapper:
         self._check(frame)
         self._sensed[frame.index] = (T_odometry, gravity)
         repeated = self._is_repeated(frame)
-        with threads(self.threads):
-            with self._watch.timing("filters"):
+        # A search for a lost camera is worth dividing, while those who prepare frames are waiting.
+        busy = prepared is not None and prepared.ready is not None and not self._lost
+        with threads(self.threads), undivided(busy):
+            with self.watch.timing("filters"):
                 before = self._history if history is None else history
                 past = tuple(self._corrected(f) for f in before)
-                frame = self._corrected(frame, self._expected())
-                filtered, removals = apply_filters(self.config.filters, frame, past)
-                clean, more = apply_filters(self.config.model_filters, filtered, past)
+                frame = self._corrected(frame, self._expected(), prepared)
+                ready = prepared.ready if prepared is not None else None
+                if ready is None:
+                    ready = self._filtered(frame, past)
+                filtered, clean = ready.filtered, ready.clean
                 self._history.append(frame)
-            for removal in (*removals, *more):
+            for removal in ready.removals:
                 self._seen[removal.name] = self._seen.get(removal.name, 0) + removal.seen
                 self._removed[removal.name] = self._removed.get(removal.name, 0) + removal.removed
-            with self._watch.timing("tracking"):
-                step = self._tracker.push(filtered, T_odometry)
+            with self.watch.timing("tracking"):
+                step = self._tracker.push(filtered, T_odometry, ready.surface)
             if repeated and step.status == "tracked":
                 reason = f"the same image as frame {self._records[-1].index}, to the last pixel"
                 step = replace(step, status="predicted", reason=reason)
@@ -225,7 +263,7 @@ class Mapper:
                     del self._lost[next(iter(self._lost))]
             else:
                 self._lost.clear()
-                with self._watch.timing("loops"):
+                with self.watch.timing("loops"):
                     if self._live.step():
                         self._follow_loops()
             if (
@@ -233,16 +271,43 @@ class Mapper:
                 and isinstance(filtered, RangeFrame)
                 and isinstance(clean, RangeFrame)
             ):
-                self._samples.take(
-                    lost=step.T_world_camera is None,
-                    make=partial(FrameSample.of, frame, filtered, clean),
-                )
+                make = partial(FrameSample.of, frame, filtered, clean)
+                lost = step.T_world_camera is None
+                self._behind.do(lambda: self._samples.take(lost=lost, make=make))
         self._progress.advance(self._records[-1])
         if step.T_world_camera is None:
             return None
         T_world_camera = self._T_map_tracked @ step.T_world_camera
         self._progress.placed(clean, T_world_camera)
         return T_world_camera
+
+    def prepare(self, frame: Frame) -> Prepared | None:
+        """Make what can be made of a frame before its turn, for `push`; None if nothing can.
+
+        Other threads may ask for it while frames before it are pushed. It makes no difference to
+        what comes out.
+        """
+        if not isinstance(frame, RangeFrame):
+            return None
+        try:
+            check_views(self.config, "range")
+        except InputError:  # said when it is pushed
+            return None
+        corrected = 0
+        for corrector in self._correctors:
+            if not corrector.alone(frame):
+                return Prepared(frame, corrected, None)
+            frame, corrected = corrector.apply(frame), corrected + 1
+        if self.config.window > 1:
+            return Prepared(frame, corrected, None)
+        ready = self._filtered(frame, ())
+        surface = self._tracker.prepare(ready.filtered)
+        return Prepared(frame, corrected, replace(ready, surface=surface))
+
+    def _filtered(self, frame: Frame, past: Sequence[Frame]) -> _Ready:
+        filtered, removals = apply_filters(self.config.filters, frame, past)
+        clean, more = apply_filters(self.config.model_filters, filtered, past)
+        return _Ready(filtered, clean, (*removals, *more))
 
     def _follow_loops(self) -> None:
         """Move the newest pose to where the loops so far put it."""
@@ -268,17 +333,27 @@ class Mapper:
         if not isinstance(frame, RangeFrame):
             return False
         before, self._before = self._before, frame
-        if before is None or not len(frame) or not np.array_equal(before.depth, frame.depth):
+        if before is None or not np.array_equal(before.depth[0], frame.depth[0]):
+            return False  # most differ there already
+        if not np.array_equal(before.depth, frame.depth) or not len(frame):
             return False
         self._repeated.append(frame.index)
         return True
 
-    def _corrected(self, frame: Frame, T_expected: Float64 | None = None) -> Frame:
+    def _corrected(
+        self,
+        frame: Frame,
+        T_expected: Float64 | None = None,
+        prepared: Prepared | None = None,
+    ) -> Frame:
         """Correct a frame, unless it is among those that were corrected last."""
         for before in self._history:
             if before.index == frame.index:
                 return before
-        for corrector in self._correctors:
+        done = 0
+        if prepared is not None:
+            frame, done = prepared.frame, prepared.corrected
+        for corrector in self._correctors[done:]:
             frame = corrector.apply(frame, T_expected)
         return frame
 
@@ -343,26 +418,31 @@ class Mapper:
             return
         self._posed += 1
         if isinstance(frame, RangeFrame):
-            ranges = frame.radial_range[::4, ::4]
-            self._depths.append(float(np.median(ranges[ranges > 0])) if ranges.any() else 0.0)
             self._ambiguity_m = frame.ambiguity_m
-            if isinstance(clean, RangeFrame):
-                self._checks.add(lambda: whole(frame, clean))
-        with self._watch.timing("loops"):
+        with self.watch.timing("loops"):
             # Who looks at surfaces leaves the points alone, which take long to make.
             looked_at = step.surface is None or self._loops.points or self._refiner.points
             view = as_cloud(clean, _KEPT_POINTS) if looked_at else clean
             self._loops.push(view, step.T_world_camera, step.surface)
-        with self._watch.timing("fusion"):
-            self._model.add(clean, step.surface, _KEPT_POINTS)
         self._refiner.push(view, step.surface, step.T_world_camera)
+        with self.watch.timing("fusion"):
+            self._behind.do(lambda: self._keep(frame, clean, step.surface))
         if step.surface is not None:
             # Only who looks at surfaces states errors that hold; ICP's are too small.
             self._knows_errors = True
 
+    def _keep(self, frame: Frame, clean: Frame, surface: SurfaceMap | None) -> None:
+        """Keep what the model and the verdict need of a frame with a pose."""
+        if isinstance(frame, RangeFrame):
+            self._depths.append(_typical_range(frame))
+            if isinstance(clean, RangeFrame):
+                self._checks.add(lambda: whole(frame, clean))
+        self._model.add(clean, surface, _KEPT_POINTS)
+
     def __getstate__(self) -> dict[str, Any]:
         """Everything but who hears of it, so that a copy can go on elsewhere."""
-        self._live.wait()  # it changes what is kept here
+        self._live.wait()  # they change what is kept here
+        self._behind.wait()
         return {name: value for name, value in self.__dict__.items() if name != "_progress"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -399,6 +479,8 @@ class Mapper:
                 remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
             )
         self._live.finish()
+        with self.watch.timing("fusion"):
+            self._behind.finish()
         stages = stages or NotKept()
         # What a stage was the last to look at makes room for the next one.
         del self._tracker, self._correctors, self._history
@@ -416,15 +498,16 @@ class Mapper:
         kept = stages.load(name)
         if kept is not None:
             found: T = kept[0]
-            self._watch.seconds.update(kept[1])
+            self.watch.seconds.update(kept[1])
             return found
         found = work()
-        stages.save(name, (found, dict(self._watch.seconds)))
+        with self.watch.timing("keeping"):
+            stages.save(name, (found, dict(self.watch.seconds)))
         return found
 
     def _close(self) -> _Closed:
         self._progress.stage("closing loops")
-        with self._watch.timing("loops"):
+        with self.watch.timing("loops"):
             loops = self._loops.finish()
             graph = self._graph(loops)
         sequential = led = graph.poses
@@ -433,7 +516,7 @@ class Mapper:
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any() or told:
             self._progress.stage("optimising")
-            with self._watch.timing("optimisation"):
+            with self.watch.timing("optimisation"):
                 optimisation = self.config.optimiser.optimise(graph)
                 if told and graph.loop.any():  # what loops are to be held against
                     alone = with_outside(self._graph(()), told)
@@ -452,7 +535,7 @@ class Mapper:
     def _refine(self, closed: _Closed) -> _Refined:
         graph = closed.optimisation.graph
         self._progress.stage("refining")
-        with self._watch.timing("refinement"):
+        with self.watch.timing("refinement"):
             refinement = self._refiner.finish(graph.ids.tolist(), graph.poses, closed.told)
             if refinement.kept:
                 graph = with_outside(self._graph(closed.loops, refinement), closed.told)
@@ -462,7 +545,7 @@ class Mapper:
         graph, refinement = refined.graph, refined.refinement
         moved = bool(graph.loop.any()) or refinement.kept or bool(closed.told)
         self._progress.stage("fusing", self._model.views)
-        with self._watch.timing("fusion"):
+        with self.watch.timing("fusion"):
             ids = graph.ids.tolist()
             model = self._model.fuse(
                 dict(zip(ids, graph.poses, strict=True)),
@@ -478,7 +561,7 @@ class Mapper:
         sequential, judged = closed.sequential, closed.judged
         self._progress.stage("checking")
         records = self._finished_records(covariances)
-        with self._watch.timing("checking"):
+        with self.watch.timing("checking"):
             evidence = Evidence(
                 records,
                 tuple(s.registration if s else None for s in self._steps),
@@ -511,7 +594,7 @@ class Mapper:
                 self._scatter(sequential),
                 optimisation.objective,
                 {n: self._removed[n] / max(self._seen[n], 1) for n in self._seen},
-                dict(self._watch.seconds),
+                dict(self.watch.seconds),
                 fused.before,
                 refinement,
                 optimisation.parts,
@@ -608,6 +691,15 @@ class Mapper:
         has = [s is not None and s.T_world_camera is not None for s in self._steps]
         out[np.array(has, bool)] = poses
         return out
+
+
+def _typical_range(frame: RangeFrame) -> float:
+    """Median radial range of some of the pixels, m; 0 where nothing is valid."""
+    ranges = frame.depth[::4, ::4]
+    if frame.depth_kind == "z":
+        ranges = ranges * ray_lengths(frame.camera)[::4, ::4]
+    known = ranges[ranges > 0]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 class _EvenSample:

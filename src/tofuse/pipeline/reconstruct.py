@@ -33,6 +33,8 @@ from tofuse.sensor.noise import NOISE, NoiseModel
 Float64 = NDArray[np.float64]
 
 _TRACKING = "tracking"
+# So many frames are read and prepared in advance; each takes some of its images' size.
+_AHEAD = 6
 
 
 def reconstruct(
@@ -111,7 +113,13 @@ def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages)
     mapper, odometry, gravity = tracked.mapper, recording.odometry, recording.gravity
     recent: dict[int, Frame] = {}
     first = tracked.done
-    for k, item in enumerate(recording.read_all(first=first), first):
+    if mapper.threads > 1:
+        frames = recording.read_with(mapper.prepare, _AHEAD, first=first)
+    else:
+        frames = ((item, None) for item in recording.read_all(_AHEAD, first=first))
+    for k in range(first, len(recording)):
+        with mapper.watch.timing("reading"):
+            item, prepared = next(frames)
         index, time = int(recording.indices[k]), float(recording.timestamps[k])
         if k and part_start(recording, index) != part_start(
             recording, int(recording.indices[k - 1])
@@ -125,11 +133,16 @@ def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages)
             down = None if gravity is None or not np.isfinite(gravity[k]).all() else gravity[k]
             past = past_frames(recording, index, window - 1, recent)
             recent = {f.index: f for f in [*past, item]}
-            mapper.push(item, T_odometry=T, gravity=down, history=past)
+            mapper.push(item, T_odometry=T, gravity=down, history=past, prepared=prepared)
         tracked.done = k + 1
         if tracked.done < len(recording) and stages.due():
-            stages.save(_TRACKING, tracked)
-    stages.save(_TRACKING, tracked)
+            _save(tracked, stages)
+    _save(tracked, stages)
+
+
+def _save(tracked: _Tracked, stages: Stages) -> None:
+    with tracked.mapper.watch.timing("keeping"):
+        stages.save(_TRACKING, tracked)
 
 
 def fitted(config: Config, recording: Recording) -> Config:

@@ -6,7 +6,7 @@ read-only by convention: a method that changes something returns a new frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Literal, Protocol, Self
 
@@ -156,7 +156,8 @@ class RangeFrame:
                     remedy="use the camera of these images",
                 )
         depth = np.asarray(self.depth, np.float32)
-        good = np.isfinite(depth) & (depth > 0)
+        # Readers leave hardly anything else, so that no copy has to be made.
+        good = (depth >= 0) & (depth < np.inf)
         if not good.all():
             depth = np.where(good, depth, np.float32(0))
         object.__setattr__(self, "depth", depth)
@@ -217,7 +218,12 @@ class RangeFrame:
 
     def keep(self, mask: Bool) -> Self:
         """Return the frame with every pixel outside the (H, W) mask made invalid."""
-        return replace(self, depth=np.where(mask, self.depth, np.float32(0)))
+        kept = object.__new__(type(self))
+        # What was checked when this one was made need not be again.
+        for each in fields(self):
+            object.__setattr__(kept, each.name, getattr(self, each.name))
+        object.__setattr__(kept, "depth", np.where(mask, self.depth, np.float32(0)))
+        return kept
 
 
 @dataclass(frozen=True, eq=False)

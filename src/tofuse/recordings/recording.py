@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.kernels.threads import side_threads
 from tofuse.recordings.frames import Frame
 
+R = TypeVar("R")
 Float64 = NDArray[np.float64]
 
 
@@ -181,15 +182,25 @@ class Recording:
         Reads up to `ahead` frames in advance: on two other threads where the source allows it,
         else on one.
         """
+        return (item for item, _ in self.read_with(lambda frame: None, ahead, first=first))
 
-        def read(index: int) -> Frame | UnreadableFrameError:
+    def read_with(
+        self, work: Callable[[Frame], R], ahead: int = 8, *, first: int = 0
+    ) -> Iterator[tuple[Frame | UnreadableFrameError, R | None]]:
+        """Iterate as `read_all` does, and give what `work` makes of each frame, where it was read.
+
+        None stands beside a frame that can't be read. Frames are not worked on in order.
+        """
+
+        def read(index: int) -> tuple[Frame | UnreadableFrameError, R | None]:
             try:
-                return self.source.read(index)
+                frame = self.source.read(index)
             except UnreadableFrameError as error:
-                return error
+                return error, None
+            return frame, work(frame)
 
         workers = 2 if getattr(self.source, "concurrent", False) else 1
-        pool = ThreadPoolExecutor(workers, thread_name_prefix="tofuse-reader")
+        pool = side_threads(workers, "tofuse-reader")
         indices = iter(self.indices[first:].tolist())
         waiting = deque(pool.submit(read, k) for k in islice(indices, max(1, ahead)))
         try:
