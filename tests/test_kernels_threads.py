@@ -13,8 +13,10 @@ from tofuse.kernels.threads import (
     run_all,
     run_chunks,
     set_thread_count,
+    side_threads,
     thread_count,
     threads,
+    undivided,
 )
 
 
@@ -109,3 +111,17 @@ def test_the_count_is_put_back() -> None:
         with pytest.raises(ValueError, match="at least 1"):
             set_thread_count(wrong)
     assert thread_count() == before
+
+
+def test_work_beside_other_work_is_not_divided() -> None:
+    def names() -> list[str]:
+        return run_chunks(lambda _a, _b: threading.current_thread().name, 8, chunks=8)
+
+    with threads(2):
+        with side_threads(1, "beside") as pool:
+            assert set(pool.submit(names).result()) == {"beside_0"}
+        with undivided():
+            assert set(names()) == {threading.current_thread().name}
+        with undivided(False):
+            assert threading.current_thread().name not in names()
+        assert threading.current_thread().name not in names()

@@ -46,7 +46,7 @@ class _Drifting:
     def interrupt(self):
         """Nothing to forget."""
 
-    def push(self, frame, T_odometry=None):
+    def push(self, frame, T_odometry=None, surface=None):
         at = min(frame.index, COUNT - 1)
         truth = away_and_back(COUNT)
         view = surface_map(frame, SurfaceOptions(radii=(2,)))

@@ -46,6 +46,12 @@ def whole(recording):
     return reconstruct(recording, CONFIG)
 
 
+@dataclass(frozen=True)
+class OnlyClouds(Filter):
+    part_name: ClassVar[str] = "only clouds"
+    takes: ClassVar[frozenset[str]] = frozenset({"cloud"})
+
+
 def in_memory(frames, **options) -> Recording:
     return Recording.of(ArraySource(frames, **options), "memory", "frames")
 
@@ -131,6 +137,39 @@ def test_a_filter_for_images_refuses_clouds_before_work_starts(frames) -> None:
     with pytest.raises(InputError, match=r"filter 'temporal' takes .'range'. views"):
         mapper.push(CloudFrame.of(frames[0].points))
     mapper.push(frames[0])  # the refused view has not decided what comes next
+
+
+@pytest.mark.parametrize(
+    ("method", "amplitude", "filters", "corrected", "ready"),
+    [
+        ("default", False, [], 2, True),
+        ("default", True, [], 1, False),  # multipath is learnt frame by frame
+        ("default", False, [{"part": "temporal"}], 2, False),
+        ("thesis", True, [], 0, True),
+    ],
+)
+def test_what_is_prepared_out_of_turn_changes_nothing(
+    frames, method, amplitude, filters, corrected, ready
+) -> None:
+    config = changed(from_method(method), {"filters": filters}, where="tests")
+    case = frames[:5] if amplitude else [replace(f, amplitude_image=None) for f in frames[:5]]
+    plain, early = Mapper(config, threads=1), Mapper(config, threads=2)
+    prepared = [early.prepare(f) for f in reversed(case)][::-1]
+    assert {(p.corrected, p.ready is not None) for p in prepared} == {(corrected, ready)}
+    for frame, p in zip(case, prepared, strict=True):
+        np.testing.assert_array_equal(plain.push(frame), early.push(frame, prepared=p))
+    a, b = plain.finish(), early.finish()
+    assert a.trajectory.tobytes() == b.trajectory.tobytes()
+    assert a.cloud.points.tobytes() == b.cloud.points.tobytes()
+    assert a.diagnostics.removed == b.diagnostics.removed
+    assert [s.index for s in a.diagnostics.samples] == [s.index for s in b.diagnostics.samples]
+
+
+def test_clouds_and_what_does_not_fit_are_not_prepared(frames) -> None:
+    assert Mapper().prepare(CloudFrame.of(np.ones((5, 3)))) is None
+    assert Mapper(from_method("default", "cloud")).prepare(frames[0]) is not None
+    only_clouds = replace(from_method("default"), filters=(OnlyClouds(),))
+    assert Mapper(only_clouds).prepare(frames[0]) is None
 
 
 def test_a_lost_frame_has_no_pose_and_the_next_goes_on(frames) -> None:

@@ -231,6 +231,14 @@ def test_frames_come_in_order_with_errors_in_place() -> None:
     assert reader_threads() == []
 
 
+def test_work_is_done_where_frames_are_read() -> None:
+    _, recording = counting(6, 3)
+    found = list(recording.read_with(lambda f: (f.index, threading.current_thread().name), first=1))
+    assert [work and work[0] for _, work in found] == [1, 2, None, 4, 5]
+    assert str(found[2][0]) == "frame 3: is bad"
+    assert all(work is None or work[1].startswith("tofuse-reader") for _, work in found)
+
+
 def test_iteration_raises_when_it_is_the_bad_frame_s_turn() -> None:
     _, recording = counting(5, 3)
     iterator = iter(recording)

@@ -48,9 +48,6 @@ class Behind:
         self._pool = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Nothing, once all is done: the jobs changed what others hold."""
+        """As it begins, once all is done: the jobs changed what others hold."""
         self.wait()
-        return {}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__()  # type: ignore[misc]
+        return {"_pool": None, "_jobs": deque()}

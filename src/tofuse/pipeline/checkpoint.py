@@ -39,6 +39,7 @@ _ROOMS = (
     "geometry",
     "maps",
     "odometry",
+    "pipeline.behind",
     "pipeline.config",
     "pipeline.live",
     "pipeline.mapper",
