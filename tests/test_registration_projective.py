@@ -215,6 +215,17 @@ def test_a_view_of_nothing_holds_nothing_and_stays_at_the_prediction(room):
         np.testing.assert_allclose(found.T_world_source, T, atol=1e-9)
 
 
+def test_a_view_beyond_all_bounds_fits_nothing_and_stays_at_the_prediction(room):
+    planes = room.views[1].planes.copy()
+    planes[60:70, :, :3] = np.inf
+    view = replace(room.views[1], planes=planes)
+    found = align(view, [room.target], room.poses[2], OPTIONS)
+    np.testing.assert_array_equal(found.T_world_source, room.poses[2])
+    assert not found.converged
+    assert found.inliers == 0
+    assert len(found.unobservable) == 6
+
+
 def test_points_lie_on_the_fitted_surface(room):
     view = room.views[0]
     some = points_of(view, 4)

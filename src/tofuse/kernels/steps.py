@@ -75,7 +75,8 @@ def settle(
     Returns
     -------
     The last sums; (6, 6) information that can be faked; (k, 6) weak directions; the size of the
-    last step in `units`; and how many there were.
+    last step in `units`; and how many there were. Where the sums are not finite, they are 0, and
+    T stays.
     """
     total = np.zeros(sums.SIZE)
     weak = np.zeros((0, 6))
@@ -98,19 +99,25 @@ def settle(
                 robust,
                 min_cosine,
             )
-        if judged:
-            if done == 0:
-                doubt = total[sums.INLIERS] * faked_information(
-                    points,
-                    max(1, len(points) // SOME_POINTS),
-                    guessed[SCALE_G],
-                    slack,
-                    guessed[SCALE_P] ** 2,
-                    tilt,
-                    slope,
-                )
-            weak = weak_directions(cross_information(total) - doubt, units, held)
-        T[:], step = advance(total, T, T_predicted, weak, prior, units)
+        if judged and done == 0:
+            doubt = total[sums.INLIERS] * faked_information(
+                points,
+                max(1, len(points) // SOME_POINTS),
+                guessed[SCALE_G],
+                slack,
+                guessed[SCALE_P] ** 2,
+                tilt,
+                slope,
+            )
+        told = np.isfinite(total.sum() + doubt.sum())
+        if told:
+            if judged:
+                weak = weak_directions(cross_information(total) - doubt, units, held)
+            onward, step = advance(total, T, T_predicted, weak, prior, units)
+            told = np.isfinite(step.sum())
+        if not told:  # planes beyond all bounds, as noise alone can make them: no point fits
+            return np.zeros(sums.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, done
+        T[:] = onward
         done += 1
         size = 0.0
         for p in range(6):
