@@ -280,6 +280,10 @@ def test_turns_that_are_not_held_are_told() -> None:
     (reason,) = judge(evidence(gaps=(), sigma=(1e-5, np.radians(0.8))))[1]
     assert reason.code == "uncertain_poses"
     assert "2.3 degrees" in reason.text
+    (reason,) = judge(evidence(gaps=(), sigma=(1e-5, 2.0)))[1]
+    assert reason.code == "uncertain_poses"
+    assert "not held at all" in reason.text
+    assert "degrees" not in reason.text
 
 
 def test_a_part_that_nothing_joins_is_told() -> None:

@@ -274,6 +274,8 @@ def _doubt(first: int, last: int, sigma: float, turn: float) -> str:
     which = f"Frame {first} is" if first == last else f"Frames {first} to {last} are"
     if not np.isfinite(sigma):
         return f"{which} not joined to the first by anything that was measured."
+    if turn >= np.pi:  # no two rotations are further apart
+        return f"{which} not held at all in at least one direction, by loops and structure."
     return (
         f"{which} held to no better than {sigma:.3f} m and {np.degrees(turn):.1f} degrees (one "
         "sigma in the worst direction), by loops and structure."

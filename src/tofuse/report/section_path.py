@@ -161,12 +161,13 @@ def uncertainty(s: Subject) -> Values:
     if known.sum() < 2:
         return {"uncertainty": []}
     figures = []
-    for what, part, scale, unit in (
-        ("position", slice(0, 3), 1000.0, "mm"),
-        ("rotation", slice(3, 6), 180 / np.pi, "degrees"),
+    for what, part, scale, unit, most in (
+        ("position", slice(0, 3), 1000.0, "mm", np.inf),
+        ("rotation", slice(3, 6), 180 / np.pi, "degrees", 180.0),
     ):
+        variance = np.linalg.eigvalsh(C[known][:, part, part])[:, -1]
         sigma = np.full(len(C), np.nan)
-        sigma[known] = scale * np.sqrt(np.linalg.eigvalsh(C[known][:, part, part])[:, -1].clip(0))
+        sigma[known] = np.minimum(scale * np.sqrt(variance.clip(0)), most)
         drawn = plots.lines(
             s.index,
             [(sigma, plots.AFTER, "-")],
