@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,13 @@ import pytest
 
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import surface_map
 from tofuse.odometry import keyframes as module
 from tofuse.odometry.keyframes import Acceptance, Keyframes, Recovery
 from tofuse.pipeline.config import changed, from_method
-from tofuse.recordings.frames import CloudFrame
+from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.projective import Target, align
@@ -51,6 +53,12 @@ def corner():
 @pytest.fixture(scope="module")
 def elsewhere():
     return Sequence("rail", [0, 5, 10]).frames
+
+
+@pytest.fixture(scope="module")
+def turning_box():
+    frames = Sequence("box", range(0, 60, 10)).frames
+    return [frame.keep(frame.z < 1.8) for frame in frames]
 
 
 def run(frames, options=None, odometry=None):
@@ -174,18 +182,23 @@ def test_fit_asks_the_same_of_several_targets(room):
 
 
 def test_the_last_motion_goes_on(room, monkeypatch):
+    """There an alignment begins; what the data leaves open goes on as it did on the mean."""
     asked = []
     align = module.align
 
-    def watched(view, targets, predicted, options, **more):
-        asked.append((view.index, np.array(predicted)))
-        return align(view, targets, predicted, options, **more)
+    def watched(view, targets, predicted, options, *, start=None):
+        asked.append((view.index, start, np.array(predicted)))
+        return align(view, targets, predicted, options, start=start)
 
     monkeypatch.setattr(module, "align", watched)
-    steps = run(room.frames[:4])
+    coarse = replace(Keyframes().alignment, levels=Keyframes().alignment.levels[:1])
+    steps = run(room.frames[:4], Keyframes(alignment=coarse))
     T = [step.T_world_camera for step in steps]
-    first = next(predicted for index, predicted in asked if index == 3)
-    np.testing.assert_allclose(first, T[2] @ se3.inverse(T[1]) @ T[2], atol=1e-9)
+    start, predicted = next(poses for index, *poses in asked if index == 3)
+    np.testing.assert_allclose(start, T[2] @ se3.inverse(T[1]) @ T[2], atol=1e-9)
+    motions = [se3.log(se3.inverse(a) @ b) for a, b in itertools.pairwise(T[:3])]
+    steady = T[2] @ se3.exp(0.7 * motions[0] + 0.3 * motions[1])
+    np.testing.assert_allclose(predicted, steady, atol=1e-9)
 
 
 def test_odometry_is_used_where_nothing_else_tells():
@@ -295,6 +308,17 @@ def test_what_is_wrong_with_a_stretch_of_images_is_told(corner, spoil, amplitude
         assert steps[k].reference is None or steps[k].reference < 3 or steps[k].reference > 5
 
 
+@pytest.mark.parametrize("spoil", ["a tenth too far", "a tenth too near"])
+def test_a_thing_on_its_own_does_not_grow_or_shrink(turning_box, spoil):
+    """At three images a second a camera could well go where it would have to be for that."""
+    frames = list(turning_box)
+    frames[BAD] = SPOILT[spoil](frames[BAD])
+    steps = run(frames)
+    assert_marked(steps[BAD])
+    assert STRETCHES[spoil] in steps[BAD].reason
+    assert [step.status for step in steps].count("tracked") == len(steps) - 1
+
+
 def test_images_that_stay_turned_over_are_followed_but_get_no_pose(room):
     """Also once the camera has left the last keyframe that it was believed at."""
     options = Keyframes(keyframe_angle=0.06, keyframe_distance=0.05)
@@ -302,6 +326,22 @@ def test_images_that_stay_turned_over_are_followed_but_get_no_pose(room):
     for step in steps[2:]:
         assert_marked(step)
         assert "mirrored left to right" in step.reason
+
+
+@pytest.mark.parametrize("side", [np.s_[:, 44:], np.s_[:, :44]])
+def test_a_wall_is_not_taken_for_its_own_mirror_image(side, monkeypatch):
+    """It fits either way, and better so if what is measured of it then lies in the keyframe."""
+    camera, rng = Pinhole(88, 72, 100.0, 100.0, 43.5, 35.5), np.random.default_rng(4)
+    rays, frames = camera.rays(), []
+    for k, angle in enumerate(np.radians([10, 8, 6, 4, 2, 0, -2])):
+        z = 2.0 / (np.cos(angle) + np.sin(angle) * rays[..., 0])
+        z = (z + 0.004 * rng.standard_normal(z.shape)).astype(np.float32)
+        if k > 3:
+            z[side] = 0
+        frames.append(RangeFrame(k, float(k), camera, z))
+    monkeypatch.setattr(module, "looks_turned_over", lambda before, now: True)
+    for step in run(frames):
+        assert step.status == "tracked", step.reason
 
 
 @pytest.mark.parametrize("spoil", [SPOILT["blank"], SPOILT["sparse"]], ids=["blank", "sparse"])

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from tofuse.geometry.cameras import Pinhole
-from tofuse.odometry.mending import Mending, glance, looks_turned_over, mendings, scale_between
+from tofuse.odometry.mending import (
+    Mending,
+    glance,
+    looks_rescaled,
+    looks_turned_over,
+    mendings,
+    scale_between,
+)
 from tofuse.recordings.frames import RangeFrame
 
 CAMERA = Pinhole(48, 36, 40.0, 40.0, 20.0, 17.0)
@@ -65,3 +72,12 @@ def test_a_glance_tells_what_is_turned_over(order):
     assert not looks_turned_over(before, before)
     assert not looks_turned_over(before, glance(np.roll(frame().z, 1, 1)))
     assert looks_turned_over(before, glance(np.roll(frame(order).z, 1, 1)))
+
+
+@pytest.mark.parametrize(("factor", "rescaled"), [(1.1, True), (0.9, True), (1.02, False)])
+def test_a_glance_tells_what_is_rescaled(factor, rescaled):
+    before = glance(frame().z)
+    assert looks_rescaled(before, glance(frame(factor=factor).z)) is rescaled
+    assert not looks_rescaled(before, np.full_like(before, np.nan))
+    (only,) = mendings(frame(), frame(factor=1.1), np.eye(4), turned=False)
+    assert only.factor == pytest.approx(1 / 1.1, rel=1e-5)

@@ -16,7 +16,13 @@ from tofuse.kernels.motion import distance_and_angle
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.odometry.likeness import likeness, thumbnail
-from tofuse.odometry.mending import Mending, glance, looks_turned_over, mendings
+from tofuse.odometry.mending import (
+    Mending,
+    glance,
+    looks_rescaled,
+    looks_turned_over,
+    mendings,
+)
 from tofuse.odometry.motion import Moment, Motion, is_small
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -39,6 +45,8 @@ Guess = Literal["identity", "previous", "odometry"]
 # A relocalisation starts far off: coarser, and with more patience, than tracking.
 _PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
 _WIDE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
+# To see how well two views fit that are aligned.
+_GLANCE = Level(4, 2, 0.0, 0.0)
 
 # From one frame to the next no view gets so many times deeper, nor as much nearer.
 _RESCALED = 4.0
@@ -325,10 +333,13 @@ class _KeyframeTracker(Tracker):
         else:
             found = self._track(view, expected, reasons)
         since = now.seconds_since(self._before)
+        mended = None
         if self._is_suspicious(look, found, expected, since):
-            mended = self._mend(frame, expected, found)
-            if mended is not None:
-                return self._follow_mended(mended, T_odometry, now)
+            mended = self._mend(frame, view, expected, found)
+        elif expected is not None and looks_rescaled(self._glance, look):
+            mended = self._mend(frame, view, expected, found, turned=False)
+        if mended is not None:
+            return self._follow_mended(mended, T_odometry, now)
         if found is not None:
             self._searched = 0
         elif rescaled:
@@ -396,9 +407,18 @@ class _KeyframeTracker(Tracker):
         )
 
     def _mend(
-        self, frame: RangeFrame, expected: Float64 | None, found: _Found | None
+        self,
+        frame: RangeFrame,
+        as_is: SurfaceMap,
+        expected: Float64 | None,
+        found: _Found | None,
+        *,
+        turned: bool = True,
     ) -> _Mended | None:
-        """See whether a frame fits better where it was expected if it is mirrored or rescaled."""
+        """See whether a frame fits better where it was expected if it is mirrored or rescaled.
+
+        It is not asked whether it is mirrored unless it may be `turned` over.
+        """
         assert self._T is not None
         assert self._frame is not None
         options = self._options
@@ -407,19 +427,35 @@ class _KeyframeTracker(Tracker):
         targets = [keyframe.target]
         start = self._T if expected is None else expected
         wrong: Iterable[Mending] = () if before is None else [before.mending]
-        wrong = wrong or mendings(self._frame, frame, se3.inverse(self._T) @ start)
-        best, least = None, 0.0 if found is None else _CLEARLY * found.aligned.score
+        wrong = wrong or mendings(self._frame, frame, se3.inverse(self._T) @ start, turned=turned)
+        best, least = None, np.zeros(2)
+        if found is not None:
+            least = _CLEARLY * self._scores(as_is, found.aligned, keyframe)
         for mending in wrong:
             mended = mending(frame)
             view = surface_map(mended, options.surface)
             aligned = align(view, targets, start, options.alignment)
             if (
-                aligned.score > least
+                aligned.score > 0
+                # A flat wall fits whichever way it is turned.
+                and (before is not None or not len(aligned.unobservable))
                 and not options.acceptance.objection(aligned, view.depth)
                 and is_small(se3.inverse(start) @ aligned.T_world_source)
             ):
-                best, least = _Mended(mending, mended, view, aligned, keyframe), aligned.score
+                scores = self._scores(view, aligned, keyframe)
+                if (scores > least).any():
+                    best, least = _Mended(mending, mended, view, aligned, keyframe), scores
         return best
+
+    def _scores(self, view: SurfaceMap, aligned: Aligned, keyframe: _Keyframe) -> Float64:
+        """How well a view fits a keyframe, and how well each fits the other, (2,).
+
+        A view that shrinks lands wherever the keyframe has a surface, but leaves much of it bare.
+        """
+        how = replace(self._options.alignment, levels=(_GLANCE,))
+        target = Target(view, se3.inverse(aligned.T_world_source))
+        back = align(keyframe.view, [target], keyframe.T_world_camera, how)
+        return np.array([aligned.score, aligned.score + back.score])
 
     def _follow_mended(self, mended: _Mended, T_odometry: Float64 | None, now: Moment) -> Step:
         """Follow the camera by an image that is wrong, which gets no pose for that."""
@@ -518,7 +554,9 @@ class _KeyframeTracker(Tracker):
         """Where the camera may be, where to begin, how, and in words; the likeliest first."""
         assert self._T is not None
         if expected is not None and self._options.guess != "identity":
-            yield expected, expected, self._options.alignment, ""
+            steady = self._motion.steadily if self._options.guess == "previous" else None
+            kept = expected if steady is None else steady
+            yield kept, expected, self._options.alignment, ""
         # Nothing tells how the camera moves: try some turns of it, and of what it sees.
         coarse = replace(self._options.alignment, levels=_PATIENT[:1])
         starts = [self._T @ motion for motion in _turns(view)]

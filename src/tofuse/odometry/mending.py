@@ -7,6 +7,7 @@ camera was expected once that is undone, then it is what happened.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -71,12 +72,14 @@ class Mending:
         return None if image is None else np.ascontiguousarray(image[self.order])
 
 
-def mendings(before: RangeFrame, frame: RangeFrame, T_before_frame: Float64) -> Iterator[Mending]:
+def mendings(
+    before: RangeFrame, frame: RangeFrame, T_before_frame: Float64, *, turned: bool = True
+) -> Iterator[Mending]:
     """What may be wrong with a frame that does not go on from the one before it.
 
-    `T_before_frame` (4, 4) is where it was expected.
+    `T_before_frame` (4, 4) is where it was expected, `turned` whether it may be turned over.
     """
-    for words, order in _ORDERS.items():
+    for words, order in _ORDERS.items() if turned else ():
         yield Mending(words, order)
     factor = scale_between(before, frame, T_before_frame)
     if max(factor, 1 / factor) > _SAME_SCALE:
@@ -115,6 +118,13 @@ def looks_turned_over(before: Float32, now: Float32) -> bool:
     """Whether a view looks more like the one before it if it is mirrored, or turned over."""
     straight = _apart(before, now)
     return any(_apart(before, now[o]) < _MUCH_ALIKE * straight for o in _ORDERS.values())
+
+
+def looks_rescaled(before: Float32, now: Float32) -> bool:
+    """Whether a view's depths are not what they were just before, in the median."""
+    difference = now - before
+    known = difference[np.isfinite(difference)]
+    return len(known) > 0 and abs(float(np.median(known))) > math.log(_SAME_SCALE)
 
 
 def _apart(a: Float32, b: Float32) -> float:

@@ -25,6 +25,8 @@ FLOOR = np.array([0.06, np.radians(4.0)])
 _SECONDS, _FARTHEST = 0.2, 10.0
 # Over that, so many times the largest of so many recent differences.
 _TIMES, _RECENT = 2.0, 4
+# Share of the newest motion in the running mean.
+_NEWEST = 0.3
 # After so many frames without a pose the camera can be anywhere.
 _FORGOTTEN = 3
 
@@ -49,6 +51,7 @@ class Motion:
     def __init__(self) -> None:
         self._T: Float64 | None = None  # of the last frame with a pose
         self._per_frame: Float64 | None = None  # (6,) the motion of a frame, while it is known
+        self._steady: Float64 | None = None  # (6,) the same as a running mean, with less noise
         self._missed = 0  # frames since
         self._elsewhere: Float64 | None = None  # the last surprise, and frames since
         self._waited = 0
@@ -60,6 +63,17 @@ class Motion:
         if self._T is None or self._per_frame is None:
             return None
         return _onward(self._T, self._per_frame, self._missed + 1)
+
+    @property
+    def steadily(self) -> Float64 | None:
+        """T_world_camera (4, 4) if the mean motion of some frames goes on; None if not known.
+
+        Where the data does not hold a direction for many frames, the camera goes on there by what
+        is expected, and the noise of one motion would add up.
+        """
+        if self._T is None or self._steady is None:
+            return None
+        return _onward(self._T, self._steady, self._missed + 1)
 
     def surprise(self, T: Float64, expected: Float64 | None, seconds: float | None = None) -> str:
         """Return in words how a pose differs from what was expected, or nothing if it is believed.
@@ -114,9 +128,11 @@ class Motion:
         if jumped:
             before, frames = self._elsewhere, self._waited + 1
         if before is None or frames > _FORGOTTEN:
-            self._per_frame = None
+            self._per_frame = self._steady = None
         elif frames > 0:  # at the place of a surprise itself the motion is taken to go on
-            self._per_frame = twist_between(before, T) / frames
+            self._per_frame = now = twist_between(before, T) / frames
+            mean = now if self._steady is None else self._steady
+            self._steady = mean + _NEWEST * (now - mean)
         self._T, self._missed, self._elsewhere = T, 0, None
         return jumped
 
@@ -127,14 +143,14 @@ class Motion:
     def interrupt(self) -> None:
         """Say that the camera may be anywhere by the next frame."""
         self._missed = _FORGOTTEN
-        self._per_frame, self._elsewhere = None, None
+        self._per_frame = self._steady = self._elsewhere = None
 
     def miss(self) -> None:
         """Say that the next frame has no pose."""
         self._missed += 1
         self._waited += 1
         if self._missed >= _FORGOTTEN:
-            self._per_frame, self._elsewhere = None, None
+            self._per_frame = self._steady = self._elsewhere = None
 
 
 def is_small(T: Float64) -> bool:
