@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -145,7 +147,7 @@ def _made_patches(means, weights, change=0.0):
     J = np.concatenate([rng.normal(size=(n, 6)), np.zeros((n, 1))], 1)
     H = (J * weights[:, None]).T @ J
     return Patches(
-        H, np.zeros((7, 7)), H, places, weights, means, J * weights[:, None], change, 2.0, 2
+        H, np.zeros((7, 7)), H, H, places, weights, means, J * weights[:, None], change, 2.0, 2
     )
 
 
@@ -158,6 +160,21 @@ def test_seen_errors_are_told_from_noise_by_their_size():
     ratio = np.sqrt(np.trace(large / np.outer(UNITS, UNITS)))
     ratio /= np.sqrt(np.trace(noise / np.outer(UNITS, UNITS)))
     assert 4 < ratio < 25
+
+
+def test_residuals_near_the_limit_do_not_make_a_direction_unknown():
+    """The slope that the robust weights leave may vanish there, and have any sign."""
+    found = _made_patches(np.zeros(48), np.full(48, 1e2))
+    steep = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
+    values, vectors = np.linalg.eigh(found.cross[:6, :6])
+    cross = found.cross.copy()
+    cross[:6, :6] -= 1.01 * values[0] * np.outer(vectors[:, 0], vectors[:, 0])
+    found = replace(found, cross=cross)
+    flat = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
+    assert (flat >= 0.99 * steep).all()
+    assert 1.5 < (flat / steep).max() < 3.5  # not above 1 / 0.3
+    unbounded = _sigmas(covariance_of_patches(found, UncertaintyOptions(steepness=1e-9)))
+    assert (unbounded / steep).max() > 10
 
 
 def test_prior_takes_only_the_unobservable_directions():
@@ -205,7 +222,7 @@ def test_tile_sums_match_numpy():
     found = found.reshape(3, 4, tiles.SIZE)
     expected = np.zeros((3, 4, tiles.SIZE))
     upper = np.triu_indices(7)
-    products, cross = np.zeros((2, tiles.UPPER))
+    products, weighed, cross = np.zeros((3, tiles.UPPER))
     for i in range(1, CAMERA.height, 2):
         for j in range(1, CAMERA.width, 2):
             if z[i, j] <= 0:
@@ -232,13 +249,19 @@ def test_tile_sums_match_numpy():
             slope = (1 - e2) * (1 - 5 * e2) / variance
             mean = (J + K) / 2
             products += w * np.outer(mean, mean)[upper]
-            cross += slope * (np.outer(J, K) + np.outer(K, J))[upper] / 2
+            both = (np.outer(J, K) + np.outer(K, J))[upper] / 2
+            weighed += w * both
+            cross += slope * both
             out = expected[i * 3 // CAMERA.height, j * 4 // CAMERA.width]
             out[tiles.A : tiles.A + 7] += w * mean
             out[tiles.WEIGHT] += w
             out[tiles.RESIDUAL] += w * r
             out[tiles.COUNT] += 1
-    for sums, wanted in ((whole[tiles.GEOMETRY], products), (whole[tiles.CROSS], cross)):
+    for sums, wanted in (
+        (whole[tiles.GEOMETRY], products),
+        (whole[tiles.WEIGHED], weighed),
+        (whole[tiles.CROSS], cross),
+    ):
         np.testing.assert_allclose(sums, wanted, rtol=0.02, atol=0.002 * np.abs(wanted).max())
     np.testing.assert_array_equal(whole[tiles.PHOTO], 0)
     assert expected[..., tiles.COUNT].sum() > 500

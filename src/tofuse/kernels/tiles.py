@@ -43,8 +43,9 @@ COUNT = 9
 SIZE = 10
 # What is summed over all tiles: upper triangles (28) of 7x7 matrices, whose seventh unknown is the
 # exposure. Of w J J^T, for the distances and for the albedo, and for both the symmetrised product
-# of the Jacobians of target and source, with the slope of the influence function for w.
-GEOMETRY, PHOTO, CROSS = 0, 1, 2
+# of the Jacobians of target and source, with w, and with the slope of the influence function for w.
+GEOMETRY, PHOTO, WEIGHED, CROSS = 0, 1, 2, 3
+KINDS = 4
 UPPER = 28
 
 
@@ -73,14 +74,14 @@ def tile_sums(
 
     Returns
     -------
-    (tiles_y * tiles_x, SIZE) of the tiles, and (3, UPPER) of the image.
+    (tiles_y * tiles_x, SIZE) of the tiles, and (KINDS, UPPER) of the image.
     """
     rows, columns = planes.shape[0], planes.shape[1]
     tiles = np.zeros((tiles_y * tiles_x, SIZE))
     points = np.zeros((LANES, POINT_SIZE), np.float32)
     of = np.zeros(LANES, np.int64)
     block = np.zeros(ROWS * LANES, np.float32)
-    sums = np.zeros((3 * UPPER, LANES))
+    sums = np.zeros((KINDS * UPPER, LANES))
     count = 0
     for row in range(stride // 2, rows, stride):
         for column in range(stride // 2, columns, stride):
@@ -106,8 +107,8 @@ def tile_sums(
                 albedos(block, T, exposure, scale_p, robust)
                 _add_products(sums, block, PHOTO, WEIGHT_P)
             count = 0
-    upper = np.zeros((3, UPPER))
-    for c in range(3):
+    upper = np.zeros((KINDS, UPPER))
+    for c in range(KINDS):
         for q in range(UPPER):
             for k in range(LANES):
                 upper[c, q] += sums[c * UPPER + q, k]
@@ -148,13 +149,17 @@ def _add_products(sums: Float64, block: Float32, of: int, weight: int) -> None:
         for o in range(p, 7):
             b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
             d = block[(DIFFERENCE + o) * LANES : (DIFFERENCE + o + 1) * LANES]
-            own, cross = sums[of * UPPER + q], sums[CROSS * UPPER + q]
+            own = sums[of * UPPER + q]
+            weighed, cross = sums[WEIGHED * UPPER + q], sums[CROSS * UPPER + q]
             for k in range(LANES):
                 own[k] += a[k] * b[k]
             if o < 6:
                 for k in range(LANES):
-                    cross[k] += per_weight[k] * (a[k] * b[k] - c[k] * d[k])
+                    both = a[k] * b[k] - c[k] * d[k]
+                    weighed[k] += both
+                    cross[k] += per_weight[k] * both
             else:  # of both sides alike
                 for k in range(LANES):
+                    weighed[k] += a[k] * b[k]
                     cross[k] += per_weight[k] * a[k] * b[k]
             q += 1

@@ -66,6 +66,8 @@ class UncertaintyOptions:
         Least error of the pose, as a share of the change of the view.
     loosest
         Largest sigma that the data itself is trusted to give, in units of 1 cm and 1 degree.
+    steepness
+        Least slope of the gradient, as a share of the weighed information.
     """
 
     tiles: tuple[int, int] = (8, 6)
@@ -76,6 +78,7 @@ class UncertaintyOptions:
     offset: float = 3.0
     floor: float = 0.008
     loosest: float = 1.8
+    steepness: float = 0.3
 
     def __post_init__(self) -> None:
         if len(self.tiles) != 2 or not all(2 <= n <= 64 for n in self.tiles):
@@ -83,7 +86,7 @@ class UncertaintyOptions:
         for name in ("noise_pixels", "photo_noise_pixels", "reach", "loosest"):
             if not 0 < getattr(self, name) < 1e3:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("hidden", "offset", "floor"):
+        for name in ("hidden", "offset", "floor", "steepness"):
             if not 0 <= getattr(self, name) < 1e3:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -96,8 +99,9 @@ class Patches:
     ----------
     geometry, photo
         (7, 7) sums of w J J^T; the seventh unknown is the exposure.
-    cross
-        (7, 7) X, the slope of the gradient.
+    weighed, cross
+        (7, 7) sums of w times the symmetrised product of target's and source's Jacobian; and X, the
+        slope of the gradient, which has the slope of the influence function for w.
     places
         (n, 2) of the patches with distances: column and row, as a share of the image's width.
     weights
@@ -116,6 +120,7 @@ class Patches:
 
     geometry: Float64
     photo: Float64
+    weighed: Float64
     cross: Float64
     places: Float64
     weights: Float64
@@ -144,7 +149,7 @@ def patches(
     some = some[some > 0]
     depth = 1 / median(some) if len(some) else 1.0
     distances = []
-    upper = np.zeros((3, kernels.UPPER))
+    upper = np.zeros((kernels.KINDS, kernels.UPPER))
     changes = []
     for target in targets:
         view = target.view
@@ -179,6 +184,7 @@ def patches(
     return Patches(
         _matrix(upper[kernels.GEOMETRY]),
         _matrix(upper[kernels.PHOTO]),
+        _matrix(upper[kernels.WEIGHED]),
         _matrix(upper[kernels.CROSS]),
         places,
         weights,
@@ -199,7 +205,7 @@ def _places(rows: int, columns: int, across: int, down: int) -> Float64:
 
 def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float64:
     """(6, 6) covariance in m and rad of the right perturbation, from what the patches say."""
-    bread = _bounded_inverse(found.cross, options.loosest)
+    bread = _bounded_inverse(_slope(found, options), options.loosest)
     per_pixel = found.stride**2
     B = max(1.0, options.noise_pixels / per_pixel) * found.geometry
     B += max(1.0, options.photo_noise_pixels / per_pixel) * found.photo
@@ -292,6 +298,20 @@ def _seen_variance(
     noise = float(share @ ((M / found.weights) * M).sum(1))
     surplus = float(share @ found.means**2) - noise
     return max(surplus, 0.0) / max(expected, 0.1 * float(share.sum()))
+
+
+def _slope(found: Patches, options: UncertaintyOptions) -> Float64:
+    """X (7, 7), but along no direction less than `steepness` of what it is without robust weights.
+
+    Normal errors make it two thirds of that. Where many residuals are near the limit, the slope is
+    the difference of large numbers, and may be anything, even negative.
+    """
+    values, vectors = np.linalg.eigh(found.weighed)
+    root = vectors / np.sqrt(np.maximum(values, options.loosest**-2))
+    values, turned = np.linalg.eigh(root.T @ found.cross @ root)
+    back = np.linalg.inv(root).T @ turned
+    X: Float64 = (back * np.maximum(values, options.steepness)) @ back.T
+    return X
 
 
 def _bounded_inverse(X: Float64, loosest: float) -> Float64:
