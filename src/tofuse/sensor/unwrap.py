@@ -19,6 +19,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label, uniform_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.unwrap import pass_messages
@@ -33,6 +35,7 @@ _GLOSSY = 0.01
 # Slopes are told from blocks so far on either side, of a phase averaged over so many: far surfaces
 # are noisy. Less than the last cosine of incidence is not believed.
 _REACH, _WIDE, _STEEPEST = 2, 5, 0.25
+_MOVES = 100
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class UnwrapOptions:
         Of the messages: about how many blocks one place can tell another.
     """
 
-    periods: int = 1
+    periods: int = 2
     albedo: float = 0.5
     spread: float = 0.6
     albedo_most: float = 4.0
@@ -74,7 +77,7 @@ class UnwrapOptions:
     difference_most: float = 3.0
     entry: float = 0.05
     columns: int = 88
-    iterations: int = 120
+    iterations: int = 60
 
 
 _DEFAULT = UnwrapOptions()
@@ -134,6 +137,7 @@ def count_periods(
     for step in range(2 * options.iterations):
         run_chunks(partial(renew, parity=step % 2), len(unary))
     best = np.argmin(unary + messages.sum(0), axis=2)
+    best = _with_surfaces_moved(blocks, unary, best, period_m, options)
     best = _entered(blocks, best, period_m, options)
     return _of_pixels(radial_range, blocks, best, period_m, side, options.periods)
 
@@ -204,6 +208,65 @@ def _steps(range_m: Float32, period: float) -> Float32:
         difference -= period * np.rint(difference / period)
         squares += (difference / (2 * _REACH)) ** 2
     return np.sqrt(squares)
+
+
+def _with_surfaces_moved(
+    blocks: _Blocks, unary: Float32, best: NDArray[np.intp], period: float, options: UnwrapOptions
+) -> NDArray[np.intp]:
+    """Move whole surfaces by periods while that makes the state likelier.
+
+    Messages that go round in loops may settle with a part of a surface a period off. A surface is
+    what hangs together but for jumps; those that gain most are moved first, and none beside one
+    that has just been moved.
+    """
+    height, width = best.shape
+    index = np.arange(height * width).reshape(height, width)
+    beside = ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:]))
+    a, b = (np.concatenate([pair[side].ravel() for pair in beside]) for side in (0, 1))
+    known = blocks.valid.ravel()
+    a, b = a[known[a] & known[b]], b[known[a] & known[b]]
+    range_m, costs = blocks.range_m.ravel().astype(float), unary.reshape(-1, unary.shape[2])
+    periods = best.ravel().copy()
+    most = unary.shape[2] - 1
+    shifts = [s for s in range(-most, most + 1) if s]
+
+    def jump(difference: Float64) -> Float64:
+        away = np.abs(difference) / (options.scale * period)
+        return np.minimum(away, options.difference_most)
+
+    for _ in range(_MOVES):
+        at = range_m + periods * period
+        difference = at[b] - at[a]
+        now = jump(difference)
+        held = now < options.difference_most
+        graph = coo_array((np.ones(held.sum()), (a[held], b[held])), (index.size, index.size))
+        count, piece = connected_components(graph, directed=False)
+        cut = piece[a] != piece[b]
+        pa, pb, gap, paid = piece[a][cut], piece[b][cut], difference[cut], now[cut]
+        gain, move = np.zeros(count), np.zeros(count, np.intp)
+        for shift in shifts:
+            to = periods + shift
+            inside = (to >= 0) & (to <= most)
+            change = costs[np.arange(index.size), np.clip(to, 0, most)]
+            change = change - costs[np.arange(index.size), periods]
+            total = np.bincount(piece, np.where(known, change, 0), count)
+            total += np.bincount(pa, jump(gap - shift * period) - paid, count)
+            total += np.bincount(pb, jump(gap + shift * period) - paid, count)
+            total[piece[known & ~inside]] = np.inf
+            better = -total > gain + 1e-6
+            gain[better], move[better] = -total[better], shift
+        if not move.any():
+            break
+        # Only those that no neighbour outbids; ties go to the first.
+        order = np.lexsort((np.arange(count), -gain))
+        rank = np.empty(count, np.intp)
+        rank[order] = np.arange(count)
+        first = rank.copy()
+        np.minimum.at(first, pa, rank[pb])
+        np.minimum.at(first, pb, rank[pa])
+        move[first < rank] = 0
+        periods = np.where(known, periods + move[piece], periods)
+    return periods.reshape(best.shape)
 
 
 def _entered(
