@@ -3,8 +3,9 @@
     python benchmarks/unwrapping.py [--seeds 5] [--every 15]
 
 A simulated SR4000 (period 5 m) turns around in the scene `hall`, 8 x 8 m, with all its errors, and
-in the scene `room`, most of which lies within the period; both also without indirect light. The
-correction `unwrap` learns the camera's light from the frames and moves pixels by whole periods.
+in the scene `room`, most of which lies within the period; both also without indirect light. Then
+the room again, as if the period were shorter, so that up to a third of it is beyond. The correction
+`unwrap` learns the camera's light from the frames and moves pixels by whole periods.
 Printed for each seed: which share of the wrapped pixels is moved back to where it belongs (target
 99 %), and which share of the others is moved by mistake (at most 0.1 %). Pixels count whose
 measurement is that of one surface: within half a metre of the truth but for whole periods, and with
@@ -14,7 +15,7 @@ a confidence of 1 or more.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import plan
 
 PERIOD_M = 5.0
+SHORTER_M = (2.8, 3.2, 3.6, 4.0)
 OFF_M = 0.5
 
 
@@ -42,27 +44,38 @@ class Counts:
         return f"{wrapped:8.1f} {restored:9.2f} {harmed:8.3f}"
 
 
-def count(scene: str, effects: Effects, seed: int, every: int) -> Counts:
+def as_if(frame: RangeFrame, period: float) -> RangeFrame:
+    """What a camera of a shorter period would measure, which compensates its light by range."""
+    radial = np.maximum(frame.radial_range, np.float32(1e-6))
+    near = np.mod(radial, period) / radial
+    light = frame.amplitude_image
+    if light is not None and frame.amplitude_kind == "range_compensated":
+        light = light * near**2
+    return replace(frame, depth=frame.depth * near, amplitude_image=light, ambiguity_m=period)
+
+
+def count(scene: str, effects: Effects, seed: int, every: int, period: float = PERIOD_M) -> Counts:
     made = plan(scene, every=every, seed=seed, effects=effects)
     frames: list[RangeFrame] = []
     truth: list[np.ndarray] = []
     for rendered in made.frames(None):
-        frames.append(rendered.frame)
+        frame = rendered.frame
+        frames.append(frame if period == PERIOD_M else as_if(frame, period))
         z = made.model.depth_kind == "z"
         truth.append(range_from_z(rendered.frame.camera, rendered.depth) if z else rendered.depth)
     corrector = Unwrap().learnt(frames).start()
     out = Counts()
     for frame, radial in zip(frames, truth, strict=True):
-        lacks = np.rint((radial - frame.radial_range) / PERIOD_M)
-        off = np.abs(radial - frame.radial_range - lacks * PERIOD_M)
+        lacks = np.rint((radial - frame.radial_range) / period)
+        off = np.abs(radial - frame.radial_range - lacks * period)
         sure = frame.valid & (radial > 0) & (off < OFF_M)
         if frame.confidence_image is not None:
             sure &= frame.confidence_image >= 1
         found = corrector.apply(frame)
         assert isinstance(found, RangeFrame)
-        moved = np.rint((found.radial_range - frame.radial_range) / PERIOD_M)
-        out.wrapped += int((sure & (lacks == 1)).sum())
-        out.restored += int((sure & (lacks == 1) & (moved == 1)).sum())
+        moved = np.rint((found.radial_range - frame.radial_range) / period)
+        out.wrapped += int((sure & (lacks > 0)).sum())
+        out.restored += int((sure & (lacks > 0) & (moved == lacks)).sum())
         out.good += int((sure & (lacks == 0)).sum())
         out.harmed += int((sure & (lacks == 0) & (moved != 0)).sum())
     return out
@@ -74,14 +87,19 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=15)
     given = parser.parse_args()
     print(
-        f"{'scene':6s} {'indirect':8s} {'seed':>4s} {'wrapped':>8s} {'restored':>9s} {'harmed':>8s}"
+        f"{'scene':6s} {'period':>6s} {'indirect':8s} {'seed':>4s} "
+        f"{'wrapped':>8s} {'restored':>9s} {'harmed':>8s}"
     )
-    for scene in ("hall", "room"):
-        for name, effects in (("yes", Effects()), ("no", Effects().without("multipath"))):
-            every = given.every if scene == "hall" else 4 * given.every
-            for seed in range(given.seeds):
-                counts = count(scene, effects, seed, every)
-                print(f"{scene:6s} {name:8s} {seed:4d} {counts}", flush=True)
+    all_of_it, without = Effects(), Effects().without("multipath")
+    cases = [("hall", PERIOD_M, e) for e in (all_of_it, without)]
+    cases += [("room", PERIOD_M, e) for e in (all_of_it, without)]
+    cases += [("room", period, all_of_it) for period in SHORTER_M]
+    for scene, period, effects in cases:
+        every = given.every if scene == "hall" else 4 * given.every
+        name = "yes" if effects is all_of_it else "no"
+        for seed in range(given.seeds):
+            counts = count(scene, effects, seed, every, period)
+            print(f"{scene:6s} {period:6.1f} {name:8s} {seed:4d} {counts}", flush=True)
 
 
 if __name__ == "__main__":

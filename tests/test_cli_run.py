@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from test_inspection import wrapping
 from tofuse.cli import main
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.errors import TofuseError
@@ -25,6 +26,9 @@ from tofuse.parts import name_of
 from tofuse.pipeline import run as run_module
 from tofuse.pipeline.config import from_method
 from tofuse.posegraph.g2o import read_g2o
+from tofuse.recordings.convert import convert
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import STAGING
 from tofuse.results.verdict import REASONS
 from tofuse.simulation.effects import Effects
@@ -247,6 +251,29 @@ def test_an_object_is_told_from_its_background(tmp_path) -> None:
     again = ["--config", tmp_path / "out/run.json", "--threads", 1]
     run(tmp_path / "rec", "--out", tmp_path / "again", "--object", *again)
     assert same(tmp_path / "again") == same(tmp_path / "out")
+
+
+def test_what_lies_beyond_the_period_is_brought_back(room_recording, tmp_path) -> None:
+    frames, period = list(open_recording(room_recording))[::2], 2.8
+    source = ArraySource(wrapping(frames, period), metadata={"ambiguity_m": period})
+    convert(Recording.of(source, "wrapped", "test"), tmp_path / "rec")
+    farthest = {}
+    for name, options in (("near", []), ("far", ["--unwrap"])):
+        run(tmp_path / "rec", "--out", tmp_path / name, *options)
+        made = run_json(tmp_path / name)
+        told = {finding["code"] for finding in made["findings"]}
+        assert ("phase_wrap" in told) == (name == "near")
+        points = read_ply(tmp_path / name / "cloud.ply").points
+        farthest[name] = np.quantile(np.linalg.norm(points, axis=1), 0.9)
+    true = np.quantile(frames[0].radial_range[frames[0].valid], 0.9)
+    assert farthest["near"] < 2.9
+    assert farthest["far"] == pytest.approx(true, rel=0.1)
+
+
+def test_what_says_no_period_is_not_unwrapped(recording, tmp_path, capsys) -> None:
+    shutil.rmtree(recording / "amplitude")
+    run(recording, "--out", tmp_path / "out", "--unwrap", status=2)
+    assert "--unwrap: the recording can't be unwrapped" in capsys.readouterr().err
 
 
 def test_a_moving_camera_has_no_background(room_recording, tmp_path, capsys) -> None:

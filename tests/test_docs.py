@@ -342,7 +342,7 @@ def test_constants_of_the_covariance_are_those_of_the_tracker() -> None:
     table = [row for row in rows(text_of("docs/uncertainty.md")) if codes(row[0]) & set(numbers)]
     stated = {option: float(row[1]) for row in table for option in codes(row[0])}
     assert stated == pytest.approx({option: numbers[option] for option in stated})
-    assert len(stated) == 6
+    assert len(stated) == 7
 
 
 def test_every_field_of_a_configuration_is_described() -> None:

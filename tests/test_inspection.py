@@ -240,12 +240,16 @@ def colored(frames, shift):
 
 
 def wrapping(frames, period):
-    """Of a camera whose phase repeats after so many metres."""
-    lengths = frames[0].radial_range / frames[0].depth
-    return [
-        replace(f, depth=np.mod(f.radial_range, period) / lengths, ambiguity_m=period)
-        for f in frames
-    ]
+    """Of a camera whose phase repeats after so many metres, which compensates light by range."""
+    out = []
+    for f in frames:
+        radial = np.maximum(f.radial_range, np.float32(1e-6))
+        near = np.mod(f.radial_range, period) / radial
+        light = f.amplitude_image
+        if f.amplitude_kind == "range_compensated":
+            light = light * near**2
+        out.append(replace(f, depth=f.depth * near, amplitude_image=light, ambiguity_m=period))
+    return out
 
 
 def saturating(frames):

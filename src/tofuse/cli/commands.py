@@ -57,6 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         guess=arguments.guess,
         loops=arguments.loops,
         object=arguments.object,
+        unwrap=arguments.unwrap,
         texture=arguments.texture,
         overwrite=arguments.overwrite,
     )

@@ -135,6 +135,11 @@ def _processing(p: argparse.ArgumentParser) -> None:
         action="store_true",
         help="a turned object before a still background, which is learnt unless cut off",
     )
+    g.add_argument(
+        "--unwrap",
+        action="store_true",
+        help="bring back what lies beyond the range after which the camera's phase repeats",
+    )
     _seed(g)
     g.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
 

@@ -198,7 +198,8 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
             f"measured as near ones: {seam_share:.2%} of the pixels are at seams from far to "
             f"near, and {dark_share:.1%} are near and yet {1 / _DARK:.0f} times darker than the "
             "rest.",
-            "Use a lower modulation frequency, or drop weak pixels by a filter of the amplitude.",
+            "Give --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
+            "drop weak pixels by a filter of the amplitude.",
             {"seam_share": seam_share, "dark_share": dark_share, "period_m": period},
         )
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
+from tofuse.filters.unwrap import Unwrap, wrapped_light
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of
@@ -38,6 +39,7 @@ from tofuse.results.verdict import verdict_of
 
 _CLOUDS = 12  # views drawn, where they are clouds
 _TEXTURE = 2048  # texels, where no size is given
+_LOOKED_AT = 8  # frames, for what they hold
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Options:
     guess: Literal["identity", "previous", "odometry"] | None = None
     loops: Path | None = None
     object: bool = False
+    unwrap: bool = False
     texture: bool = False
     overwrite: bool = False
 
@@ -86,12 +89,16 @@ def run(
     _preview(recording, progress)
     config = resolve(options, view_kind(recording))
     _check_guess(options, recording)
+    if options.unwrap:
+        _check_unwrap(recording)
     config = learnt(fitted(config, recording), recording, options.threads)
     loops = (
         read_loops(options.loops, frozenset(recording.indices.tolist())) if options.loops else ()
     )
     # At the start: what is wrong with a recording is told before hours of work.
     findings = _findings(recording, turning=options.object)
+    if any(isinstance(part, Unwrap) for part in config.corrections):
+        findings = tuple(f for f in findings if f.code != "phase_wrap")
     for warning in (*recording.warnings, *(str(f) for f in findings)):
         progress.note(warning)
     kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
@@ -223,10 +230,24 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
         # The world is the object, of which neither gravity nor the camera's odometry knows.
         config = changed(config, {"outside": []}, where="--object")
+    if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
+        corrections.insert(0, {"part": "unwrap"})
     if front or corrections != chosen["corrections"]:
         lists = {"filters": [*front, *chosen["filters"]], "corrections": corrections}
         config = changed(config, lists, where="--object" if options.object else "--max-depth")
     return config
+
+
+def _check_unwrap(recording: Recording) -> None:
+    """Refuse what can't be unwrapped before work starts."""
+    frames = [f for f in recording.sample(_LOOKED_AT) if not isinstance(f, UnreadableFrameError)]
+    if not any(wrapped_light(frame, None) for frame in frames):
+        raise InputError(
+            "the recording can't be unwrapped: that needs its amplitude, and the range after which "
+            "the phase of its camera repeats",
+            where="--unwrap",
+            remedy='give "ambiguity_m" in a camera.json by --camera, or leave --unwrap out',
+        )
 
 
 def _seed(options: Options) -> int:

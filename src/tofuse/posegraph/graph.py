@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,6 @@ from tofuse.geometry import se3
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
-
-EdgeKind = Literal["odometry", "loop"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -248,14 +248,6 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
     return out
 
 
-def color_fields(color: ColorCamera) -> dict[str, Any]:
-    """Return the "color" object of camera.json."""
-    return {
-        "intrinsics": camera_fields(color.camera),
-        "T_color_depth": [[float(v) for v in row] for row in color.T_color_depth],
-    }
-
-
 class _Fields:
     """Checked access to the fields of an object, with errors that name file and field."""
 
