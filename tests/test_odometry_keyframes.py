@@ -57,7 +57,7 @@ def elsewhere():
 
 @pytest.fixture(scope="module")
 def turning_box():
-    frames = Sequence("box", range(0, 60, 10)).frames
+    frames = Sequence("box", range(0, 120, 10)).frames
     return [frame.keep(frame.z < 1.8) for frame in frames]
 
 
@@ -317,6 +317,19 @@ def test_a_thing_on_its_own_does_not_grow_or_shrink(turning_box, spoil):
     assert_marked(steps[BAD])
     assert STRETCHES[spoil] in steps[BAD].reason
     assert [step.status for step in steps].count("tracked") == len(steps) - 1
+
+
+@pytest.mark.parametrize("amplitude", [True, False], ids=["lit", "depth alone"])
+def test_what_is_nearly_its_own_mirror_image_is_told_by_how_it_turns(turning_box, amplitude):
+    frames = list(turning_box)
+    if not amplitude:
+        frames = [replace(frame, amplitude_image=None) for frame in frames]
+    clean = run(frames)
+    steps = run([*frames[:7], *map(mirrored, frames[7:])])
+    assert sum("mirrored left to right" in step.reason for step in steps[7:]) >= 3
+    for step, right in zip(steps, clean, strict=True):
+        if step.T_world_camera is not None:
+            assert_near(step, right.T_world_camera, 0.05, 3.0)
 
 
 def test_images_that_stay_turned_over_are_followed_but_get_no_pose(room):

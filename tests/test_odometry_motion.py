@@ -67,6 +67,16 @@ def test_the_mean_motion_goes_on_more_steadily() -> None:
     assert motion.steadily is None
 
 
+def test_a_jump_hardly_counts_in_the_mean() -> None:
+    poses = walk(9)
+    motion = followed(poses[:8])
+    there = elsewhere(poses[8], 0.5, 0.6)
+    motion.follow(there)
+    off = se3.log(se3.inverse(there @ STEP) @ motion.steadily)
+    assert 0.0 < np.linalg.norm(off[:3]) < 0.02
+    assert np.linalg.norm(off[3:]) < np.radians(1.3)
+
+
 @pytest.mark.parametrize(("metres", "angle"), [(0.3, 0.0), (0.0, 0.2)])
 def test_a_place_out_of_nowhere_is_a_surprise(metres, angle) -> None:
     poses = walk(8)

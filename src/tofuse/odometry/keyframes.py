@@ -50,8 +50,9 @@ _GLANCE = Level(4, 2, 0.0, 0.0)
 
 # From one frame to the next no view gets so many times deeper, nor as much nearer.
 _RESCALED = 4.0
-# An image that fits is wrong all the same if it fits so many times better otherwise.
-_CLEARLY = 1.02
+# An image that fits is wrong all the same if it fits so many times better otherwise, or, where the
+# camera would have had to jump, nearly as well.
+_CLEARLY, _NEARLY = 1.02, 0.95
 # Keyframes that are kept, so that memory stays flat, and those of them that a lost view is aligned
 # with, so that it does not cost more than ten that are not.
 _REMEMBERED, _TRIED = 40, 5
@@ -335,9 +336,9 @@ class _KeyframeTracker(Tracker):
         since = now.seconds_since(self._before)
         mended = None
         if self._is_suspicious(look, found, expected, since):
-            mended = self._mend(frame, view, expected, found)
+            mended = self._mend(frame, view, expected, found, since)
         elif expected is not None and looks_rescaled(self._glance, look):
-            mended = self._mend(frame, view, expected, found, turned=False)
+            mended = self._mend(frame, view, expected, found, since, turned=False)
         if mended is not None:
             return self._follow_mended(mended, T_odometry, now)
         if found is not None:
@@ -412,6 +413,7 @@ class _KeyframeTracker(Tracker):
         as_is: SurfaceMap,
         expected: Float64 | None,
         found: _Found | None,
+        seconds: float | None,
         *,
         turned: bool = True,
     ) -> _Mended | None:
@@ -430,7 +432,9 @@ class _KeyframeTracker(Tracker):
         wrong = wrong or mendings(self._frame, frame, se3.inverse(self._T) @ start, turned=turned)
         best, least = None, np.zeros(2)
         if found is not None:
-            least = _CLEARLY * self._scores(as_is, found.aligned, keyframe)
+            T = found.aligned.T_world_source
+            jumped = self._motion.is_surprising(T, expected, seconds)
+            least = self._scores(as_is, found.aligned, keyframe) * (_NEARLY if jumped else _CLEARLY)
         for mending in wrong:
             mended = mending(frame)
             view = surface_map(mended, options.surface)

@@ -132,7 +132,10 @@ class Motion:
         elif frames > 0:  # at the place of a surprise itself the motion is taken to go on
             self._per_frame = now = twist_between(before, T) / frames
             mean = now if self._steady is None else self._steady
-            self._steady = mean + _NEWEST * (now - mean)
+            off = now - mean
+            # A jump hardly counts: the camera does not go on jumping.
+            far = max(np.linalg.norm(off[:3]) / FLOOR[0], np.linalg.norm(off[3:]) / FLOOR[1], 1.0)
+            self._steady = mean + _NEWEST / far * off
         self._T, self._missed, self._elsewhere = T, 0, None
         return jumped
 
