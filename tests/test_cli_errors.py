@@ -201,14 +201,14 @@ def test_bad_output_folders(name, options, recording, tmp_path, capfd) -> None:
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
 def test_no_space_or_permission_for_the_output(code, recording, tmp_path, capfd, monkeypatch):
-    write = Path.write_bytes
+    open_file = Path.open
 
-    def full(self: Path, data: bytes) -> int:
-        if "rec" in self.parts:
-            return write(self, data)
+    def full(self: Path, mode: str = "r", *args: object, **named: object) -> object:
+        if "w" not in mode:
+            return open_file(self, mode, *args, **named)
         raise OSError(code, os.strerror(code), str(self))
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "open", full)
     before = listing(tmp_path)
     out = tmp_path / "out"
     said = refuses(capfd, "run", recording, "--out", out, says=(str(out), "can't be written"))

@@ -44,7 +44,7 @@ def test_trouble_becomes_one_line_with_a_remedy(
     def fail(*_args: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(Path, "write_bytes", fail)
+    monkeypatch.setattr(Path, "open", fail)
     with pytest.raises(OutputError, match=words) as caught:
         write_text(tmp_path / "a.txt", "x")
     assert str(tmp_path / "a.txt") in str(caught.value)

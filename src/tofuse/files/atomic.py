@@ -9,8 +9,12 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tofuse.errors import OutputError
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer as Buffer
 
 _counter = itertools.count()
 
@@ -58,10 +62,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise
 
 
-def write_bytes(path: str | Path, data: bytes | bytearray | memoryview) -> None:
-    """Write a whole file; see `replacing`."""
-    with replacing(path) as beside:
-        beside.write_bytes(data)
+def write_bytes(path: str | Path, *parts: Buffer) -> None:
+    """Write a whole file of parts, one after the other, which saves joining them; see `replacing`.
+
+    Arrays must be contiguous.
+    """
+    with replacing(path) as beside, beside.open("wb") as file:
+        for part in parts:
+            file.write(part)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -58,10 +58,11 @@ def write_glb(
     document, body = _document(path, points, faces, normals, color, uv, texture, name, generator)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks: list[bytes | bytearray] = [struct.pack("<I4s", len(text), b"JSON"), text]
     if body:
-        chunks += struct.pack("<I4s", len(body), b"BIN\0") + body
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        chunks += [struct.pack("<I4s", len(body), b"BIN\0"), body]
+    size = 12 + sum(len(chunk) for chunk in chunks)
+    write_bytes(path, struct.pack("<4sII", b"glTF", 2, size), *chunks)
 
 
 def write_gltf(
@@ -94,7 +95,7 @@ def _document(
     texture: bytes | None,
     name: str,
     generator: str,
-) -> tuple[dict[str, Any], bytes]:
+) -> tuple[dict[str, Any], bytearray]:
     """What glTF says of a mesh, and its buffer."""
     points, faces = np.asarray(points, np.float32), np.asarray(faces)
     columns: dict[str, NDArray[np.generic]] = {"POSITION": points}
@@ -121,7 +122,7 @@ def _document(
         "scenes": [{}],
     }
     if len(faces) == 0:
-        return document, b""
+        return document, bytearray()
     body = bytearray()
     views: list[dict[str, Any]] = []
     accessors = []
@@ -160,7 +161,7 @@ def _document(
         "bufferViews": views,
         "buffers": [{"byteLength": len(body)}],
     }
-    return document, bytes(body)
+    return document, body
 
 
 def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:

@@ -395,7 +395,7 @@ def write_ply(
         If the shapes disagree.
     """
     points = np.asarray(points, np.float32)
-    columns: dict[str, NDArray[np.generic]] = {}
+    columns: dict[str, tuple[NDArray[np.generic], str]] = {}
     groups: list[tuple[str, ArrayLike | None, str, tuple[str, ...]]] = [
         ("points", points, "<f4", ("x", "y", "z")),
         ("normals", normals, "<f4", ("nx", "ny", "nz")),
@@ -405,28 +405,30 @@ def write_ply(
         if values is not None:
             array = np.asarray(values)
             _check_shape(path, what, array, (len(points), 3))
-            columns |= {name: array[:, k].astype(dtype) for k, name in enumerate(names)}
+            columns |= {name: (array[:, k], dtype) for k, name in enumerate(names)}
     for name, values in (scalars or {}).items():
         array = np.asarray(values)
         _check_shape(path, name, array, (len(points),))
-        columns[name] = array.astype(_stored(array.dtype))
-    rows = np.empty(len(points), [(name, column.dtype) for name, column in columns.items()])
-    for name, column in columns.items():
+        columns[name] = array, _stored(array.dtype)
+    rows = np.empty(len(points), [(name, dtype) for name, (_, dtype) in columns.items()])
+    for name, (column, _) in columns.items():
         rows[name] = column
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {' '.join(c.split())}" for c in comments]
     header += [f"element vertex {len(points)}"]
-    header += [f"property {_NAMES[c.dtype.str[1:]]} {name}" for name, c in columns.items()]
-    body = rows.tobytes()
+    header += [
+        f"property {_NAMES[np.dtype(dtype).str[1:]]} {name}" for name, (_, dtype) in columns.items()
+    ]
+    body = [rows.view(np.uint8).data]
     if faces is not None:
         triangles = np.asarray(faces)
         _check_shape(path, "faces", triangles, (len(triangles), 3))
         polygon = np.empty(len(triangles), [("n", "u1"), ("items", "<i4", (3,))])
         polygon["n"], polygon["items"] = 3, triangles
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
-        body += polygon.tobytes()
+        body.append(polygon.view(np.uint8).data)
     header.append("end_header\n")
-    write_bytes(path, "\n".join(header).encode() + body)
+    write_bytes(path, "\n".join(header).encode(), *body)
 
 
 def _stored(dtype: np.dtype) -> str:

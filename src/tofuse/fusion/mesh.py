@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
+from tofuse.kernels.clustering import plane_sums
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -131,15 +132,17 @@ class Mesh:
         """Return the mesh simplified to about `faces` triangles at most."""
         if len(self.faces) <= faces:
             return self
-        corners = self.vertices[self.faces].astype(float)
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = 0.5 * float(np.linalg.norm(across, axis=1).sum())
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        across = np.cross(b - a, c - a)
+        area = 0.5 * float(np.linalg.norm(across, axis=1).sum(dtype=float))
         cell = float(np.sqrt(2 * area / faces))  # two triangles a cell, if it is flat
         while True:
-            small = self.simplified(cell)
-            if len(small.faces) <= faces:
-                return small
-            cell *= float(np.clip(np.sqrt(len(small.faces) / faces), 1.02, 2.0))
+            group, count = self._groups(cell)
+            left = self._regrouped(group)
+            if len(left) <= faces:
+                return self._merged(group, count, left, cell)
+            # Somewhat more than a flat surface would ask for, as it is not.
+            cell *= float(np.clip((len(left) / faces) ** 0.6, 1.02, 2.0))
 
     def simplified(self, cell_m: float) -> Mesh:
         """Return the mesh with the vertices in each cube of a grid put together, on either side.
@@ -149,6 +152,11 @@ class Mesh:
         """
         if len(self) == 0:
             return self
+        group, count = self._groups(cell_m)
+        return self._merged(group, count, self._regrouped(group), cell_m)
+
+    def _groups(self, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Which vertices (N,) are put together, and how many are in each group (G,)."""
         cell = np.floor(self.vertices.astype(float) / cell_m).astype(np.int64)
         cell -= cell.min(0)
         extent = cell.max(0) + 1
@@ -157,7 +165,17 @@ class Mesh:
         # The two sides of a thin sheet stay two.
         behind = np.einsum("ni,ni->n", self.normals, self.normals[first[cube]]) < _BEHIND
         _, group, count = np.unique(2 * cube + behind, return_inverse=True, return_counts=True)
+        return group, count
 
+    def _regrouped(self, group: NDArray[np.intp]) -> Int32:
+        """The faces between groups that are left of those between vertices."""
+        a, b, c = (group[self.faces[:, k]] for k in range(3))
+        left = (a != b) & (b != c) & (c != a)
+        return np.stack([a[left], b[left], c[left]], -1).astype(np.int32)
+
+    def _merged(
+        self, group: NDArray[np.intp], count: NDArray[np.intp], faces: Int32, cell_m: float
+    ) -> Mesh:
         def mean(values: NDArray[np.generic]) -> Float64:
             columns = values.reshape(len(values), -1).astype(float).T
             sums = [np.bincount(group, column, len(count)) for column in columns]
@@ -168,9 +186,6 @@ class Mesh:
         normals = mean(self.normals)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
-        faces = group[self.faces].astype(np.int32).reshape(-1, 3)
-        a, b, c = faces.T
-        faces = faces[(a != b) & (b != c) & (c != a)]
         most = np.zeros(len(count), np.int32)
         np.maximum.at(most, group, self.views)
         merged = Mesh(
@@ -189,20 +204,9 @@ class Mesh:
 
         Directions that these don't hold stay at the middle, and no place is beyond half a cell.
         """
-        corners = self.vertices[self.faces].astype(float)
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(across, axis=1)
-        n = across / np.maximum(area, 1e-12)[:, None]
         A = np.zeros((len(middles), 3, 3))
         b = np.zeros((len(middles), 3))
-        for k in range(3):
-            of = group[self.faces[:, k]]
-            # Distance of the middle from the plane, along its normal.
-            height = ((corners[:, k] - middles[of]) * n).sum(1)
-            for i in range(3):
-                b[:, i] += np.bincount(of, area * n[:, i] * height, len(middles))
-                for j in range(i, 3):
-                    A[:, i, j] += np.bincount(of, area * n[:, i] * n[:, j], len(middles))
+        plane_sums(self.vertices, self.faces, group, middles, A, b)
         A += np.triu(A, 1).transpose(0, 2, 1)
         trace = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-12)
         step = np.linalg.solve(A + _HELD * trace[:, None, None] * np.eye(3), b[..., None])[..., 0]

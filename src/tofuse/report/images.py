@@ -38,10 +38,17 @@ _VIRIDIS = np.array(
 
 def viridis(value: Float64) -> UInt8:
     """Colours (..., 3) of values from 0 to 1."""
-    place = np.clip(np.nan_to_num(value), 0, 1) * (len(_VIRIDIS) - 1)
+    place = np.clip(np.nan_to_num(value), 0, 1) * (len(_TABLE) - 1)
+    return _TABLE[np.round(place).astype(np.intp)]
+
+
+def _between(place: Float64) -> UInt8:
     low = np.minimum(place.astype(int), len(_VIRIDIS) - 2)
     t = (place - low)[..., None]
     return np.round(_VIRIDIS[low] * (1 - t) + _VIRIDIS[low + 1] * t).astype(np.uint8)
+
+
+_TABLE = _between(np.linspace(0, len(_VIRIDIS) - 1, 1025))
 
 
 def encoded(image: UInt8, *, jpeg: bool = False) -> bytes:

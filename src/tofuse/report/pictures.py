@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels.threads import run_all
 from tofuse.report.images import GONE, REMOVED, encoded, grey, viridis
 from tofuse.results import samples
 from tofuse.results.samples import FrameSample
@@ -50,8 +52,8 @@ def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
     table = np.zeros((4, 3), np.uint8)
     for fate, (color, _) in FATES.items():
         table[fate] = color
-    out = []
-    for frame in frames:
+
+    def drawn(frame: FrameSample) -> Pictures:
         depth = frame.depth.astype(float)
         picture = viridis((depth - low) / (high - low))
         picture[depth == 0] = GONE
@@ -60,5 +62,6 @@ def draw(frames: Sequence[FrameSample]) -> tuple[Pictures, ...]:
         if frame.amplitude is not None:
             images["amplitude"] = encoded(grey(frame.amplitude), jpeg=True)
         images["fate"] = encoded(table[frame.fate])
-        out.append(Pictures(frame.index, images))
-    return tuple(out)
+        return Pictures(frame.index, images)
+
+    return tuple(run_all([partial(drawn, frame) for frame in frames]))

@@ -140,14 +140,7 @@ def make_scene(
 
 def _shown(mesh: Mesh | None) -> Mesh | None:
     """The mesh with at most `MAX_FACES` faces; None where there are none."""
-    if mesh is None or len(mesh.faces) == 0:
-        return None
-    cell = 2 * float(np.median(np.abs(np.diff(mesh.vertices[mesh.faces[:1000]], axis=1)).max(2)))
-    shown = mesh
-    while len(shown.faces) > MAX_FACES:
-        shown = mesh.simplified(cell)
-        cell *= 1.4
-    return shown
+    return None if mesh is None or len(mesh.faces) == 0 else mesh.decimated(MAX_FACES)
 
 
 def packed(scene: Scene) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from tofuse.files.trajectory import write_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.fusion.upright import upright
+from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
@@ -245,25 +246,30 @@ def write_result(
     OutputError
         If a file can't be written; then nothing that was there before has changed.
     """
-    with folder.staging(instead_of=FILES) as staging:
+    # Much of either is copying and drawing in which the other can go on.
+    with folder.staging(instead_of=FILES) as staging, side_threads(1, "tofuse-writer") as beside:
+        model = beside.submit(_write_model, result, staging, texture)
         posed = result.has_pose
         write_tum(staging / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
         write_g2o(staging / "pose_graph.g2o", result.graph)
-        cloud = result.cloud
-        write_ply(
-            staging / "cloud.ply",
-            cloud.points,
-            normals=cloud.normals,
-            color=cloud.color,
-            scalars={"views": cloud.views}
-            | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
-        )
-        if result.mesh is not None:
-            _write_mesh(result.mesh, result, staging, texture)
         if report is not None:
             report(result, staging)
+        model.result()
         text = json.dumps(run_json(result), indent=1, allow_nan=False)
         (staging / "run.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _write_model(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+    cloud = result.cloud
+    write_ply(
+        folder / "cloud.ply",
+        cloud.points,
+        normals=cloud.normals,
+        color=cloud.color,
+        scalars={"views": cloud.views} | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
+    )
+    if result.mesh is not None:
+        _write_mesh(result.mesh, result, folder, texture)
 
 
 def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:

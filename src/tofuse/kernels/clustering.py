@@ -1,0 +1,60 @@
+"""Sums over the triangles around groups of vertices that are put together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float64 = NDArray[np.float64]
+
+
+@kernel
+def plane_sums(
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    group: NDArray[np.int64],
+    middles: Float64,
+    A: Float64,
+    b: Float64,
+) -> None:
+    """Add up what the planes of the triangles say of each group's place.
+
+    Each corner of a triangle adds its plane to its group, weighed by twice the triangle's area:
+    n n^T to the upper triangle of A, and n times the height of the group's middle below the plane
+    to b.
+
+    Parameters
+    ----------
+    vertices, faces
+        (N, 3) m, and (M, 3) rows of them.
+    group
+        (N,) which group a vertex is in.
+    middles
+        (G, 3) m.
+    A, b
+        (G, 3, 3) and (G, 3), zeros at first.
+    """
+    p, n = np.empty((3, 3)), np.empty(3)
+    for m in range(len(faces)):
+        for k in range(3):
+            for i in range(3):
+                p[k, i] = vertices[faces[m, k], i]
+        x0, y0, z0 = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
+        x1, y1, z1 = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
+        n[0] = y0 * z1 - z0 * y1
+        n[1] = z0 * x1 - x0 * z1
+        n[2] = x0 * y1 - y0 * x1
+        area = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        for i in range(3):
+            n[i] /= max(area, 1e-12)
+        for k in range(3):
+            g = group[faces[m, k]]
+            height = 0.0
+            for i in range(3):
+                height += (p[k, i] - middles[g, i]) * n[i]
+            for i in range(3):
+                b[g, i] += area * n[i] * height
+                for j in range(i, 3):
+                    A[g, i, j] += area * n[i] * n[j]

@@ -1,0 +1,31 @@
+"""Sums over triangles, beside a slow twin."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.kernels.clustering import plane_sums
+
+
+def test_sums_are_those_of_each_corner_s_plane() -> None:
+    rng = np.random.default_rng(0)
+    vertices = rng.normal(size=(30, 3)).astype(np.float32)
+    faces = rng.integers(0, 30, (50, 3)).astype(np.int32)
+    faces[0] = 4  # a point, without a plane
+    group = rng.integers(0, 6, 30)
+    middles = rng.normal(size=(6, 3))
+    A, b = np.zeros((7, 3, 3)), np.zeros((7, 3))
+    plane_sums(vertices, faces, group, middles, A, b)
+    wanted_A, wanted_b = np.zeros((7, 3, 3)), np.zeros((7, 3))
+    for face in faces:
+        corners = vertices[face].astype(float)
+        across = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        area = np.linalg.norm(across)
+        n = across / max(area, 1e-12)
+        for corner, vertex in zip(corners, face, strict=True):
+            g = group[vertex]
+            wanted_A[g] += area * np.triu(np.outer(n, n))
+            wanted_b[g] += area * n * (n @ (corner - middles[g]))
+    np.testing.assert_allclose(A, wanted_A, atol=1e-12)
+    np.testing.assert_allclose(b, wanted_b, atol=1e-12)
+    assert not A[6].any(), "no vertex is in the last group"
