@@ -394,7 +394,7 @@ def test_a_builder_keeps_so_much_memory_evenly() -> None:
     builder = ModelBuilder(Fusion(memory_mb=1))
     for k in range(200):
         builder.add(replace(frame, index=k), None, 1000)
-    most = 1_000_000 // size
+    most = 500_000 // size
     assert most / 2 <= builder.views <= most
     advanced = []
     model = builder.fuse(dict.fromkeys(range(200), EYE), lambda: advanced.append(1))

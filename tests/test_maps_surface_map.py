@@ -443,3 +443,13 @@ def test_a_thinned_view_is_kept_once():
     assert thin is view.thinned(44)
     assert view.thinned(88) is view
     np.testing.assert_array_equal(thin.z, view.z[1::2, 1::2])
+
+
+def test_views_without_light_share_one_image_of_it():
+    dark = [surface_map(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
+    assert dark[0].photo is dark[1].photo
+    assert dark[0].thinned(50).photo is dark[1].thinned(50).photo
+    assert not dark[0].has_photo
+    assert np.isnan(dark[0].photo).all()
+    assert np.isnan(dark[0].thinned(50).photo).all()
+    assert surface_map(wall(), OPTIONS).photo is not dark[0].photo

@@ -165,6 +165,16 @@ def test_what_is_prepared_out_of_turn_changes_nothing(
     assert [s.index for s in a.diagnostics.samples] == [s.index for s in b.diagnostics.samples]
 
 
+def test_nothing_follows_the_end(frames) -> None:
+    mapper = Mapper(CONFIG)
+    mapper.push(frames[0])
+    mapper.end()
+    with pytest.raises(InputError, match="is finished"):
+        mapper.push(frames[1])
+    mapper.end()
+    assert mapper.finish().trajectory.shape == (1, 4, 4)
+
+
 def test_clouds_and_what_does_not_fit_are_not_prepared(frames) -> None:
     assert Mapper().prepare(CloudFrame.of(np.ones((5, 3)))) is None
     assert Mapper(from_method("default", "cloud")).prepare(frames[0]) is not None

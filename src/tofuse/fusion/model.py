@@ -75,7 +75,7 @@ class ModelBuilder:
         view = RangeView.of(frame, surface)
         self._ranges.append(view)
         self._bytes += view.nbytes
-        while self._bytes > self._options.memory_mb * 1_000_000 and len(self._ranges) > 1:
+        while self._bytes > self._options.memory_mb * 500_000 and len(self._ranges) > 1:
             self._ranges = self._ranges[::2]
             self._step *= 2
             self._bytes = sum(kept.nbytes for kept in self._ranges)

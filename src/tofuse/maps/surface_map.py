@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
@@ -307,10 +307,11 @@ class SurfaceMap:
             return self._thinned[step]
         first = step // 2
         kept = (slice(first, None, step),) * 2
-        z, sigma, planes, variance, photo = (
+        z, sigma, planes, variance = (
             np.ascontiguousarray(image[kept])
-            for image in (self.z, self.sigma, self.planes, self.plane_variance, self.photo)
+            for image in (self.z, self.sigma, self.planes, self.plane_variance)
         )
+        photo = np.ascontiguousarray(self.photo[kept]) if self.has_photo else _no_photo(*z.shape)
         projection = self.projection.thinned(step)
         rays = projection.rays
         self._thinned[step] = SurfaceMap(
@@ -371,9 +372,10 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         rows,
         _chunks(rows),
     )
-    photo = np.full((rows, columns, 3), np.nan, np.float32)
+    photo = _no_photo(rows, columns)
     has_photo = light is not None
     if light is not None:
+        photo = np.full((rows, columns, 3), np.nan, np.float32)
         albedo = np.empty((rows, columns), np.float32)
         falls = lit and frame.amplitude_kind == "raw"
         albedo_image(planes, rays, light, falls, lit, albedo)
@@ -403,6 +405,12 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         has_photo,
         pixel_variance=None if shared is None else own_variance,
     )
+
+
+@lru_cache(maxsize=16)
+def _no_photo(rows: int, columns: int) -> Float32:
+    """NaN (H, W, 3), never written to: one image for all views, as there are many of them."""
+    return np.full((rows, columns, 3), np.nan, np.float32)
 
 
 def _inverse(values: Float32, known: NDArray[np.bool_]) -> Float32:

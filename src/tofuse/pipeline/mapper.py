@@ -28,6 +28,7 @@ from tofuse.pipeline.checkpoint import NotKept, Stages
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.live import LiveLoops
+from tofuse.pipeline.memory import give_back
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
@@ -176,7 +177,7 @@ class Mapper:
         self._knows_errors = False
         self._seen: dict[str, int] = {}
         self._removed: dict[str, int] = {}
-        self._finished = False
+        self._ended = self._finished = False
 
     def _begin(self) -> None:
         self._correctors = [correction.start() for correction in self.config.corrections]
@@ -390,7 +391,7 @@ class Mapper:
             self._kind = kind
 
     def _check_order(self, index: int) -> None:
-        if self._finished:
+        if self._finished or self._ended:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
         if self._records and index <= self._records[-1].index:
             raise InputError(
@@ -455,6 +456,15 @@ class Mapper:
         for record in self._records:
             progress.advance(record)
 
+    def end(self) -> None:
+        """Say that no frame follows: what only they would ask for need not be kept any longer."""
+        if not self._ended:
+            del self._tracker, self._correctors, self._history
+            self._before = None
+            self._lost.clear()
+            self._ended = True
+            give_back()
+
     def finish(self, stages: Stages | None = None) -> Reconstruction:
         """Close the loops, optimise, fuse and judge.
 
@@ -482,15 +492,18 @@ class Mapper:
         with self.watch.timing("fusion"):
             self._behind.finish()
         stages = stages or NotKept()
-        # What a stage was the last to look at makes room for the next one.
-        del self._tracker, self._correctors, self._history
+        self.end()
         with threads(self.threads):
             closed = self._staged(stages, "loops", self._close)
+            # What a stage was the last to look at makes room for the next one.
             del self._live, self._loops
+            give_back()
             refined = self._staged(stages, "refinement", lambda: self._refine(closed))
             del self._refiner
+            give_back()
             fused = self._staged(stages, "fusion", lambda: self._fuse(closed, refined))
             del self._model
+            give_back()
             return self._check_all(closed, refined, fused)
 
     def _staged(self, stages: Stages, name: str, work: Callable[[], T]) -> T:

@@ -137,6 +137,7 @@ def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages)
         tracked.done = k + 1
         if tracked.done < len(recording) and stages.due():
             _save(tracked, stages)
+    mapper.end()
     _save(tracked, stages)
 
 

@@ -218,6 +218,8 @@ class _RevisitLoops(Loops):
     def _aligned(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
         options = self._options
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
+        # Else all views would keep, until the end, what they are compared with here.
+        target, source = target.bare(), source.bare()
         there = self._align(target, source, guess, options.near)
         objection = self._objection(there)
         if objection:
