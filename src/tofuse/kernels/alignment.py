@@ -68,14 +68,14 @@ SIZE = HISTOGRAM + BINS
 LANES = 128
 _NEAREST = 0.02  # m; what comes nearer to the target's camera is not compared
 _XN, _YN, _Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
-_SEEN = _PIXEL + PIXEL_SIZE
-FITS = _SEEN + 1
+SEEN = _PIXEL + PIXEL_SIZE
+FITS = SEEN + 1
 JACOBIAN = FITS + 1
 MISFIT, DIFFERENCE = JACOBIAN + 7, JACOBIAN + 8
 STAT = DIFFERENCE + 6  # as from INLIERS to SQUARES_M
 _STATS = SQUARES_M + 1 - INLIERS
-_RATIO = STAT + _STATS
-ROOT = _RATIO + 1
+RATIO = STAT + _STATS
+ROOT = RATIO + 1
 ROWS = ROOT + 1
 
 
@@ -133,9 +133,9 @@ def accumulate(
             for k in range(LANES):
                 total[k] += row[k]
         for k in range(count):
-            if block[_SEEN * LANES + k] > 0:
+            if block[SEEN * LANES + k] > 0:
                 out[COMPARED] += 1
-                out[HISTOGRAM + histogram_bin(block[_RATIO * LANES + k])] += 1
+                out[HISTOGRAM + histogram_bin(block[RATIO * LANES + k])] += 1
     width = LANES
     while width > 1:
         width //= 2
@@ -181,7 +181,7 @@ def land(
     rows, columns = target.shape[0], target.shape[1]
     landed = 0
     for k in range(LANES):
-        block[_SEEN * LANES + k] = 0
+        block[SEEN * LANES + k] = 0
         if k >= count or not block[_Z * LANES + k] > _NEAREST:
             continue
         u, v, iu, _ = landing(block[_XN * LANES + k], block[_YN * LANES + k], lookup, lookup_frame)
@@ -190,7 +190,7 @@ def land(
         landed += 1
         pixel = target[int(v + 0.5), int(u + 0.5)]
         if pixel[DISTANCE] > 0:
-            block[_SEEN * LANES + k] = 1
+            block[SEEN * LANES + k] = 1
             for c in range(PIXEL_SIZE):
                 block[(_PIXEL + c) * LANES + k] = pixel[c]
     return landed
@@ -233,10 +233,10 @@ def distances(
         along = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * LANES + k]
         own = along * along + block[(_PIXEL + VARIANCE) * LANES + k]
         r2 = r * r
-        block[_RATIO * LANES + k] = r2 / own
+        block[RATIO * LANES + k] = r2 / own
         per_variance = one / (scale_g2 * own + slack2)
         e2 = r2 * per_variance * per_limit2
-        seen = block[_SEEN * LANES + k] > none
+        seen = block[SEEN * LANES + k] > none
         fits = seen & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= least)
         # Nearer than what the target saw there: it looked through this point.
         in_front = seen & (r < none) & (e2 > np.float32(4))

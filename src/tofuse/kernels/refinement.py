@@ -16,16 +16,34 @@ from tofuse.kernels.alignment import (
     ALBEDO,
     ALBEDO_SLOPE,
     BINS,
+    COUNT_P,
     DISTANCE,
+    INLIERS,
+    JACOBIAN,
+    LANES,
     LIGHT,
     LIGHT_SLOPE,
     NORMAL,
     PLANE,
     POINT,
+    RATIO,
+    ROWS,
+    SEEN,
     SIGMA,
+    SQUARES_G,
+    STAT,
     VARIANCE,
+    WEIGHT_G,
+    albedos,
+    distances,
     histogram_bin,
+    land,
+    load,
+    move,
 )
+from tofuse.kernels.alignment import IN_FRONT as FRONT
+from tofuse.kernels.alignment import SQUARES_P as ALBEDO_SQUARES
+from tofuse.kernels.alignment import WEIGHT_P as ALBEDO_WEIGHT
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row, landing
 
@@ -112,6 +130,12 @@ def pair_equations(
     while unknowns > 7 and known[unknowns - 8]:
         unknowns -= 1
     asked = unknowns - 7
+    if asked == 0:
+        _pose_equations(
+            points, target, lookup, lookup_frame, T, exposure, scale_g, scale_p, slack, robust,
+            min_cosine, out,
+        )  # fmt: skip
+        return
     J = np.zeros(UNKNOWNS)
     Bp = np.zeros((ERRORS, 3))
     Bq = np.zeros((ERRORS, 3))
@@ -230,6 +254,95 @@ def pair_equations(
         for o in range(p, UNKNOWNS):
             out[q] = A[p, o]
             q += 1
+
+
+@kernel
+def _pose_equations(
+    points: Float32,
+    target: Float32,
+    lookup: Float32,
+    lookup_frame: Float64,
+    T: Float64,
+    exposure: float,
+    scale_g: float,
+    scale_p: float,
+    slack: float,
+    robust: float,
+    min_cosine: float,
+    out: Float64,
+) -> None:
+    """Do the same where no error of the camera is asked for: in blocks, as `alignment` does."""
+    block = np.zeros(ROWS * LANES, np.float32)
+    # Products of the rows of J and r, then what is counted or summed of each column.
+    products, support = 36, 36 + SQUARES_G - INLIERS
+    sums = np.zeros((36 + COUNT_P + 1 - INLIERS, LANES))
+    for first in range(0, len(points), LANES):
+        count = min(LANES, len(points) - first)
+        load(block, points[first : first + count])
+        move(block, T)
+        land(block, count, target, lookup, lookup_frame)
+        distances(block, T, scale_g, slack, robust, min_cosine)
+        for k in range(count):
+            if block[SEEN * LANES + k] > 0:
+                out[COMPARED] += 1
+                out[HISTOGRAM + histogram_bin(block[RATIO * LANES + k])] += 1
+        _add_block(sums, block)
+        _add_cubes(sums[support], block, WEIGHT_G)
+        if scale_p > 0:
+            albedos(block, T, exposure, scale_p, robust)
+            _add_block(sums, block)
+            _add_cubes(sums[support], block, ALBEDO_WEIGHT)
+        for which in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
+            place = which - INLIERS
+            total = sums[products + place]
+            row = block[(STAT + place) * LANES : (STAT + place + 1) * LANES]
+            for k in range(LANES):
+                total[k] += row[k]
+    width = LANES
+    while width > 1:
+        width //= 2
+        for q in range(len(sums)):
+            low, high = sums[q, :width], sums[q, width:]
+            for k in range(width):
+                low[k] += high[k]
+    q, place = 0, H
+    for p in range(8):
+        for o in range(p, 8):
+            if p < 7 and o < 7:
+                out[place] = sums[q, 0]
+                place += 1
+            elif p < 7:
+                out[G + p] = sums[q, 0]
+            q += 1
+        place += ERRORS  # with which nothing was asked
+    out[IN_FRONT] = sums[products + FRONT - INLIERS, 0]
+    out[WEIGHT_P] = sums[products + ALBEDO_WEIGHT - INLIERS, 0]
+    out[SQUARES_P] = sums[products + ALBEDO_SQUARES - INLIERS, 0]
+    out[TERMS] = out[COMPARED] + sums[products + COUNT_P - INLIERS, 0]
+    out[SUPPORT] = sums[support, 0]
+
+
+@kernel
+def _add_block(sums: Float64, block: Float32) -> None:
+    """Add the products of the rows of J and r, column by column."""
+    q = 0
+    for p in range(8):
+        a = block[(JACOBIAN + p) * LANES : (JACOBIAN + p + 1) * LANES]
+        for o in range(p, 8):
+            b = block[(JACOBIAN + o) * LANES : (JACOBIAN + o + 1) * LANES]
+            total = sums[q]
+            for k in range(LANES):
+                total[k] += a[k] * b[k]
+            q += 1
+
+
+@kernel
+def _add_cubes(total: Float64, block: Float32, which: int) -> None:
+    """Add the cubes of the roots of robust weights: 1 where the residual is 0."""
+    place = STAT + which - INLIERS
+    row = block[place * LANES : (place + 1) * LANES]
+    for k in range(LANES):
+        total[k] += row[k] * np.sqrt(row[k])
 
 
 @kernel
