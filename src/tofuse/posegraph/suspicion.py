@@ -41,8 +41,8 @@ _LEAST_VIEWS = 8
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
 # The way to what fits may be long.
 _ROUNDS = (Round(4, 0.02, 0.1), Round(4, 0.005, 0.03), Round(6, 0.0, 0.0))
-# Errors that all views share are known from so many pairs; where there are many more, half of them
-# and a third of the points take part.
+# Errors that all views share are known from so many pairs; where there are many more, about as
+# many and a third of the points take part.
 _ENOUGH_PAIRS = 500
 
 
@@ -118,7 +118,7 @@ def suspicion(
     best: Refined | None = None
     some, few = replace(options, rounds=_ROUNDS), list(views)
     if len(pairs) > 2 * _ENOUGH_PAIRS:
-        some = replace(some, neighbours=-(-options.neighbours // 2))
+        some = replace(some, neighbours=-(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
         few = [KeptView(v.surface, np.ascontiguousarray(v.points[::3])) for v in views]
     for name in _NUMBERS:
         if sigma[_NUMBERS[name]] > _VAGUE * TOLERANCES[name]:
