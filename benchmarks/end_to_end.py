@@ -127,7 +127,7 @@ def located(name: str, data: Path) -> Path:
 
 
 def table(rows: Sequence[tuple[str, Sequence[Spent]]]) -> Iterator[str]:
-    """Medians of the runs of each method, and the stages of the median run."""
+    """Medians of the runs of each method, and below it the stages of the median run."""
     yield f"{'':<20}{'frames':>8}{'s':>8}{'ms a frame':>12}{'CPU s':>8}{'peak MB':>9}"
     for name, runs in rows:
         wall = statistics.median(run.wall_s for run in runs)
@@ -138,8 +138,11 @@ def table(rows: Sequence[tuple[str, Sequence[Spent]]]) -> Iterator[str]:
             f"{max(run.peak_mb for run in runs):>9.0f}"
         )
         rest = middle.wall_s - sum(middle.stages.values())
-        parts = {**middle.stages, "reading, writing and the rest": max(0.0, rest)}
-        yield "  " + ", ".join(f"{part} {s:.1f} s" for part, s in parts.items() if s >= 0.05)
+        for part, s in {**middle.stages, "start, writing": max(0.0, rest)}.items():
+            if s >= 0.05:
+                share = s / max(middle.wall_s, 1e-9)
+                each = 1e3 * s / max(1, middle.frames)
+                yield f"  {part:<26}{s:>8.1f}{each:>12.1f}{share:>8.0%}"
     if len(rows) > 1:
         ours, theirs = (statistics.median(r.ms_a_frame for r in runs) for _, runs in rows[:2])
         yield f"{rows[1][0]} takes {theirs / ours:.1f} times as long"

@@ -19,7 +19,7 @@ from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.paint import paint
-from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import (
     fitted,
     past_frames,
@@ -80,27 +80,31 @@ def run(
     """
     progress = progress or Silent()
     seed = _seed(options)
-    recording = open_recording(
-        *inputs, format=options.format, camera=options.camera, topic=options.topic
-    )
-    recording = recording.select(options.start, options.end, options.every)
-    if options.average_still:
-        recording = average_still(recording)
-    _preview(recording, progress)
-    config = resolve(options, view_kind(recording))
-    _check_guess(options, recording)
-    if options.unwrap:
-        _check_unwrap(recording)
-    config = learnt(fitted(config, recording), recording, options.threads)
-    loops = (
-        read_loops(options.loops, frozenset(recording.indices.tolist())) if options.loops else ()
-    )
-    # At the start: what is wrong with a recording is told before hours of work.
-    findings = _findings(recording, turning=options.object)
-    if any(isinstance(part, Unwrap) for part in config.corrections):
-        findings = tuple(f for f in findings if f.code != "phase_wrap")
-    for warning in (*recording.warnings, *(str(f) for f in findings)):
-        progress.note(warning)
+    watch = Stopwatch()
+    with watch.timing("opening"):
+        recording = open_recording(
+            *inputs, format=options.format, camera=options.camera, topic=options.topic
+        )
+        recording = recording.select(options.start, options.end, options.every)
+        if options.average_still:
+            recording = average_still(recording)
+        _preview(recording, progress)
+        config = resolve(options, view_kind(recording))
+        _check_guess(options, recording)
+        if options.unwrap:
+            _check_unwrap(recording)
+        config = learnt(fitted(config, recording), recording, options.threads)
+        loops = (
+            read_loops(options.loops, frozenset(recording.indices.tolist()))
+            if options.loops
+            else ()
+        )
+        # At the start: what is wrong with a recording is told before hours of work.
+        findings = _findings(recording, turning=options.object)
+        if any(isinstance(part, Unwrap) for part in config.corrections):
+            findings = tuple(f for f in findings if f.code != "phase_wrap")
+        for warning in (*recording.warnings, *(str(f) for f in findings)):
+            progress.note(warning)
     kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
     folder = OutputFolder(options.out, overwrite=options.overwrite or bool(kept.fresh))
     kept.begin(not is_result(options.out))
@@ -115,10 +119,15 @@ def run(
             stages=kept,
         )
         size = config.fusion.texture
-        texture = paint(recording, result, size, options.threads, progress) if size else None
+        texture = None
+        if size:
+            with watch.timing("texture"):
+                texture = paint(recording, result, size, options.threads, progress)
         if size and texture is None:
             progress.note("no texture: there is no surface, or neither colour nor amplitude")
         result = with_findings(result, findings, turning=options.object)
+        seconds = {**watch.seconds, **result.diagnostics.seconds}
+        result = replace(result, diagnostics=replace(result.diagnostics, seconds=seconds))
         progress.stage("writing")
         write_result(result, folder, lambda r, f: _report(recording, config, r, f), texture)
     except BaseException as error:
