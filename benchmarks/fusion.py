@@ -148,7 +148,7 @@ def main(arguments: list[str] | None = None) -> int:
             times = []
             for view, T in zip(views, made.poses, strict=True):
                 started = time.process_time()
-                volume.add(view, T)
+                volume.add([view], T[None])
                 times.append(time.process_time() - started)
             print(f"pass {turn + 1}: {1e3 * np.median(times):.1f} ms a frame")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

@@ -11,12 +11,12 @@ from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.fusion.upright import upright
-from tofuse.fusion.views import RangeView, without_camera_errors
+from tofuse.fusion.views import DECODED, RangeView, without_camera_errors
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole, ray_lengths
 from tofuse.kernels import tsdf
+from tofuse.kernels.blocks import block_of, voxel_of
 from tofuse.kernels.threads import threads
-from tofuse.kernels.tsdf import block_of
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 
@@ -152,11 +152,18 @@ def test_threads_change_no_byte(ball) -> None:
             assert getattr(again, name).tobytes() == getattr(mesh, name).tobytes(), name
 
 
+def pixels_of(view):
+    """(H, W, 5) plane n . p = h of each pixel as n, h, and its weight, 0 where unknown."""
+    n = view.normals / 127.0
+    along = (n[..., :2] * view.projection.rays).sum(-1) + n[..., 2]
+    weight = DECODED[view.strength] * ((view.z > 0) & (along > 0))
+    return np.concatenate([n, (view.z * view.unit * along)[..., None], weight[..., None]], -1)
+
+
 def voxels_of(volume):
     """(B, 512, 3) where the voxels are, in m."""
     ijk = np.array([block_of(int(key)) for key in volume.keys])
-    v = np.arange(512)
-    inside = np.stack([v >> 6, (v >> 3) & 7, v & 7], -1)
+    inside = np.array([voxel_of(v) for v in range(512)])
     return (8 * ijk[:, None] + inside[None]) * volume.voxel_m
 
 
@@ -176,7 +183,7 @@ def slow_distances(volume, views, poses):
             margin = np.minimum(margin, np.where(good, 0.5 - np.abs(x - np.round(x)), np.inf))
         c, r = np.round(u).astype(int), np.round(w).astype(int)
         good &= (c >= 0) & (r >= 0) & (c < 88) & (r < 72)
-        pixel = view.pixels().astype(float)[np.where(good, r, 0), np.where(good, c, 0)]
+        pixel = pixels_of(view)[np.where(good, r, 0), np.where(good, c, 0)]
         d = pixel[..., 3] - (pixel[..., :3] * p).sum(-1)
         good &= (pixel[..., 4] > 0) & (d >= -volume.reach_m)
         wt = np.where(good, pixel[..., 4], 0)
@@ -196,8 +203,7 @@ def test_distances_are_those_of_a_slow_sum_over_all_views() -> None:
         ball = sphere_range(T, np.array([0, 0, 1.2]), 0.3 if k < 2 else 0.0)
         views.append(RangeView.of(frame_of(np.minimum(wall, ball), noise=rng)))
     volume = Volume.around(views, poses, 0.01, Fusion())
-    for view, T in zip(views, poses, strict=True):
-        volume.add(view, T)
+    volume.add(views, poses)
     assert (volume.free > 0).sum() > 10
     volume.surface()  # settles what was seen through
     distance, weight, seen, margin = slow_distances(volume, views, poses)
@@ -256,8 +262,11 @@ def test_pixels_next_to_a_jump_make_no_surface() -> None:
     ranges[:, 40:] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, 40:]
     ranges[:, 40] = 1.5  # mixes both
     view = RangeView.of(frame_of(ranges))
-    assert (view.strength[10:60, 38:43] == 0).all()
-    assert (view.strength[10:60, 10:36] > 0).all()
+    weight = DECODED[view.strength[10:60]]
+    assert (weight[:, 39:42] == 0).all()
+    middle = np.median(weight[:, 10:36])
+    assert (weight[:, [38, 42]] < 0.5 * middle).all()
+    assert (weight[:, 10:36] > 0.5 * middle).all()
     mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03, island=0))
     z = mesh.vertices[:, 2]
     assert (np.minimum(np.abs(z - 1), np.abs(z - 2)) < 0.01).all()
@@ -269,12 +278,12 @@ def test_weights_follow_noise_and_incidence() -> None:
     centre = (36, 43)
     quiet = RangeView.of(frame_of(straight, sigma=0.005))
     loud = RangeView.of(frame_of(straight, sigma=0.02))
-    assert 2 < quiet.pixels()[centre][4] / loud.pixels()[centre][4] < 16
+    assert 2 < pixels_of(quiet)[centre][4] / pixels_of(loud)[centre][4] < 16
     tilted = RangeView.of(frame_of(slanted, sigma=0.005))
-    cut = tilted.pixels()[centre][4] / quiet.pixels()[centre][4]
+    cut = pixels_of(tilted)[centre][4] / pixels_of(quiet)[centre][4]
     assert cut == pytest.approx(np.cos(1.0) ** -2, rel=0.15)
     np.testing.assert_allclose(
-        tilted.pixels()[centre][:3], [np.sin(1.0), 0, np.cos(1.0)], atol=0.02
+        pixels_of(tilted)[centre][:3], [np.sin(1.0), 0, np.cos(1.0)], atol=0.02
     )
 
 
@@ -284,7 +293,7 @@ def test_weights_say_what_noise_is_left(sigma) -> None:
     rng = np.random.default_rng(6)
     view = RangeView.of(frame_of(straight, sigma=sigma, noise=rng))
     off = view.z[5:-5, 5:-5] * view.unit - 2.0
-    pixels = view.pixels()[5:-5, 5:-5].astype(float)
+    pixels = pixels_of(view)[5:-5, 5:-5].astype(float)
     lengths = np.linalg.norm(np.insert(CAMERA.rays(), 2, 1, -1), axis=-1)[5:-5, 5:-5]
     cosine = np.clip(pixels[..., 2] / lengths, 0.5, 1)
     said = 1 / (cosine * np.sqrt(np.maximum(pixels[..., 4], 1e-9)))
@@ -488,7 +497,7 @@ def test_packed_views_against_a_slow_twin() -> None:
     good = rng.random(shape) < 0.8
     normals, weights = np.full((*shape, 3), 99, np.int8), np.full(shape, -1, np.float32)
     lengths2 = (1 + (rays * rays).sum(-1)).astype(np.float32)
-    tsdf.pack_view(planes, rays, lengths2, variance, good, 0.1, 0.25, normals, weights)
+    tsdf.pack_view(planes, rays, lengths2, variance, good, 0.1, normals, weights)
     assert weights[0, 0] == 0
     assert not normals[0, 0].any()
     kept = 0
@@ -500,7 +509,7 @@ def test_packed_views_against_a_slow_twin() -> None:
         n = planes[r, c, :3].astype(float) if fitted else ray
         n = n / np.linalg.norm(n)
         cosine = n @ ray / np.linalg.norm(ray)
-        expected = (1 if fitted else 0.25) / (cosine**2 * variance[r, c])
+        expected = 1 / (cosine**2 * variance[r, c])
         expected *= good[r, c] and cosine > 0.1
         kept += expected > 0
         assert weights[r, c] == pytest.approx(expected, rel=1e-4)

@@ -30,7 +30,7 @@ def fit(w, rays, weight, radii=(2, 5), limit=1e-6, fill=0.7, offset=0.2):
     quality = np.full((*w.shape, 2), 7, np.float32)
     for start, stop in ((0, 11), (11, w.shape[0])):
         fit_planes(
-            w, rays, weight, np.array(radii), limit, fill, offset,
+            w, rays, weight, weight > -1, np.array(radii), limit, fill, offset,
             planes, quality, start, stop,
         )  # fmt: skip
     return planes, quality
@@ -118,7 +118,9 @@ def test_fits_are_the_same_however_the_rows_are_shared_out():
         planes = np.empty((30, 40, 4), np.float32)
         quality = np.empty((30, 40, 2), np.float32)
         for a, b in itertools.pairwise(bounds):
-            fit_planes(w, rays, weight, np.array([2, 5]), 2.0, 0.7, 0.2, planes, quality, a, b)
+            fit_planes(
+                w, rays, weight, weight > 0, np.array([2, 5]), 2.0, 0.7, 0.2, planes, quality, a, b
+            )
         found.append(planes)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5, atol=1e-6)
     assert (found[0][5:-5, 5:-5, 3] > 0).mean() > 0.9

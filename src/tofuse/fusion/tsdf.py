@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +12,42 @@ from numpy.typing import NDArray
 from tofuse.fusion.cloud import grey_of
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
-from tofuse.fusion.views import RangeView
+from tofuse.fusion.views import DECODED, RangeView
 from tofuse.geometry import se3
-from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
-from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.tsdf import (
+from tofuse.kernels.blocks import (
     EDGE,
     EMPTY,
     VOXELS,
-    integrate,
+    enter,
+    index_of,
+    mark_eighths,
     neighbours_of,
-    ray_cells,
-    settle_free,
-    touch_blocks,
 )
+from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
+from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.tsdf import integrate, near_cubes, open_view, settle_free
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 _CHUNKS = 16
+_AT_ONCE = 16  # views
+# Where a view shows no surface near by, at most every 4th one counts, and four times: of hundreds
+# that see through a place all say the same. One of every so many more views is left out.
+_TURNS, _PER_TURN = 4, 32
+# How far apart points along a normal may be that stand for all of it: as a share of a block's edge,
+# and of an eighth's.
+_OF_BLOCKS, _OF_CUBES = 0.34, 0.6
+_MOST_SEEN = 65535  # views that a voxel can count
+# Pixels by which a camera that keeps lines straight may bend them, from one node to the next.
+_STRAIGHT = 1e-3
+# And within how many nodes any other one bends them little.
+_LINEAR_NODES = 2.0
 # Nearer cuts would take off more of the noise on one side of a surface than on the other.
 _REACH_SIGMAS = 3.0
 _LARGEST_REACH = 8.0  # voxels: the noise of a bad sensor is no reason to fill space
-_KNOWN = 1.5  # voxels: the largest standard deviation of a surface
+_KNOWN = 2.0  # voxels: the largest standard deviation of a surface
 # How much larger voxels get when there are too many.
 _COARSER = 1.25
 
@@ -66,6 +79,8 @@ class Volume:
         (B,) the blocks, ascending.
     distance, weight, seen, color, free
         See `tofuse.kernels.tsdf.integrate`.
+    turns, added
+        Every how-many-th view says what it saw through, and how many have been added.
     """
 
     voxel_m: float
@@ -76,6 +91,13 @@ class Volume:
     seen: NDArray[np.uint16]
     color: Float32
     free: Float32
+    turns: int = 1
+    added: int = 0
+
+    @cached_property
+    def index(self) -> tuple[Int64, NDArray[np.int32]]:
+        """Where the row of a block is found by its key."""
+        return index_of(self.keys)
 
     @classmethod
     def around(
@@ -90,6 +112,7 @@ class Volume:
         most = max(1, options.memory_mb * 1_000_000 // block_bytes)
         noise = [view.sigma_m for view in views if view.sigma_m > 0]
         sigma = float(np.median(noise)) if noise else 0.0
+        turns = int(np.clip(len(views) // _PER_TURN, 1, _TURNS))
         while True:
             reach = voxel_m * float(
                 np.clip(
@@ -98,7 +121,7 @@ class Volume:
                     max(_LARGEST_REACH, options.reach),
                 )
             )
-            keys = _touched(views, poses, EDGE * voxel_m, reach, most)
+            keys = _touched(views, poses, EDGE * voxel_m, reach, most, turns)
             if keys is not None:
                 break
             voxel_m = float(f"{_COARSER * voxel_m:.3g}")
@@ -112,29 +135,93 @@ class Volume:
             np.zeros((blocks, VOXELS), np.uint16),
             np.zeros((blocks, VOXELS, channels), np.float32),
             np.zeros((blocks, 8), np.float32),
+            turns,
         )
 
-    def add(self, view: RangeView, T_world_camera: Float64) -> None:
-        """Add a view at its pose (4, 4)."""
+    def add(
+        self,
+        views: Sequence[RangeView],
+        poses: Float64,
+        advance: Callable[[], None] | None = None,
+    ) -> None:
+        """Add views at their poses (N, 4, 4), in order; `advance` is called after each."""
+        start = 0
+        while start < len(views):
+            stop = start + 1
+            while (
+                stop < min(len(views), start + _AT_ONCE)
+                and views[stop].projection is views[start].projection
+            ):
+                stop += 1
+            self._add(views[start:stop], poses[start:stop])
+            for _ in range(start, stop):
+                if advance is not None:
+                    advance()
+            start = stop
+
+    def _add(self, views: Sequence[RangeView], poses: Float64) -> None:
+        """Add a few views of one camera at once: a block is then fetched once for all of them."""
         if len(self.keys) == 0:
             return
-        projection = view.projection
-        pixels = view.pixels()
-        light = view.light_image(self.color.shape[2])
-        lookup = projection.lookup
-        cells = np.empty((lookup.shape[0] - 1, lookup.shape[1] - 1, 3), np.float32)
-        ray_cells(pixels, projection.rays, projection.frame, self.reach_m, cells)
-        T = se3.inverse(T_world_camera)
+        count, (rows, columns) = len(views), views[0].z.shape
+        projection = views[0].projection
+        heights = np.empty((count, rows * columns + 1), np.float32)
+        codes = np.empty((count, rows * columns + 1), np.int32)
+        grid = np.array(projection.lookup.shape[:2]) - 1
+        cells = np.empty((count, *grid, 3), np.float32)
+        coarse = np.empty((count, *-(-grid // 4), 3), np.float32)
+        channels = self.color.shape[2]
+        light = np.zeros((count, rows * columns, channels), np.float32)
+
+        def open_views(a: int, b: int) -> None:
+            for s in range(a, b):
+                view = views[s]
+                open_view(
+                    view.z,
+                    view.unit,
+                    view.normals,
+                    view.strength,
+                    DECODED,
+                    projection.rays,
+                    projection.frame,
+                    self.reach_m,
+                    heights[s],
+                    codes[s],
+                    cells[s],
+                    coarse[s],
+                )
+                if self.turns > 1:
+                    cubes = _near(view, poses[s], edge, self.reach_m, _OF_CUBES, self.added + s, 2)
+                    mark_eighths(cubes, *self.index, near[s])
+                # Albedo says nothing where the others have colour.
+                if view.light is not None and channels == view.channels:
+                    light[s] = view.light.reshape(-1, channels)
+
+        near = np.zeros((count, len(self.keys)), np.uint8)
+        edge = 0.5 * EDGE * self.voxel_m
+        run_chunks(open_views, count, count)
+        if self.added + count > _MOST_SEEN:
+            np.minimum(self.seen, _MOST_SEEN - count, out=self.seen)
+        T = np.array([se3.inverse(T_world_camera) for T_world_camera in poses])
+        nodes = _straight_nodes(projection.lookup)
         run_chunks(
             lambda a, b: integrate(
                 self.keys,
                 self.voxel_m,
                 T,
-                pixels,
+                heights,
+                codes,
+                DECODED,
+                near,
+                self.added,
+                self.turns,
                 light,
-                lookup,
+                (rows, columns),
+                projection.lookup,
                 projection.frame,
+                nodes,
                 cells,
+                coarse,
                 self.reach_m,
                 self.distance,
                 self.weight,
@@ -147,6 +234,7 @@ class Volume:
             len(self.keys),
             _CHUNKS,
         )
+        self.added += count
 
     def surface(self, min_views: int = 1) -> Mesh:
         """Return where the distances change sign, between voxels that views saw.
@@ -252,17 +340,65 @@ class Volume:
         return run(np.cumsum(counts) - counts, found, fill=True)
 
 
+def _straight_nodes(lookup: Float32) -> float:
+    """Within how many nodes of a lookup a linear function will do."""
+    bends = [np.abs(np.diff(lookup, 2, axis)) for axis in (0, 1)]
+    if max(bend.max() for bend in bends) < _STRAIGHT:
+        return float(np.inf)
+    return _LINEAR_NODES
+
+
 def _touched(
-    views: Sequence[RangeView], poses: Float64, block_m: float, reach: float, most: int
+    views: Sequence[RangeView],
+    poses: Float64,
+    block_m: float,
+    reach: float,
+    most: int,
+    turns: int,
 ) -> Int64 | None:
     """Keys of the blocks near surfaces, ascending; None if there are more than `most`."""
-    table, count = np.full(1 << 12, EMPTY, np.int64), 0
-    for view, T in zip(views, poses, strict=True):
-        pixels = view.pixels()
-        table, count = touch_blocks(pixels, view.projection.rays, T, block_m, reach, table, count)
-        if count > most:
-            return None
-    return np.sort(table[table != EMPTY])
+
+    def touched(start: int, stop: int) -> Int64:
+        table, count = np.full(1 << 12, EMPTY, np.int64), 0
+        for k in range(start, stop):
+            keys = _near(views[k], poses[k], block_m, reach, _OF_BLOCKS, k, min(turns, 2))
+            table, count = enter(table, count, keys)
+            if count > most:
+                break
+        return table[table != EMPTY]
+
+    if not views:
+        return np.zeros(0, np.int64)
+    keys = np.unique(np.concatenate(run_chunks(touched, len(views), _CHUNKS)))
+    return keys if len(keys) <= most else None
+
+
+def _near(
+    view: RangeView,
+    T_world_camera: Float64,
+    cube_m: float,
+    reach: float,
+    spacing: float,
+    number: int,
+    stride: int,
+) -> Int64:
+    """Keys of the cubes near to what a view shows, by every `stride`-th pixel.
+
+    Views with other numbers begin with another one.
+    """
+    return near_cubes(
+        view.z,
+        view.unit,
+        view.normals,
+        view.strength,
+        view.projection.rays,
+        T_world_camera,
+        cube_m,
+        reach,
+        spacing,
+        (number % stride, number // stride % stride),
+        stride,
+    )
 
 
 def fuse_surface(
@@ -288,8 +424,5 @@ def fuse_surface(
     """
     options = options or Fusion()
     volume = Volume.around(views, poses, options.voxel_m or fitting_voxel(views), options)
-    for view, T in zip(views, poses, strict=True):
-        volume.add(view, T)
-        if advance is not None:
-            advance()
+    volume.add(views, poses, advance)
     return volume.surface(options.min_views).without_islands(options.island)

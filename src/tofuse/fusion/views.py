@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.kernels.tsdf import pack_view, unpack_view
+from tofuse.kernels.middle import median
+from tofuse.kernels.tsdf import pack_view
 from tofuse.maps.surface_map import (
     Projection,
     SurfaceMap,
     SurfaceOptions,
     surface_map,
+    with_noisy_planes,
 )
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 
@@ -23,15 +25,20 @@ Float32 = NDArray[np.float32]
 
 # Weights, in 1/m^2, are kept as logarithms: six steps an octave, from 2^-14 on.
 _STEPS, _LEAST = 6.0, -14.0
-_DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS + _LEAST)].astype(np.float32)
+DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS + _LEAST)].astype(np.float32)
 # Below this cosine of the incidence a pixel's light comes from too much of the surface.
 _LEAST_COSINE = 0.1
 # Size of what surfaces have of relief within a window of a few pixels, as a share of the depth.
 _DETAIL = 0.002
 # Two neighbours differ by more than so many sigmas only where there are two surfaces.
 _JUMP_SIGMAS = 4.0
-# Where no plane could be fitted little is known of the surface.
-_UNFITTED = 0.25
+# Pixels near a jump count so many times: they are wanted where nothing else was seen.
+_RIM = 0.1
+# Sigmas within which a pixel measured a plane. A filter that thins out a noisy surface is overruled
+# there, next to what it left; what it cuts off stays away.
+_ON_PLANE = 3.0
+# Planes where the tracker has none: of windows that may be less full, and less even.
+_FILL, _OFFSET = 0.4, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +91,14 @@ class RangeView:
         options = options or SurfaceOptions()
         if surface is None:
             surface = surface_map(frame, options)
+        surface = with_noisy_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
         shape = surface.z.shape
         valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
+        valid |= _on_planes(surface) & _widened(valid, 1)
         smoothed, variance = _smoothed(surface)
         z = np.where(valid, smoothed, np.float32(0))
-        good = (z > 0) & (surface.sigma > 0) & ~_near_jumps(surface, options)
+        jump = _jumps(surface, options)
+        good = (z > 0) & (surface.sigma > 0) & ~jump
         normals = np.empty((*shape, 3), np.int8)
         weight = np.empty(shape, np.float32)
         pack_view(
@@ -98,10 +108,10 @@ class RangeView:
             variance,
             good,
             _LEAST_COSINE,
-            _UNFITTED,
             normals,
             weight,
         )
+        weight[_widened(jump, options.edge_margin)] *= _RIM
         good = weight > 0
         farthest = float(z.max(initial=0.0))
         unit = max(farthest, 1e-3) / 65535
@@ -114,7 +124,7 @@ class RangeView:
             normals,
             _encoded(weight),
             _light(frame, shape),
-            float(np.sqrt(np.median(variance[good]))) if good.any() else 0.0,
+            _typical_sigma(variance, good),
         )
 
     @property
@@ -140,24 +150,6 @@ class RangeView:
         if self.light is None:
             return 0
         return 3 if self.light.ndim == 3 else 1
-
-    def pixels(self) -> Float32:
-        """(H, W, 5) plane n . p = h of each pixel as n, h, and its weight, 0 where unknown."""
-        out = np.zeros((*self.z.shape, 5), np.float32)
-        unpack_view(
-            self.z, self.unit, self.normals, self.strength, _DECODED, self.projection.rays, out
-        )
-        return out
-
-    def light_image(self, channels: int) -> Float32:
-        """(H, W, channels) light as float32: the root of the albedo, or RGB; 0 where unknown.
-
-        Albedo says nothing where the others have colour.
-        """
-        out = np.zeros((*self.z.shape, channels), np.float32)
-        if self.light is not None and channels == self.channels:
-            out[:] = self.light.reshape(*self.z.shape, -1)
-        return out
 
     def as_cloud(self, pixels: int | None = None) -> CloudFrame:
         """Return the valid pixels as a cloud; its amplitude falls with the square of the range.
@@ -204,18 +196,38 @@ def _smoothed(surface: SurfaceMap) -> tuple[Float32, Float32]:
     return np.asarray(plane + gain * (z - plane), np.float32), np.asarray(variance, np.float32)
 
 
-def _near_jumps(surface: SurfaceMap, options: SurfaceOptions) -> NDArray[np.bool_]:
-    """Pixels next to jumps in depth: by a share of it, and by more than the noise makes."""
+def _jumps(surface: SurfaceMap, options: SurfaceOptions) -> NDArray[np.bool_]:
+    """Both sides of jumps in depth: by a share of it, and by more than the noise makes."""
     z, variance = surface.z, np.square(surface.sigma)
-    jump = np.zeros(z.shape, np.uint8)
+    jump = np.zeros(z.shape, bool)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         step = np.abs(z[a] - z[b])
         across = (z[a] > 0) & (z[b] > 0) & (step > options.edge_jump * np.minimum(z[a], z[b]))
         across &= step * step > _JUMP_SIGMAS**2 * (variance[a] + variance[b])
         jump[a] |= across
         jump[b] |= across
-    size = 2 * options.edge_margin + 1
-    return cv2.dilate(jump, np.ones((size, size), np.uint8)) > 0
+    return jump
+
+
+def _typical_sigma(variance: Float32, good: NDArray[np.bool_]) -> float:
+    """Of every fourth pixel, or of all if none of these is good."""
+    for step in (2, 1):
+        some = variance[::step, ::step][good[::step, ::step]]
+        if len(some):
+            return float(np.sqrt(median(some)))
+    return 0.0
+
+
+def _on_planes(surface: SurfaceMap) -> NDArray[np.bool_]:
+    """Pixels that measured the plane around them, as far as their noise tells."""
+    on_plane = surface.planes[..., 3]
+    off = np.abs(surface.z * on_plane - np.float32(1)) * surface.z
+    return (on_plane > 0) & (surface.z > 0) & (off <= np.float32(_ON_PLANE) * surface.sigma)
+
+
+def _widened(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
+    size = 2 * margin + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
 
 def without_camera_errors(

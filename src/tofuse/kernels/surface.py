@@ -97,6 +97,7 @@ def fit_planes(
     w: Float32,
     rays: Float32,
     weight: Float32,
+    wanted: NDArray[np.bool_],
     radii: NDArray[np.int64],
     limit: float,
     fill: float,
@@ -106,9 +107,9 @@ def fit_planes(
     start: int,
     stop: int,
 ) -> None:
-    """Fit a plane at each pixel of rows start..stop: its slope over the widest window that is one
-    surface, its depth over the smallest.
+    """Fit a plane at each `wanted` pixel of rows start..stop.
 
+    Its slope is that over the widest window that is one surface, its depth that over the smallest.
     The slope needs many pixels, as noise in it acts like noise in the motion. The depth does not,
     and a wide window would bend curved surfaces, more in some views than in others, which drags
     the motion.
@@ -153,7 +154,7 @@ def fit_planes(
             planes[i, j, 3] = 0
             quality[i, j, 0] = np.nan
             quality[i, j, 1] = 0
-            if weight[i, j] <= 0:
+            if weight[i, j] <= 0 or not wanted[i, j]:
                 continue
             x0 = np.float64(rays[i, j, 0])
             y0 = np.float64(rays[i, j, 1])

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels.blocks import EDGE, VOXELS, block_of, voxel_at, voxel_of
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.tsdf import EDGE, VOXELS, block_of
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -26,7 +26,7 @@ _SIDE = EDGE + 1
 def _place(i: int, j: int, k: int) -> tuple[int, int]:
     """Neighbour and voxel of (i, j, k), each from -1 to EDGE, seen from a block."""
     n = 9 * ((i >> 3) + 1) + 3 * ((j >> 3) + 1) + (k >> 3) + 1
-    return n, ((i & 7) << 6) | ((j & 7) << 3) | (k & 7)
+    return n, voxel_at(i & 7, j & 7, k & 7)
 
 
 @kernel
@@ -77,9 +77,7 @@ def mark_cells(
             continue
         number = 0
         for v in range(VOXELS):
-            i = v >> 6
-            j = (v >> 3) & 7
-            k = v & 7
+            i, j, k = voxel_of(v)
             below = 0
             above = 0
             most = 0
@@ -140,9 +138,7 @@ def make_vertices(
         for v in range(VOXELS):
             if cells[b, v] < 0:
                 continue
-            i = v >> 6
-            j = (v >> 3) & 7
-            k = v & 7
+            i, j, k = voxel_of(v)
             tint[:] = 0
             amount = 0.0
             total = 0.0
@@ -221,9 +217,7 @@ def make_faces(
     for b in range(start, stop):
         number = 0
         for v in range(VOXELS):
-            i = v >> 6
-            j = (v >> 3) & 7
-            k = v & 7
+            i, j, k = voxel_of(v)
             if cells[b, v] < 0:
                 continue
             d0 = distance[b, v]

@@ -42,6 +42,9 @@ _LEAST_NOISE = 3e-4
 # An alignment takes pixels for independent. Where so many share an error, they tell together what
 # each of them would with that many times its variance.
 _SHARE_ERROR = 100.0
+# The typical noise does not stand for pixels with so many times as much; to fit planes to them is
+# worth its time where they are this share of a view.
+_NOISIER, _WORTH_FITTING = 2.0, 0.02
 # Of the absolute values of a normal distribution, in standard deviations.
 _MEDIAN_OF_NORMAL = 0.6745
 
@@ -356,6 +359,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     if options.edge_margin:
         jump = max(options.edge_jump, options.edge_sigmas * noise)
         weight[_near_edges(w, jump, options.edge_margin)] = 0
+    known = weight > 0
     rows, columns = z.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
@@ -367,7 +371,18 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
     limit = options.misfit * max(scale, _scale_at(options.flatness, z, sigma))
     run_chunks(
         lambda a, b: fit_planes(
-            w, rays, weight, radii, limit, options.fill, options.offset, planes, quality, a, b
+            w,
+            rays,
+            weight,
+            known,
+            radii,
+            limit,
+            options.fill,
+            options.offset,
+            planes,
+            quality,
+            a,
+            b,
         ),
         rows,
         _chunks(rows),
@@ -386,13 +401,8 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
             rows,
             _chunks(rows),
         )
-    variance = quality[..., 1] * np.float32(scale)
     shared = _shared_sigma(frame, projection.lengths2)
-    own_variance = variance
-    if shared is not None:
-        once = (shared * planes[..., 3] ** 2) ** 2
-        own_variance = variance + once
-        variance = variance + np.float32(_SHARE_ERROR) * once
+    variance, own_variance = _with_shared(quality[..., 1] * np.float32(scale), planes, shared)
     return SurfaceMap(
         frame.index,
         rays,
@@ -403,7 +413,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         photo,
         projection,
         has_photo,
-        pixel_variance=None if shared is None else own_variance,
+        pixel_variance=own_variance,
     )
 
 
@@ -411,6 +421,94 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
 def _no_photo(rows: int, columns: int) -> Float32:
     """NaN (H, W, 3), never written to: one image for all views, as there are many of them."""
     return np.full((rows, columns, 3), np.nan, np.float32)
+
+
+def with_noisy_planes(
+    surface: SurfaceMap, frame: RangeFrame, options: SurfaceOptions
+) -> SurfaceMap:
+    """Return the view of `frame` with planes also where it is noisier than its typical pixel.
+
+    `surface_map` takes what differs by more than the typical noise for a jump in depth: a tracker
+    does well to leave out what is so uncertain. Here a jump is what differs by more than the noise
+    of the pixels beside it, as long as one of these is not much noisier than the other. Planes that
+    were fitted before stay. Returns `surface` itself where hardly any pixel is noisier than others.
+    """
+    z, known = surface.z, (surface.z > 0) & (surface.sigma > 0)
+    if not known.any():
+        return surface
+    w = _inverse(z, known)
+    noise = np.where(known, surface.sigma * w, np.float32(0))
+    typical = median(noise[known])
+    missing = known & (surface.planes[..., 3] == 0)
+    if np.count_nonzero(missing & (noise > _NOISIER * typical)) < _WORTH_FITTING * z.size:
+        return surface
+    options = options.for_noise(float(np.sqrt(2) * typical))
+    edge = _noisy_edges(w, noise, options)
+    missing &= ~edge
+    weight = _inverse((noise * w) ** 2, known & ~edge)
+    rows, columns = z.shape
+    planes = np.empty((rows, columns, 4), np.float32)
+    quality = np.empty((rows, columns, 2), np.float32)
+    limit = options.misfit * max(1.0, _scale_at(options.flatness, z, surface.sigma))
+    radii = np.array(options.radii, np.int64)
+    run_chunks(
+        lambda a, b: fit_planes(
+            w,
+            surface.rays,
+            weight,
+            missing,
+            radii,
+            limit,
+            options.fill,
+            options.offset,
+            planes,
+            quality,
+            a,
+            b,
+        ),
+        rows,
+        _chunks(rows),
+    )
+    new = missing & (planes[..., 3] > 0)
+    shared = _shared_sigma(frame, surface.projection.lengths2)
+    variance, own = _with_shared(quality[..., 1], planes, shared)
+    return replace(
+        surface,
+        planes=np.where(new[..., None], planes, surface.planes),
+        plane_variance=np.where(new, variance, surface.plane_variance),
+        pixel_variance=None
+        if own is None or surface.pixel_variance is None
+        else np.where(new, own, surface.pixel_variance),
+    )
+
+
+def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> NDArray[np.bool_]:
+    """As `_near_edges`, where each pixel has a noise (H, W) of its own, as a share of its depth."""
+    edge = np.zeros(w.shape, np.uint8)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        n, m = noise[a] ** 2, noise[b] ** 2
+        # A quiet surface ends where a noisy one begins.
+        differs = np.float32(options.edge_sigmas) * np.sqrt(np.minimum(n + m, 4 * np.minimum(n, m)))
+        share = np.minimum(np.maximum(differs, np.float32(options.edge_jump)), np.float32(0.9))
+        across = np.abs(w[a] - w[b]) > share * np.maximum(w[a], w[b])
+        edge[a] |= across
+        edge[b] |= across
+    return _widened(edge, options.edge_margin)
+
+
+def _widened(edge: NDArray[np.uint8], margin: int) -> NDArray[np.bool_]:
+    size = 2 * margin + 1
+    return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
+
+
+def _with_shared(
+    variance: Float32, planes: Float32, shared: Float32 | None
+) -> tuple[Float32, Float32 | None]:
+    """Variances of planes where pixels also share errors: for alignments, and of one pixel."""
+    if shared is None:
+        return variance, None
+    once = (shared * planes[..., 3] ** 2) ** 2
+    return variance + np.float32(_SHARE_ERROR) * once, variance + once
 
 
 def _inverse(values: Float32, known: NDArray[np.bool_]) -> Float32:
@@ -509,8 +607,7 @@ def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
         across = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
-    size = 2 * margin + 1
-    return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
+    return _widened(edge, margin)
 
 
 def _typical_noise(w: Float32, weight: Float32) -> float:
@@ -566,9 +663,10 @@ def _noise_scale(w: Float32, rays: Float32, weight: Float32, radius: int) -> flo
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
     values = []
+    known = weight > 0
     radii = np.array([radius], np.int64)
     for i in range(radius, rows - radius, max(1, rows // 12)):
-        fit_planes(w, rays, weight, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
+        fit_planes(w, rays, weight, known, radii, np.inf, 0.7, 0.2, planes, quality, i, i + 1)
         values.append(quality[i, :, 0])
     found = np.concatenate(values) if values else np.zeros(0)
     found = found[np.isfinite(found)]

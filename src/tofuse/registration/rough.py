@@ -28,12 +28,15 @@ def with_rough_planes(view: SurfaceMap) -> SurfaceMap:
     z[(view.z <= 0) | (np.abs(z - view.z) > 5 * _ROUGH * view.z)] = 0
     w = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
     weight = np.divide(1, (_ROUGH * w) ** 2, out=np.zeros_like(z), where=z > 0)
+    known = weight > 0
     rows, columns = z.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
     radii = np.array([max(2, round(_WINDOW * columns))], np.int64)
     run_chunks(
-        lambda a, b: fit_planes(w, view.rays, weight, radii, 1.0, 0.7, 0.2, planes, quality, a, b),
+        lambda a, b: fit_planes(
+            w, view.rays, weight, known, radii, 1.0, 0.7, 0.2, planes, quality, a, b
+        ),
         rows,
         _CHUNKS,
     )

@@ -1,0 +1,135 @@
+"""Sparse blocks of voxels, known by keys in open-addressed tables (Nießner et al. 2013).
+
+Space is cut into blocks of 8 x 8 x 8 voxels, of which only those near surfaces are kept. A block is
+known by a 63-bit key; tables of keys are probed linearly. A block's voxels are numbered by eighths:
+those of each 4 x 4 x 4 are neighbours in memory.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Int64 = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+
+EDGE = 8  # voxels along the edge of a block
+VOXELS = EDGE**3
+EMPTY = -1  # of a table of keys
+HALF = 1 << 20  # blocks reach from minus this to below it along each axis
+_MASK = (1 << 21) - 1
+
+
+@kernel
+def block_key(i: int, j: int, k: int) -> int:
+    """Key of the block (i, j, k), each from -2^20 to 2^20 - 1."""
+    return ((i + HALF) << 42) | ((j + HALF) << 21) | (k + HALF)
+
+
+@kernel
+def block_of(key: int) -> tuple[int, int, int]:
+    """Block (i, j, k) of a key."""
+    return (key >> 42) - HALF, ((key >> 21) & _MASK) - HALF, (key & _MASK) - HALF
+
+
+@kernel
+def slot_of(table: Int64, key: int) -> int:
+    """Where `key` is in the table (a power of two long), or the empty place where it belongs."""
+    # Fibonacci hashing: the upper bits of the product depend on all bits of the key.
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    mask = len(table) - 1
+    slot = np.int64(mixed >> np.uint64(32)) & mask
+    while table[slot] != EMPTY and table[slot] != key:
+        slot = (slot + 1) & mask
+    return int(slot)
+
+
+@kernel
+def _grown(table: Int64) -> Int64:
+    larger = np.full(2 * len(table), EMPTY, np.int64)
+    for key in table:
+        if key != EMPTY:
+            larger[slot_of(larger, key)] = key
+    return larger
+
+
+@kernel
+def voxel_at(i: int, j: int, k: int) -> int:
+    """Number of the voxel (i, j, k), each from 0 to 7, within its block."""
+    eighth = (i & 4) << 6 | (j & 4) << 5 | (k & 4) << 4
+    return int(eighth | (i & 3) << 4 | (j & 3) << 2 | (k & 3))
+
+
+@kernel
+def voxel_of(number: int) -> tuple[int, int, int]:
+    """Voxel (i, j, k) of a number."""
+    i = (number >> 6) & 4 | (number >> 4) & 3
+    j = (number >> 5) & 4 | (number >> 2) & 3
+    k = (number >> 4) & 4 | number & 3
+    return i, j, k
+
+
+@kernel
+def enter(table: Int64, count: int, keys: Int64) -> tuple[Int64, int]:
+    """Enter keys: the table, a larger one if it had to grow, and how many it holds now."""
+    for key in keys:
+        slot = slot_of(table, key)
+        if table[slot] == EMPTY:
+            table[slot] = key
+            count += 1
+            if 2 * count > len(table):
+                table = _grown(table)
+    return table, count
+
+
+@kernel
+def parent_of(key: int) -> tuple[int, int]:
+    """Key of the block that holds a cube half as large, and which eighth of it that is."""
+    i, j, k = block_of(key)
+    return block_key(i >> 1, j >> 1, k >> 1), (i & 1) << 2 | (j & 1) << 1 | (k & 1)
+
+
+@kernel
+def index_of(keys: Int64) -> tuple[Int64, Int32]:
+    """Table of distinct keys, and the row of each."""
+    size = 16
+    while size < 2 * len(keys):
+        size *= 2
+    table = np.full(size, EMPTY, np.int64)
+    rows = np.full(size, -1, np.int32)
+    for b in range(len(keys)):
+        slot = slot_of(table, keys[b])
+        table[slot] = keys[b]
+        rows[slot] = b
+    return table, rows
+
+
+@kernel
+def mark_eighths(cubes: Int64, table: Int64, rows: Int32, marks: NDArray[np.uint8]) -> None:
+    """Set the bits of eighths of blocks, in `marks` (B,), given the keys of cubes of their size.
+
+    `table` and `rows` are those of `index_of`; blocks that are not in there are passed over.
+    """
+    for cube in cubes:
+        key, eighth = parent_of(cube)
+        slot = slot_of(table, key)
+        if table[slot] == key:
+            marks[rows[slot]] |= np.uint8(1 << eighth)
+
+
+@kernel
+def neighbours_of(keys: Int64, out: Int32) -> None:
+    """Rows of the 27 blocks around each block, itself in the middle; -1 where there is none.
+
+    `keys` (B,) are distinct. Column 9 a + 3 b + c of `out` (B, 27) is the block at the offset
+    (a - 1, b - 1, c - 1).
+    """
+    table, rows = index_of(keys)
+    for b in range(len(keys)):
+        i, j, k = block_of(keys[b])
+        for n in range(27):
+            key = block_key(i + n // 9 - 1, j + n // 3 % 3 - 1, k + n % 3 - 1)
+            slot = slot_of(table, key)
+            out[b, n] = rows[slot] if table[slot] == key else -1
