@@ -85,6 +85,11 @@ class ModelBuilder:
         """How many views are kept."""
         return len(self._ranges) + len(self._clouds)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the images of these views take."""
+        return self._bytes
+
     def fuse(
         self,
         poses: Mapping[int, Float64],
