@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.fusion import tsdf as fusing
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
@@ -15,8 +16,16 @@ from tofuse.fusion.views import DECODED, RangeView, without_camera_errors
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole, ray_lengths
 from tofuse.kernels import tsdf
-from tofuse.kernels.blocks import block_of, voxel_of
+from tofuse.kernels.blocks import (
+    block_key,
+    block_of,
+    index_of,
+    mark_eighths,
+    parent_of,
+    voxel_of,
+)
 from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 
@@ -515,3 +524,100 @@ def test_packed_views_against_a_slow_twin() -> None:
         assert weights[r, c] == pytest.approx(expected, rel=1e-4)
         assert np.abs(normals[r, c] - 127 * n).max() < 0.51
     assert 10 < kept < good.sum()
+
+
+def half_dark(rng):
+    """A wall 2 m away, known to 4 mm on the left and to 60 mm on the right."""
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    sigma = np.full(ranges.shape, 0.004, np.float32)
+    sigma[:, 50:] = 0.06
+    depth = (ranges + sigma * rng.standard_normal(ranges.shape)).astype(np.float32)
+    return RangeFrame(0, 0.0, CAMERA, depth, "range", sigma_image=sigma)
+
+
+def test_a_dark_wall_gets_planes_and_weights_of_its_own_noise() -> None:
+    frame = half_dark(np.random.default_rng(7))
+    view = RangeView.of(frame)
+    dark, bright = np.s_[6:-6, 56:-6], np.s_[6:-6, 6:44]
+    off = view.z * view.unit - 2.0
+    assert np.abs(off[dark]).mean() < 0.02  # a pixel alone is off by 0.048
+    assert (view.strength[dark] > 0).mean() > 0.95
+    weight = DECODED[view.strength]
+    ratio = np.median(weight[bright]) / np.median(weight[dark])
+    assert 10 < ratio < 1000
+
+
+def test_filters_that_thin_out_are_overruled_on_planes_but_not_those_that_cut_off() -> None:
+    rng = np.random.default_rng(8)
+    frame = half_dark(rng)
+    mask = rng.random(frame.valid.shape) < 0.4
+    mask[:, :20] = False
+    view = RangeView.of(frame.keep(mask), surface_map(frame, SurfaceOptions()))
+    assert (view.strength[4:-4, 24:-4] > 0).mean() > 0.93
+    assert not view.strength[:, :18].any()
+
+
+def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
+    frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
+    # Each also sees one pixel in front of the ball, which the others see through.
+    for k, frame in enumerate(frames):
+        frame.depth[30 + k % 12, 40 + k % 7] = 0.6
+    views = [RangeView.of(f) for f in frames]
+    options = Fusion(voxel_m=0.012, island=0)
+    turned = Volume.around(views, poses, 0.012, options)
+    assert turned.turns == 2
+    found = fuse_surface(views, poses, options)
+    monkeypatch.setattr(fusing, "_TURNS", 1)
+    full = Volume.around(views, poses, 0.012, options)
+    assert full.turns == 1
+    assert len(turned.keys) > 0.97 * len(full.keys)  # lone pixels may be passed over
+    assert np.isin(turned.keys, full.keys).all()
+    expected = fuse_surface(views, poses, options)
+    for mesh in (found, expected):
+        r = np.linalg.norm(mesh.vertices.astype(float), axis=1)
+        assert np.abs(r - 0.3).mean() < 0.0015
+        assert np.abs(r - 0.3).max() < 0.03
+    assert abs(len(found) - len(expected)) < 0.01 * len(expected)
+    # The same weights in the mean, both where the surface is and where there is none.
+    for volume in (turned, full):
+        volume.add(views, poses)
+        volume.surface()
+    common = np.isin(full.keys, turned.keys)
+    near = np.abs(full.distance[common]) < 0.006
+    np.testing.assert_allclose(
+        turned.weight[near & (turned.weight > 0)].mean(),
+        full.weight[common][near & (full.weight[common] > 0)].mean(),
+        rtol=0.03,
+    )
+    assert turned.weight.sum() == pytest.approx(full.weight[common].sum(), rel=0.1)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_cubes_near_a_surface_against_a_slow_twin(stride) -> None:
+    rng = np.random.default_rng(9)
+    view = RangeView.of(frame_of(rng.uniform(1, 3, (72, 88))))
+    T = look([0.3, -0.2, 0.1], [0.5, 0.4, 2.0])
+    first = (1 % stride, 0)
+    keys = tsdf.near_cubes(
+        view.z, view.unit, view.normals, view.strength, view.projection.rays,
+        T, 0.05, 0.04, 0.5, first, stride,
+    )  # fmt: skip
+    expected = set()
+    steps = int(np.ceil(0.08 / 0.025))
+    for r in range(first[0], 72, stride):
+        for c in range(first[1], 88, stride):
+            if view.z[r, c] == 0 or view.strength[r, c] == 0:
+                continue
+            p = view.z[r, c] * view.unit * np.array([*view.projection.rays[r, c], 1.0])
+            for t in np.linspace(-0.04, 0.04, steps + 1):
+                q = se3.transform(T, (p + t * view.normals[r, c] / 127)[None])[0]
+                expected.add(block_key(*(int(n) for n in np.floor(q / 0.05))))
+    assert len(expected) > 200
+    both = expected & set(keys.tolist())
+    assert len(both) > 0.998 * max(len(expected), len(set(keys.tolist())))  # but for rounding
+    marks = np.zeros(2, np.uint8)
+    parents = np.array(sorted({parent_of(k)[0] for k in expected}))[:2]
+    mark_eighths(keys, *index_of(parents), marks)
+    for parent, mark in zip(parents, marks, strict=True):
+        eighths = {parent_of(k)[1] for k in set(keys.tolist()) if parent_of(k)[0] == parent}
+        assert mark == sum(1 << e for e in eighths)
