@@ -39,42 +39,55 @@ def _judged(
     ty: float,
     tz: float,
     reach: float,
+    node: NDArray[np.int32],
 ) -> float:
-    """Support less twice the free-space violation, of points that are turned already."""
-    rows, columns = grid.shape[0], grid.shape[1]
-    x0, y0, sx, sy = frame[0], frame[1], frame[2], frame[3]
-    top, left = columns - 0.5, rows - 0.5
-    per2 = 1.0 / (reach * reach)
-    total = 0.0
-    for k in range(points.shape[0]):
-        z = points[k, 2] + tz
-        if z <= _NEAREST:
+    """Support less twice the free-space violation, of points that are turned already.
+
+    Points and normals are (3, N), so that several points are projected at once; `node` (N,) is
+    where their places in the image, row by row, are kept meanwhile.
+    """
+    rows, columns = np.int32(grid.shape[0]), np.int32(grid.shape[1])
+    mx, my, mz = np.float32(tx), np.float32(ty), np.float32(tz)
+    su, sv = np.float32(frame[2]), np.float32(frame[3])
+    u0, v0 = np.float32(0.5 - frame[0] * frame[2]), np.float32(0.5 - frame[1] * frame[3])
+    nearest, none, one = np.float32(_NEAREST), np.float32(0), np.float32(1)
+    px, py, pz = points[0], points[1], points[2]
+    n0, n1, n2 = normals[0], normals[1], normals[2]
+    # What is beyond is cut here, so that it has a place in an integer.
+    far_u, far_v = np.float32(columns), np.float32(rows)
+    for k in range(len(node)):
+        z = pz[k] + mz
+        before = z > nearest
+        inverse = one / z if before else none
+        u = (px[k] + mx) * inverse * su + u0
+        v = (py[k] + my) * inverse * sv + v0
+        inside = before & (u > none) & (v > none) & (u < far_u) & (v < far_v)
+        j = np.int32(u if inside else none)
+        i = np.int32(v if inside else none)
+        node[k] = i * columns + j if inside else np.int32(-1)
+    planes = grid.reshape(grid.size // 4, 4)
+    reach32 = np.float32(reach)
+    per2 = np.float32(1.0 / (reach * reach))
+    two = np.float32(2)
+    total = none
+    for k in range(len(node)):
+        at = node[k]
+        if at < 0:
             continue
-        x = points[k, 0] + tx
-        y = points[k, 1] + ty
-        inverse = 1.0 / z
-        u = (x * inverse - x0) * sx
-        v = (y * inverse - y0) * sy
-        if not (u > -0.5 and v > -0.5 and u < top and v < left):
+        plane = planes[at]
+        d = plane[3]
+        z = pz[k] + mz
+        if d <= none:
+            if d < none and z < -d - reach32:
+                total -= two
             continue
-        i = int(v + 0.5)
-        j = int(u + 0.5)
-        d = grid[i, j, 3]
-        if d <= 0:
-            if d < 0 and z < -d - reach:
-                total -= 2.0
-            continue
-        r = grid[i, j, 0] * x + grid[i, j, 1] * y + grid[i, j, 2] * z - d
-        if r < -reach:
-            total -= 2.0
-        elif r < reach:
-            c = (
-                grid[i, j, 0] * normals[k, 0]
-                + grid[i, j, 1] * normals[k, 1]
-                + grid[i, j, 2] * normals[k, 2]
-            )
-            if c > 0:
-                total += c * (1.0 - r * r * per2)
+        r = plane[0] * (px[k] + mx) + plane[1] * (py[k] + my) + plane[2] * z - d
+        if r < -reach32:
+            total -= two
+        elif r < reach32:
+            c = plane[0] * n0[k] + plane[1] * n1[k] + plane[2] * n2[k]
+            if c > none:
+                total += c * (one - r * r * per2)
     return total
 
 
@@ -112,33 +125,34 @@ def score_grid(
         (A, B), written: support less twice the violations, as a share of all points.
     """
     n, m = source_points.shape[0], target_points.shape[0]
-    P = np.empty((n, 3), np.float32)
-    PN = np.empty((n, 3), np.float32)
-    Q = np.empty((m, 3), np.float32)
-    QN = np.empty((m, 3), np.float32)
+    P = np.empty((3, n), np.float32)
+    PN = np.empty((3, n), np.float32)
+    Q = np.empty((3, m), np.float32)
+    QN = np.empty((3, m), np.float32)
+    nodes = np.empty(n, np.int32), np.empty(m, np.int32)
     share = 1.0 / max(n + m, 1)
     for a in range(start, stop):
         R = rotations[a]
         for k in range(n):
             for i in range(3):
-                P[k, i] = (
+                P[i, k] = (
                     R[i, 0] * source_points[k, 0]
                     + R[i, 1] * source_points[k, 1]
                     + R[i, 2] * source_points[k, 2]
                 )
-                PN[k, i] = (
+                PN[i, k] = (
                     R[i, 0] * source_normals[k, 0]
                     + R[i, 1] * source_normals[k, 1]
                     + R[i, 2] * source_normals[k, 2]
                 )
         for k in range(m):
             for i in range(3):
-                Q[k, i] = (
+                Q[i, k] = (
                     R[0, i] * target_points[k, 0]
                     + R[1, i] * target_points[k, 1]
                     + R[2, i] * target_points[k, 2]
                 )
-                QN[k, i] = (
+                QN[i, k] = (
                     R[0, i] * target_normals[k, 0]
                     + R[1, i] * target_normals[k, 1]
                     + R[2, i] * target_normals[k, 2]
@@ -146,12 +160,12 @@ def score_grid(
         row = min(a, translations.shape[0] - 1)
         for b in range(translations.shape[1]):
             t = translations[row, b]
-            total = _judged(P, PN, target_grid, target_frame, t[0], t[1], t[2], reach)
+            total = _judged(P, PN, target_grid, target_frame, t[0], t[1], t[2], reach, nodes[0])
             # The inverse moves by -R^T t.
             sx = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
             sy = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
             sz = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
-            total += _judged(Q, QN, source_grid, source_frame, sx, sy, sz, reach)
+            total += _judged(Q, QN, source_grid, source_frame, sx, sy, sz, reach, nodes[1])
             scores[a, b] = total * share
 
 
