@@ -18,8 +18,10 @@ from tofuse.files.images import read_image
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import BrownConrady, Pinhole
+from tofuse.inspection import channels
 from tofuse.inspection.finding import CODES, Finding
 from tofuse.inspection.inspect import inspect_recording
+from tofuse.inspection.sample import Sample
 from tofuse.pipeline.run import with_findings
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -322,6 +324,29 @@ def test_a_wrong_focal_length_is_measured(factor) -> None:
         said = tofuse.inspect(of(seen_by(frames, wrong))).findings
         (found,) = [f for f in said if f.code == "focal_length"]
         assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
+
+
+@pytest.mark.parametrize("boxes", [False, True])
+def test_colour_beside_depth_is_told_only_where_one_place_fits_best(boxes: bool) -> None:
+    """Edges that all run the same way fit anywhere along themselves."""
+    camera = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
+    rng = np.random.default_rng(61)
+    frames = []
+    for k in range(4):
+        depth = np.full((120, 160), 2.0, np.float32)
+        grey = np.full((120, 160), 60, np.uint8)
+        for at in rng.integers(15, 120, 4):
+            top, bottom = int(rng.integers(10, 60)), int(rng.integers(70, 110))
+            rows = slice(top, bottom) if boxes else slice(None)
+            depth[rows, at : at + 18] -= 0.3
+            grey[rows, at + 10 : at + 28] += 45  # 10 pixels beside
+        depth += rng.normal(0, 0.002, depth.shape).astype(np.float32)
+        color = np.repeat(grey[..., None], 3, -1)
+        frames.append(RangeFrame(k, k / 10, camera, depth, color_image=color))
+    found = list(channels.check_color(Sample.of(of(frames), 8)))
+    assert [f.code for f in found] == ["color_unregistered"] * boxes
+    if found:
+        assert found[0].evidence["shift_px"] == pytest.approx(10, abs=1.5)
 
 
 def test_how_the_camera_moves() -> None:

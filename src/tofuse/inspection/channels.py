@@ -29,9 +29,11 @@ _LEAST_CORRELATION, _LEAD, _SIGMAS = 0.15, 0.06, 4.0
 # Shift of colour that matters, as a share of the width, and what is looked for at most.
 _SHIFT, _MOST_SHIFT = 0.02, 0.12
 _FEWEST = 3
-# What edges of colour must reach elsewhere, and by how much more than where they are: edges in one
-# direction fit at many places.
-_COLOR_FITS, _COLOR_LEAD = 0.42, 0.18
+# What edges of colour must reach elsewhere, by how much more than where they are, and what share of
+# it they may reach there, or anywhere that many pixels beside: edges in one direction fit at many
+# places.
+_COLOR_FITS, _COLOR_LEAD, _COLOR_HERE = 0.42, 0.16, 0.68
+_ELSEWHERE, _BESIDE_PIXELS = 0.95, 4
 # How much better edges correlate beside each other if the camera moved.
 _BESIDE = 0.03
 
@@ -78,7 +80,13 @@ def check_color(sample: Sample) -> Iterator[Finding]:
     lead = maps[:, i, j] - maps[:, reach, reach]
     error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
     shift = float(np.hypot(i - reach, j - reach)) / columns
-    if mean[i, j] < _COLOR_FITS:
+    down, right = np.mgrid[: mean.shape[0], : mean.shape[1]]
+    elsewhere = mean[np.hypot(down - i, right - j) > _BESIDE_PIXELS].max()
+    if (
+        mean[i, j] < _COLOR_FITS
+        or mean[reach, reach] > _COLOR_HERE * mean[i, j]
+        or elsewhere > _ELSEWHERE * mean[i, j]
+    ):
         return
     if shift > _SHIFT and lead.mean() > max(_COLOR_LEAD, _SIGMAS * error):
         pixels = shift * pairs[0][0].camera.width

@@ -34,7 +34,7 @@ _FEWEST_PAIRS, _MOST_PAIRS = 6, 12
 _TRIED = np.array([-0.42, -0.28, -0.14, 0.0, 0.14, 0.28, 0.42])
 _HERE = 3
 # How much better the views must agree, in score, and by how many standard deviations.
-_LEAD, _LEAD_SIGMAS, _SIGMAS = 0.02, 1.5, 3.0
+_LEAD, _LEAD_SIGMAS, _SIGMAS = 0.015, 1.5, 3.0
 _LEAST, _AGREES, _WELL = 0.08, 0.5, 0.75
 
 
@@ -58,10 +58,10 @@ def check_focal(sample: Sample) -> Iterator[Finding]:
         return
     lead = scores[:, best] - scores[:, _HERE]
     error = float(lead.std(ddof=1)) / np.sqrt(len(lead))
-    # Jackknife: what it would be without each of the pairs (Efron 1982).
-    tops = np.array([_top(np.delete(scores, k, 0).mean(0)) for k in range(len(scores))])
+    # Jackknife: what it would be without each of the pairs (Efron 1982), about the same top.
+    tops = np.array([_top(np.delete(scores, k, 0).mean(0), best) for k in range(len(scores))])
     sigma = float(np.sqrt((len(tops) - 1) * tops.var()))
-    log_scale = _top(scores.mean(0))
+    log_scale = _top(scores.mean(0), best)
     if lead.mean() > max(_LEAD, _LEAD_SIGMAS * error) and abs(log_scale) > max(
         _LEAST, _SIGMAS * sigma
     ):
@@ -69,15 +69,12 @@ def check_focal(sample: Sample) -> Iterator[Finding]:
         yield wrong_focal(factor, factor * max(sigma, 0.01), "frames disagree")
 
 
-def _top(score: Float64) -> float:
-    """Where the parabola through the best score and its neighbours is highest."""
-    best = int(score.argmax())
-    if not 0 < best < len(score) - 1:
-        return float(_TRIED[best])
+def _top(score: Float64, best: int) -> float:
+    """Where the parabola through an inner score and its neighbours is highest."""
     a, b, c = score[best - 1 : best + 2]
     bend = a - 2 * b + c
     shift = 0.0 if bend >= 0 else 0.5 * (a - c) / bend
-    return float(_TRIED[best] + np.clip(shift, -0.5, 0.5) * (_TRIED[1] - _TRIED[0]))
+    return float(_TRIED[best] + np.clip(shift, -1.0, 1.0) * (_TRIED[1] - _TRIED[0]))
 
 
 def _turned_pairs(sample: Sample) -> list[Pair]:

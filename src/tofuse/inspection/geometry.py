@@ -14,8 +14,8 @@ from tofuse.inspection.sample import Sample
 # Of the exponent that says z (0) from range (1 or -1): how far off it may be, how well known.
 _KIND_WITHIN, _KIND_SIGMA = 0.3, 0.12
 # Rays off by less don't matter; by less than so many standard deviations they may not be.
-_STRETCH, _FOCAL = 0.035, 0.05
-_SIGMAS = 4.0
+_STRETCH, _FOCAL = 0.045, 0.05
+_STRETCH_SIGMAS, _SIGMAS = 3.0, 4.0
 _SMALLEST = -0.8
 _FEWEST_SURFACES = 4
 # Planes that fit worse than this, as a share of the depth, under any lens, are none.
@@ -81,7 +81,7 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
     ):
         yield wrong_focal(1 / (1 + scale), scale_sigma, "planes bend")
         return
-    if abs(stretch) > max(_STRETCH, _SIGMAS * sigma):
+    if abs(stretch) > max(_STRETCH, _STRETCH_SIGMAS * sigma):
         yield Finding(
             "lens_distortion",
             f"Planes bend as under a lens that is not corrected: rays at the corners are off by "

@@ -17,7 +17,7 @@ _FEWEST_FRAMES = 3
 # Neighbours that share less than this part of the image, or move by more than this part of it.
 _OVERLAP, _FAST = 0.5, 0.2
 # Part of the image that something new stands in, in this part of the pairs.
-_MOVED, _OFTEN = 0.025, 0.5
+_MOVED, _OFTEN = 0.015, 0.5
 _FITS_WELL = 0.65
 # Part of the pixels of a view of a single plane that are on it.
 _WALL_SHARE = 0.8
