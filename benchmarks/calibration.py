@@ -46,7 +46,7 @@ def main() -> None:
             )
             print(f"| {name} | {seed} | {lens_row(recording, model)} |")
             depths.append(f"| {name} | {seed} | {depth_row(recording, model)} |")
-    print("\nCurve's error in mm rms, but for its mean and slope in brackets\n")
+    print("\nErrors in mm rms: curve (but for its mean and slope), offsets of single pixels\n")
     print("| camera | seed | before | board on wall | board | wall |")
     print("|---|---|---|---|---|---|")
     print("\n".join(depths))
@@ -77,7 +77,8 @@ def depth_row(recording: Recording, model: CameraModel) -> str:
     cells, before = [], ""
     for way in ways:
         try:
-            fit = calibrate_depth(*way())
+            views, camera = way()
+            fit = calibrate_depth(views, camera)
         except InputError as error:
             cells.append(str(error))
             continue
@@ -85,8 +86,14 @@ def depth_row(recording: Recording, model: CameraModel) -> str:
         bias = np.interp(r, true.range_m, true.bias_m) + true.pixel_bias_m.mean()
         error = np.interp(r, fit.correction.range_m, fit.correction.bias_m) - bias
         bent = error - np.polyval(np.polyfit(r, error, 1), r)
-        before = before or f"{1000 * rms(bias):.1f}"
-        cells.append(f"{1000 * rms(error):.2f} ({1000 * rms(bent):.2f})")
+        # Offsets of pixels that were seen; their mean is the curve's.
+        seen = np.zeros(true.pixel_bias_m.size, bool)
+        seen[np.concatenate([view.pixels for view in views])] = True
+        assert fit.correction.pixel_bias_m is not None
+        own = true.pixel_bias_m.ravel()[seen].astype(float)
+        left = own - fit.correction.pixel_bias_m.ravel()[seen]
+        before = before or f"{1000 * rms(bias):.1f}, {1000 * own.std():.1f}"
+        cells.append(f"{1000 * rms(error):.2f} ({1000 * rms(bent):.2f}), {1000 * left.std():.2f}")
     return f"{before} | " + " | ".join(cells)
 
 

@@ -12,6 +12,7 @@ second. The peak memory of the whole process is printed at the end.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import resource
 import shutil
 import signal
@@ -29,6 +30,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import test_recordings_fuzz as folders  # noqa: E402
 import test_recordings_fuzz_cameras as cameras  # noqa: E402
+import test_recordings_ros as bags  # noqa: E402
 from tofuse.errors import TofuseError  # noqa: E402
 from tofuse.geometry.cameras import Pinhole  # noqa: E402
 from tofuse.recordings.frames import RangeFrame  # noqa: E402
@@ -43,7 +45,19 @@ def makers() -> dict[str, tuple[Callable[[Path], None], str | None]]:
         name: (make, None) for name, make in folders.MAKERS.items()
     }
     found |= {name: (make, file) for name, (make, file, _) in cameras.MAKERS.items()}
+    if importlib.util.find_spec("rosbags") is not None:
+        found |= {"realsense": (make_realsense, "a.bag"), "orbbec": (make_orbbec, "a.bag")}
     return found
+
+
+def make_realsense(path: Path) -> None:
+    path.parent.mkdir(parents=True)
+    bags.real_sense(path.parent, "ros1", "None", name="Intel RealSense L515", color="rgb8")
+
+
+def make_orbbec(path: Path) -> None:
+    path.parent.mkdir(parents=True)
+    bags.orbbec(path.parent, (0.0,) * 8, color="jpeg", R=bags.T_COLOR[:3, :3])
 
 
 class TooSlowError(Exception):

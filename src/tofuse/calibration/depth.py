@@ -35,6 +35,9 @@ _HUBER = 2.0  # standard deviations
 # What is believed beforehand, standard deviations in m: of the curve, of its bend from knot to
 # knot, of the offsets; of the curve's mean and slope, where no plane's pose is known.
 _CURVE_M, _BEND_M, _OFFSET_M = 0.1, 0.004, 0.02
+# Where boards' poses tell a slope over the image, pixels are free while planes are estimated: what
+# is believed of thousands of them would outweigh the poses.
+_ANY_OFFSET_M, _MEAN_OFFSET_M = 1.0, 1e-4
 _MEAN_M, _SLOPE = 0.002, 0.001
 _FLOOR_M = 0.001  # of the noise
 _LEAST_SPREAD_M = 0.3
@@ -226,6 +229,7 @@ def _solved(
     planes, curve = start.copy(), np.zeros(many) if held is None else held.copy()
     offsets = np.zeros(len(pixels))
     prior = _prior(knots, posed=_posed(views))
+    believed = _ANY_OFFSET_M if _posed(views) else _OFFSET_M
     size = many + 3 * len(views)
     n = len(measured)
     covariance = np.zeros((many, many))
@@ -249,11 +253,17 @@ def _solved(
         target = residual + offsets[pixel]
         right = AtW @ target
         by_pixel = csr_array((weight, (pixel, np.arange(n))), (len(pixels), n))
-        total = by_pixel.sum(1) + 1 / _OFFSET_M**2
+        total = by_pixel.sum(1) + 1 / believed**2
         if held is None:
             coupled = by_pixel @ A
             normal -= (coupled.T @ (diags_array(1 / total) @ coupled)).toarray()
-            right -= coupled.T @ ((by_pixel @ target) / total)
+            alone = (by_pixel @ target) / total
+            right -= coupled.T @ alone
+            # Their mean is the curve's: held at 0, by the formula of Sherman and Morrison.
+            held_mean = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
+            together = coupled.T @ (1 / total)
+            normal += held_mean * np.outer(together, together)
+            right += held_mean * together * alone.sum()
             normal[:many, :many] += prior
             right[:many] -= prior @ curve
         for k, view in enumerate(views):
@@ -269,7 +279,8 @@ def _solved(
         curve = curve + step[:many]
         planes = planes + step[many:].reshape(-1, 3)
         if held is None:
-            offsets = (by_pixel @ (target - A @ step)) / total
+            alone = (by_pixel @ (target - A @ step)) / total
+            offsets = alone - held_mean * alone.sum() / total
             inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
             covariance = (inverse * unit[:, None] * unit)[:many, :many]
     weights = (np.bincount(left, minlength=many) + 1e-9).astype(np.float64)
