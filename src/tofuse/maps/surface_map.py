@@ -530,19 +530,20 @@ def _reduced(
     z = frame.z
     z = np.where(frame.valid & (z > _NEAREST) & (z < _FARTHEST), z, np.float32(0))
     light = _light(frame)
-    variance = _own_variance(frame)
+    sigma = _own_sigma(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
-        halves = _halved(z, z if light is None else light, z if variance is None else variance)
+        variance = z if sigma is None else sigma * sigma
+        halves = _halved(z, z if light is None else light, variance)
         z = halves[0]
         light = None if light is None else halves[1]
-        variance = None if variance is None else halves[2]
+        sigma = None if sigma is None else np.sqrt(halves[2])
         step *= 2
     projection = _projection(frame.camera, step)
     if step > 1 and projection.unknown is not None:
         # The mean of a block of rays that holds an unknown one is unknown.
         z[projection.unknown] = 0
-    return projection, z, light, None if variance is None else np.sqrt(variance)
+    return projection, z, light, sigma
 
 
 def _light(frame: RangeFrame) -> Float32 | None:
@@ -560,14 +561,14 @@ def _light(frame: RangeFrame) -> Float32 | None:
     return np.where(seen, grey, 0).astype(np.float32)
 
 
-def _own_variance(frame: RangeFrame) -> Float32 | None:
-    """Variance of z that the frame states, m^2; 0 where it does not."""
+def _own_sigma(frame: RangeFrame) -> Float32 | None:
+    """Sigma of z that the frame states, m; 0 where it does not."""
     if frame.sigma_image is None:
         return None
     known = (frame.sigma_image > _LEAST_SIGMA) & (frame.sigma_image < _FARTHEST)
     # The noise is that of the range, along the ray.
     sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
-    return np.asarray(sigma * sigma, np.float32)
+    return np.asarray(sigma, np.float32)
 
 
 def _shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.kernels.middle import median
 from tofuse.recordings.frames import RangeFrame
 
 Float32 = NDArray[np.float32]
@@ -116,16 +117,14 @@ def glance(z: Float32) -> Float32:
 
 def looks_turned_over(before: Float32, now: Float32) -> bool:
     """Whether a view looks more like the one before it if it is mirrored, or turned over."""
-    straight = _apart(before, now)
-    return any(_apart(before, now[o]) < _MUCH_ALIKE * straight for o in _ORDERS.values())
+    ways = np.stack([now, *(now[order] for order in _ORDERS.values())])
+    # An unknown depth is as good as any that is far off.
+    straight, *turned = np.fmin(np.abs(before - ways), np.float32(_FARTHEST)).mean((1, 2))
+    return bool(min(turned) < _MUCH_ALIKE * straight)
 
 
 def looks_rescaled(before: Float32, now: Float32) -> bool:
     """Whether a view's depths are not what they were just before, in the median."""
     difference = now - before
     known = difference[np.isfinite(difference)]
-    return len(known) > 0 and abs(float(np.median(known))) > math.log(_SAME_SCALE)
-
-
-def _apart(a: Float32, b: Float32) -> float:
-    return float(np.fmin(np.abs(a - b), np.float32(_FARTHEST)).mean())
+    return len(known) > 0 and abs(median(known)) > math.log(_SAME_SCALE)
