@@ -88,7 +88,7 @@ def _judged(
             c = plane[0] * n0[k] + plane[1] * n1[k] + plane[2] * n2[k]
             if c > none:
                 total += c * (one - r * r * per2)
-    return total
+    return float(total)
 
 
 @kernel
