@@ -5,7 +5,9 @@ saturation only (`--all`: with all errors of the camera). The surface is made at
 poses, and (`--estimated`) at those of the default method; errors are the distances to the true
 surface. Completeness is the share of the truth within 1 cm of the model: of what was seen by a
 pixel that is valid (this camera gives noise where there is too little light), and of what the
-filters keep. Then one pass over the views
+filters keep. Where Open3D is installed, its own fusion gets the same frames, filtered, at the same
+poses, with voxels of the same size; it is shown with all surfaces and with those of three views.
+Then one pass over the views
 is fused again and again, to see whether a frame costs the same in a volume that has been filled.
 Times are of one thread, process time.
 
@@ -18,6 +20,7 @@ more are taken in the same room.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import resource
 import sys
 import time
@@ -90,10 +93,10 @@ def method(everything: bool) -> Config:
 
 def views_of(
     frames: list[RangeFrame], config: Config
-) -> tuple[list[RangeView], list[NDArray[np.bool_]]]:
-    """What the method keeps of the frames for fusion, and which pixels its filters leave."""
+) -> tuple[list[RangeView], list[NDArray[np.bool_]], list[RangeFrame]]:
+    """What the method keeps of frames, which pixels its filters leave, and the corrected frames."""
     correctors = [correction.start() for correction in config.corrections]
-    views, masks = [], []
+    views, masks, corrected = [], [], []
     for frame in frames:
         for corrector in correctors:
             frame = corrector.apply(frame)
@@ -102,19 +105,24 @@ def views_of(
         assert isinstance(clean, RangeFrame)
         views.append(RangeView.of(clean, surface))
         masks.append(clean.valid)
-    return views, masks
+        corrected.append(frame)
+    return views, masks, corrected
 
 
-def row(label: str, mesh: Mesh, truth: Shape, seen: Float64, kept: Float64) -> str:
+def shape_of(mesh: Mesh) -> Shape:
+    """The mesh as what is compared."""
+    return Shape(mesh.vertices, mesh.faces)
+
+
+def row(label: str, shape: Shape, truth: Shape, seen: Float64, kept: Float64) -> str:
     """One line of the table."""
-    shape = Shape(mesh.vertices, mesh.faces)
     found = compare_surfaces(shape, truth, seen=kept)
     recall = (distances(seen, shape) <= found.threshold_m).mean()
     return (
         f"{label:<16} {1e3 * found.accuracy_m:7.1f} {1e3 * found.accuracy_median_m:7.1f} "
         f"{1e3 * found.accuracy_p95_m:7.1f} {100 * found.precision:7.1f} {100 * recall:9.1f} "
         f"{100 * found.recall:9.1f} {100 * found.fscore:7.1f} {100 * found.outliers:8.3f} "
-        f"{len(mesh.faces):9,}"
+        f"{len(shape.faces) if shape.faces is not None else 0:9,}"
     )
 
 
@@ -188,7 +196,7 @@ def main(arguments: list[str] | None = None) -> int:
     T_world_truth = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
     truth = Shape(se3.transform(T_world_truth, vertices), faces)
     config = method(options.all)
-    views, masks = views_of(frames, config)
+    views, masks, corrected = views_of(frames, config)
     seen = seen_by(made, [frame.valid for frame in frames], frames)
     kept = seen_by(made, masks, frames)
     print(f"{len(frames)} frames; {len(seen):,} cm^3 with surface seen, {len(kept):,} kept")
@@ -196,14 +204,21 @@ def main(arguments: list[str] | None = None) -> int:
         f"{'poses':<16} {'mean mm':>7} {'median':>7} {'95 %':>7} {'<1cm %':>7} {'of seen %':>9} "
         f"{'of kept %':>9} {'F':>7} {'>5cm %':>8} {'faces':>9}"
     )
-    print(row("true", fuse_surface(views, made.poses), truth, seen, kept))
+    print(row("true", shape_of(fuse_surface(views, made.poses)), truth, seen, kept), flush=True)
+    if importlib.util.find_spec("open3d"):
+        from peers import o3d
+
+        clean = [frame.keep(mask) for frame, mask in zip(corrected, masks, strict=True)]
+        for least in (1.0, 3.0):
+            peer = Shape(*o3d.fused(clean, made.poses, fitting_voxel(views), least))
+            print(row(f"Open3D, weight {least:.0f}", peer, truth, seen, kept), flush=True)
     if options.estimated:
         mapper = Mapper(config)
         for frame in frames:
             mapper.push(frame)
         result = mapper.finish()
         assert result.mesh is not None
-        print(row("estimated", result.mesh, truth, seen, kept))
+        print(row("estimated", shape_of(result.mesh), truth, seen, kept))
         seconds = result.diagnostics.seconds["fusion"]
         print(f"fusion took {1e3 * seconds / len(frames):.0f} ms a frame, all included")
     with threads(1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -171,6 +172,30 @@ class _DenseSession:
         """Write the surface of what was pushed so far as PLY."""
         mesh = self._model.voxel_grid.extract_triangle_mesh()
         self._images.o3d.io.write_triangle_mesh(str(path), mesh.to_legacy())
+
+
+def fused(
+    frames: Sequence[RangeFrame], poses: Float64, voxel_m: float, least: float
+) -> tuple[Float64, NDArray[np.int64]]:
+    """Vertices and faces of its TSDF of the frames at given poses (N, 4, 4).
+
+    Truncation is 8 voxels, its default; `least` is the weight, one a view, from which it shows a
+    surface.
+    """
+    images = _Images(frames[0])
+    o3d = images.o3d
+    kinds = (o3d.core.float32, o3d.core.float32)
+    # Smaller blocks, or fewer of them to begin with, end in an error of its allocator.
+    volume = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), kinds, ((1), (1)), voxel_m, 16, 50000, o3d.core.Device("CPU:0")
+    )
+    for frame, T_world_camera in zip(frames, poses, strict=True):
+        depth = images.depth(frame)
+        seen_from = (images.K, o3d.core.Tensor(np.linalg.inv(T_world_camera)), _SCALE, MAX_DEPTH_M)
+        blocks = volume.compute_unique_block_coordinates(depth, *seen_from, 8.0)
+        volume.integrate(blocks, depth, *seen_from, 8.0)
+    mesh = volume.extract_triangle_mesh(least).to_legacy()
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64)
 
 
 def _grey(frame: RangeFrame) -> NDArray[np.uint8]:

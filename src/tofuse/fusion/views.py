@@ -135,14 +135,18 @@ class RangeView:
 
     @property
     def depth(self) -> float:
-        """Median z in m; 0 where nothing is valid."""
-        known = self.z[self.z > 0]
-        return float(np.median(known)) * self.unit if len(known) else 0.0
+        """Median z in m, of every fourth pixel if any of these is valid; 0 where nothing is."""
+        for step in (2, 1):
+            some = self.z[::step, ::step]
+            known = some[some > 0]
+            if len(known):
+                return float(median(known.astype(np.float32))) * self.unit
+        return 0.0
 
     @property
     def pitch(self) -> float:
         """Typical difference of x/z between neighbouring pixels."""
-        return float(np.nanmedian(np.abs(np.diff(self.projection.rays[..., 0], axis=1))))
+        return self.projection.pitch
 
     @property
     def channels(self) -> int:

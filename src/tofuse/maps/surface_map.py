@@ -193,6 +193,11 @@ class Projection:
         """(H, W) squared ratio of the range to z."""
         return np.float32(1) + (self.rays * self.rays).sum(-1)
 
+    @cached_property
+    def pitch(self) -> float:
+        """Typical difference of x/z between neighbouring pixels."""
+        return float(np.nanmedian(np.abs(np.diff(self.rays[..., 0], axis=1))))
+
     @classmethod
     def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:
         """Make the lookup of a camera whose images are halved to every `step`-th pixel."""
