@@ -1,12 +1,13 @@
 """Readers: damage of every kind, and how fast depth images are decoded.
 
-    python benchmarks/readers.py [--mutations 10000] [--frames 400]
+    python benchmarks/readers.py [--mutations 10000] [--first 0] [--frames 400]
 
 Makes a small recording of each format as the tests do, damages it (cut off, flipped bits, swapped
 files, numbers changed, files gone or replaced by folders), and reads it through. Whatever comes out
 other than frames or the package's own errors on one line, or takes more than 20 s, is printed and
-makes the exit status 1. Then decodes 640 x 480 depth images with reading ahead, and prints frames a
-second. The peak memory of the whole process is printed at the end.
+makes the exit status 1. With --first another run goes on where one ended. Then decodes 640 x 480
+depth images with reading ahead, and prints frames a second. The peak memory of the whole process is
+printed at the end.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def read_through(path: Path) -> tuple[int, int]:
     return whole, told
 
 
-def fuzz(total: int, work: Path) -> int:
+def fuzz(total: int, first: int, work: Path) -> int:
     signal.signal(signal.SIGALRM, alarm)
     known = makers()
     bad = 0
@@ -97,7 +98,7 @@ def fuzz(total: int, work: Path) -> int:
         make(original / (file or "."))
         count = total // len(known) + (number < total % len(known))
         frames = errors = failures = 0
-        for k in range(count):
+        for k in range(first, first + count):
             rng = np.random.default_rng([200, number, k])
             copy = work / "copy" / "freiburg1"
             shutil.copytree(original, copy)
@@ -146,11 +147,12 @@ def decode(frames: int, work: Path) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mutations", type=int, default=10_000)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--frames", type=int, default=400)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        bad = fuzz(given.mutations, work) if given.mutations else 0
+        bad = fuzz(given.mutations, given.first, work) if given.mutations else 0
         decode(given.frames, work)
     print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
     return 1 if bad else 0
