@@ -58,6 +58,9 @@ class Correction(Protocol):
         Kinds of view it works on, or passes through: "range", "cloud".
     learns
         Whether it can learn from frames of the whole recording first.
+    on_trial
+        Whether it may bend what is straight where the error that it takes off is not there, so
+        that it stays only if views do not fit together worse for it.
     """
 
     part_kind: ClassVar[str] = "correction"
@@ -67,6 +70,15 @@ class Correction(Protocol):
     def learns(self) -> bool:
         """Whether it can learn from frames of the whole recording, with `learnt`, beforehand."""
         return False
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether a trial on the recording (`pipeline.trial`) is to decide if it stays."""
+        return False
+
+    def tried(self) -> Correction:
+        """Return the correction as it is after a trial that it passed."""
+        return self
 
     def learnt(self, frames: Sequence[Frame]) -> Correction:
         """Return the correction with what it has learnt from frames spread over a recording.

@@ -51,6 +51,9 @@ class Multipath(Correction):
     doubt
         Standard deviation of the correction, as a share of it; neighbouring pixels share its
         error.
+    trial
+        Leave it out where neighbouring views of the recording clearly fit together worse with it:
+        where there is no such light, it bends what is straight. A gain that is given is trusted.
     """
 
     gain: float | None = None
@@ -60,6 +63,7 @@ class Multipath(Correction):
     columns: int = 44
     lamp: float = 1.2
     doubt: float = 0.2
+    trial: bool = True
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -72,6 +76,15 @@ class Multipath(Correction):
         whole("columns", self.columns, 8, 200)
         at_least("lamp", self.lamp, 1)
         within("doubt", self.doubt, 0, 10)
+
+    @property
+    def on_trial(self) -> bool:
+        """See `Correction.on_trial`."""
+        return self.trial and self.gain is None
+
+    def tried(self) -> Multipath:
+        """See `Correction.tried`."""
+        return replace(self, trial=False)
 
     def start(self) -> MultipathCorrector:
         """See `Correction.start`."""

@@ -5,29 +5,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.errors import UnreadableFrameError
 from tofuse.filters.base import Filter
 from tofuse.filters.correction import Correction
 from tofuse.kernels.threads import threads as use_threads
+from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, check_views, kind_of
-from tofuse.recordings.frames import Frame
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.trial import Prepare, trial
+from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 
 # Frames, evenly spaced: enough to see what is behind an object that turns once.
 _SAMPLE = 30
 
 
-def learnt(config: Config, recording: Recording, threads: int | None = None) -> Config:
+def learnt(
+    config: Config,
+    recording: Recording,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Config:
     """Return the configuration with what its corrections and filters learn from the recording.
 
-    Reads up to 30 frames, and only if a part learns at all.
+    Reads up to 30 frames, and only if a part learns at all. Corrections that are on trial are left
+    out if views fit together worse with them (`trial`); that reads some tens more.
 
     Parameters
     ----------
     threads
         How many to use; None: all cores. The result does not depend on it.
+    progress
+        Hears of corrections that are left out.
 
     Raises
     ------
@@ -35,17 +47,68 @@ def learnt(config: Config, recording: Recording, threads: int | None = None) -> 
         If the recording does not show what a filter has to learn.
     """
     filters_learn = any(f.learns for f in (*config.filters, *config.model_filters))
-    if not filters_learn and not any(c.learns for c in config.corrections):
-        return config
+    # BLAS sums differ with its number of threads; ours don't.
+    with use_threads(threads), threadpool_limits(1):
+        if filters_learn or any(c.learns for c in config.corrections):
+            config = _taught(config, recording)
+        for item in config.corrections:
+            if item.on_trial:
+                config = _tried(config, item, recording, progress or Silent())
+    return config
+
+
+def _taught(config: Config, recording: Recording) -> Config:
     sample = recording.sample(_SAMPLE)
     frames = [item for item in sample if not isinstance(item, UnreadableFrameError)]
     check_views(config, kind_of(frames[0]) if frames else "range")
-    # BLAS sums differ with its number of threads; ours don't.
-    with use_threads(threads), threadpool_limits(1):
-        corrections, frames = _corrections(config.corrections, frames)
-        filters, frames = _filters(config.filters, frames)
-        model_filters, _ = _filters(config.model_filters, frames)
+    corrections, frames = _corrections(config.corrections, frames)
+    filters, frames = _filters(config.filters, frames)
+    model_filters, _ = _filters(config.model_filters, frames)
     return replace(config, corrections=corrections, filters=filters, model_filters=model_filters)
+
+
+def _tried(config: Config, item: Correction, recording: Recording, progress: Progress) -> Config:
+    """Return the configuration with a correction that has passed its trial, or without it."""
+    without = replace(config, corrections=tuple(c for c in config.corrections if c is not item))
+    ways = _prepared(without), _prepared(config)
+    if _changes(config, recording, *ways) and trial(recording, *ways).harms:
+        words = "neighbouring views fit together worse with it"
+        progress.note(f"the correction {name_of(item)} is left out: {words}")
+        return without
+    kept = tuple(c.tried() if c is item else c for c in config.corrections)
+    return replace(config, corrections=kept)
+
+
+def _changes(config: Config, recording: Recording, without: Prepare, corrected: Prepare) -> bool:
+    """Whether a correction does anything to the first image of a recording."""
+    for k in range(len(recording)):
+        try:
+            frame = recording[k]
+        except UnreadableFrameError:
+            continue
+        check_views(config, kind_of(frame))
+        if not isinstance(frame, RangeFrame):
+            return False
+        before, after = without(frame), corrected(frame)
+        assert isinstance(before, RangeFrame)
+        assert isinstance(after, RangeFrame)
+        return not np.array_equal(before.depth, after.depth)
+    return False
+
+
+def _prepared(config: Config) -> Prepare:
+    """What is tracked of a frame whose neighbours are not known."""
+    correctors = [correction.start() for correction in config.corrections]
+
+    def made(frame: Frame) -> Frame:
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        for item in config.filters:
+            if item.window == 1:
+                frame = frame.keep(item.mask(frame, ()))
+        return frame
+
+    return made
 
 
 def _corrections(

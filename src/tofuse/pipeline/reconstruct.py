@@ -75,7 +75,7 @@ def reconstruct(
     """
     progress = progress or Silent()
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
-    config = learnt(fitted(config, recording), recording, threads)
+    config = learnt(fitted(config, recording), recording, threads, progress)
     stages = stages or NotKept()
     progress.stage("tracking", len(recording))
     # BLAS sums differ with its number of threads; ours don't.

@@ -93,7 +93,7 @@ def run(
         _check_guess(options, recording)
         if options.unwrap:
             _check_unwrap(recording)
-        config = learnt(fitted(config, recording), recording, options.threads)
+        config = learnt(fitted(config, recording), recording, options.threads, progress)
         loops = (
             read_loops(options.loops, frozenset(recording.indices.tolist()))
             if options.loops
