@@ -71,7 +71,8 @@ def turned_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> None:
     recording = tofuse.open(room_recording).select(every=2)
-    config = from_method("default")
+    kept_as_it_is = [{"part": "noise"}, {"part": "multipath", "trial": False}]
+    config = changed(from_method("default"), {"corrections": kept_as_it_is}, where="test")
     never = Kept(0)
     whole = reconstruct.reconstruct(recording, config, seed=3, stages=never)
     assert never.saved == ["tracking"] * 4 + ["loops", "refinement", "fusion"]

@@ -104,6 +104,8 @@ def trial(recording: Recording, without: Prepare, corrected: Prepare) -> Trial:
     without, corrected
         Make of a frame what would be tracked. Called with the same frames, run by run.
     """
+    if len(recording) < _VIEWS + _LEAST_RUNS - 1:
+        return Trial(())
     bench = _Bench(recording, without, corrected)
     stride, larger, seen = 1, [], set()
     for place in _PLACES:
