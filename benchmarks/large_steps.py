@@ -76,7 +76,10 @@ TAKEN = [
     Steps("room", "every 8th view, 22 degrees", 8),
     Steps("room", "every 10th view, 28 degrees", 10),
     Steps("room", "every 12th view, 34 degrees", 12),
-    Steps("empty-room", "every 8th view", 8),
+    Steps("empty-room", "every 8th view, 22 degrees", 8),
+    Steps("empty-room", "every 10th view, 27 degrees", 10),
+    Steps("empty-room", "every 12th view, 32 degrees", 12),
+    Steps("kitchen", "26 degrees or 0.9 m", degrees=26.0, metres=0.9, most=14),
 ]
 
 

@@ -20,6 +20,8 @@ from tofuse.registration.agreement import AgreementOptions, agreement
 from tofuse.registration.floor import FloorOptions, find_floor, find_floors
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import SearchOptions, search
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import simulate_recording
 
 CAMERA = Pinhole(160, 120, 130.0, 130.0, 79.5, 59.5)
 # Boxes (centre, half size, turned about y by rad) on a floor 1 m below the origin, y down.
@@ -86,7 +88,7 @@ def pair():
 
 
 def random_image(rng, shape=(9, 12)):
-    """A grid of planes in front of the camera, holes, and depths without a plane."""
+    """A grid of planes in front of the camera, holes, and depths without a plane; with albedo."""
     frame = np.array([-0.6, -0.4, 10.0, 10.0])
     y, x = np.mgrid[: shape[0], : shape[1]] / 10.0
     rays = np.dstack([x - 0.6, y - 0.4, np.ones(shape)])
@@ -98,7 +100,8 @@ def random_image(rng, shape=(9, 12)):
     grid[kind < 0.1] = 0
     grid[kind > 0.85, :3] = 0
     grid[kind > 0.85, 3] = -2.0
-    return grid.astype(np.float32), frame
+    light = np.where(rng.random(shape) < 0.1, np.nan, rng.normal(0, 0.3, shape))
+    return np.dstack([grid, light]).astype(np.float32), frame
 
 
 def random_points(rng, count):
@@ -110,7 +113,7 @@ def random_points(rng, count):
 
 
 def looked_up(p, grid, frame):
-    """(N, 4) entries of the grid where points land, and whether they do."""
+    """(N, 5) entries of the grid where points land, and whether they do."""
     with np.errstate(divide="ignore", invalid="ignore"):
         u = np.floor((p[:, 0] / p[:, 2] - frame[0]) * frame[2] + 0.5)
         v = np.floor((p[:, 1] / p[:, 2] - frame[1]) * frame[3] + 0.5)
@@ -120,8 +123,8 @@ def looked_up(p, grid, frame):
     return grid[v, u].astype(float), inside
 
 
-def scored(p, n, grid, frame, T, reach):
-    """What `score_grid` sums one way, point by point."""
+def scored(p, n, light, grid, frame, T, reach):
+    """What `score_grid` sums one way, point by point; weights of and differences in albedo."""
     q, m = se3.transform(T, p.astype(float)), n @ T[:3, :3].T
     plane, inside = looked_up(q, grid, frame)
     r = (plane[:, :3] * q).sum(1) - plane[:, 3]
@@ -129,7 +132,10 @@ def scored(p, n, grid, frame, T, reach):
     through = (known & (r < -reach)) | (raw & (q[:, 2] < -plane[:, 3] - reach))
     fits = known & (np.abs(r) < reach)
     cosine = np.maximum((plane[:, :3] * m).sum(1), 0)
-    return (fits * cosine * (1 - (r / reach) ** 2)).sum() - 2.0 * through.sum()
+    weight = fits * cosine * (1 - (r / reach) ** 2)
+    lighter = plane[:, 4] - light
+    told = np.isfinite(lighter)
+    return weight.sum() - 2.0 * through.sum(), weight[told], lighter[told]
 
 
 def small_poses(rng, count):
@@ -140,23 +146,42 @@ def test_every_pose_of_a_grid_is_scored_both_ways():
     rng = np.random.default_rng(3)
     grids = [random_image(rng), random_image(rng, (11, 10))]
     source, target = random_points(rng, 60), random_points(rng, 50)
+    lights = [
+        np.where(rng.random(n) < 0.2, np.nan, rng.normal(0, 0.3, n)).astype(np.float32)
+        for n in (60, 50)
+    ]
     poses = small_poses(rng, 6)
     rotations, moves = poses[:, :3, :3].copy(), poses[:4, :3, 3].copy()
     scores = np.full((6, 4), np.nan, np.float32)
-    arguments = (*source, *target, *grids[0], *grids[1], rotations)
-    kernels.score_grid(*arguments, moves[None], 0.4, scores, 0, 6)
+    points = (*source, lights[0], *target, lights[1])
+    arguments = (*points, *grids[0], *grids[1], rotations)
+    kernels.score_grid(*arguments, moves[None], 0.4, 0.3, scores, 0, 6)
+    most = 0
     for a in range(6):
         for b in range(4):
             T = np.eye(4)
             T[:3, :3], T[:3, 3] = rotations[a], moves[b]
-            there = scored(*source, *grids[1], T, 0.4)
-            back = scored(*target, *grids[0], se3.inverse(T), 0.4)
-            assert scores[a, b] == pytest.approx((there + back) / 110, abs=1e-5)
+            there, w, d = scored(*source, lights[0], *grids[1], T, 0.4)
+            back, v, e = scored(*target, lights[1], *grids[0], se3.inverse(T), 0.4)
+            w, d = np.append(w, v), np.append(d, -e)
+            spread = (w * (d - (w * d).sum() / w.sum()) ** 2).sum() / 0.3**2
+            against = min(spread, 2 * w.sum())
+            most += against < spread
+            assert scores[a, b] == pytest.approx((there + back - against) / 110, abs=1e-5)
     assert scores.std() > 0.01
+    assert 2 < most < 22
+    # A longer exposure says nothing.
+    brighter = grids[0][0].copy()
+    brighter[..., 4] += 0.7
+    longer = (*source, lights[0] + np.float32(0.7), *target, lights[1])
+    again = np.full((6, 4), np.nan, np.float32)
+    images = (brighter, grids[0][1], *grids[1])
+    kernels.score_grid(*longer, *images, rotations, moves[None], 0.4, 0.3, again, 0, 6)
+    np.testing.assert_allclose(again, scores, atol=1e-5)
     # A translation of its own for each rotation.
     single = np.full((4, 1), np.nan, np.float32)
     own = np.ascontiguousarray(moves[:, None])
-    kernels.score_grid(*arguments[:-1], rotations[:4], own, 0.4, single, 0, 4)
+    kernels.score_grid(*arguments[:-1], rotations[:4], own, 0.4, 0.3, single, 0, 4)
     np.testing.assert_allclose(single[:, 0], scores[np.arange(4), np.arange(4)], atol=1e-6)
 
 
@@ -400,6 +425,29 @@ def test_the_answer_does_not_depend_on_the_number_of_threads(pair):
     for a, b in zip(*(answer.candidates for answer in answers), strict=True):
         assert a.T_target_source.tobytes() == b.T_target_source.tobytes()
         assert a.score == b.score
+
+
+def test_albedo_tells_where_geometry_is_alike():
+    """Bare walls, 27 degrees apart, textured."""
+    effects = Effects.none(shot_noise=True)
+    recording = simulate_recording("empty-room", every=30, frames=9, effects=effects).select(3)
+    views = [surface_map(frame, SurfaceOptions()) for frame in recording]
+    dark = [
+        surface_map(replace(frame, amplitude_image=None), SurfaceOptions()) for frame in recording
+    ]
+    poses = recording.reference
+    right = {"with": 0, "without": 0}
+    for k in range(5):
+        true = se3.inverse(poses[k]) @ poses[k + 1]
+        assert 20 < np.degrees(se3.angle(true)) < 30
+        for name, seen_by in (("with", views), ("without", dark)):
+            found = search(seen_by[k + 1], seen_by[k])
+            metres, degrees = error(found.T_target_source, true)
+            right[name] += metres < 0.1 and degrees < 3
+            if name == "with":
+                assert found.agreement.clash < 0.01
+    assert right["with"] == 5
+    assert right["without"] < 4
 
 
 def test_a_view_of_nothing_is_not_searched(pair):

@@ -1,9 +1,9 @@
 """Exhaustive search for the pose between two range images, and what both images say of a pose.
 
-Images are pinhole grids here: (H, W, 4) holds the unit normal away from the camera and the
+Images are pinhole grids here: (H, W, 5) holds the unit normal away from the camera and the
 distance n . p of the plane seen along each node's ray; where only a depth is known, 0, 0, 0 and
-its negative; all 0 where nothing is known. The frame (x0, y0, 1/dx, 1/dy) tells the ray
-coordinates of the nodes.
+its negative; all 0 where nothing is known; and the log albedo around the node, NaN where unknown.
+The frame (x0, y0, 1/dx, 1/dy) tells the ray coordinates of the nodes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ Float64 = NDArray[np.float64]
 
 # Nearer than this, a point has no place in an image, m.
 _NEAREST = 0.05
+# Points whose albedo disagrees speak against a pose for at most so many that support it.
+_MOST_AGAINST = 2.0
 # Layout of what `agree` returns.
 LANDED = 0
 COMPARED = 1
@@ -33,18 +35,23 @@ AGREE_SIZE = 5
 def _judged(
     points: Float32,
     normals: Float32,
+    light: Float32,
     grid: Float32,
     frame: Float64,
     tx: float,
     ty: float,
     tz: float,
     reach: float,
+    sign: float,
+    lit: Float64,
     node: NDArray[np.int32],
 ) -> float:
     """Support less twice the free-space violation, of points that are turned already.
 
     Points and normals are (3, N), so that several points are projected at once; `node` (N,) is
-    where their places in the image, row by row, are kept meanwhile.
+    where their places in the image, row by row, are kept meanwhile. Adds to `lit` (3,) the weights
+    of the points whose albedo is compared, and their differences in log albedo, times `sign`, once
+    and squared.
     """
     rows, columns = np.int32(grid.shape[0]), np.int32(grid.shape[1])
     mx, my, mz = np.float32(tx), np.float32(ty), np.float32(tz)
@@ -65,7 +72,9 @@ def _judged(
         j = np.int32(u if inside else none)
         i = np.int32(v if inside else none)
         node[k] = i * columns + j if inside else np.int32(-1)
-    planes = grid.reshape(grid.size // 4, 4)
+    planes = grid.reshape(grid.size // 5, 5)
+    times = np.float32(sign)
+    weights, first, second = np.float32(0), np.float32(0), np.float32(0)
     reach32 = np.float32(reach)
     per2 = np.float32(1.0 / (reach * reach))
     two = np.float32(2)
@@ -87,7 +96,16 @@ def _judged(
         elif r < reach32:
             c = plane[0] * n0[k] + plane[1] * n1[k] + plane[2] * n2[k]
             if c > none:
-                total += c * (one - r * r * per2)
+                w = c * (one - r * r * per2)
+                total += w
+                lighter = times * (plane[4] - light[k])
+                if lighter == lighter:
+                    weights += w
+                    first += w * lighter
+                    second += w * lighter * lighter
+    lit[0] += weights
+    lit[1] += first
+    lit[2] += second
     return float(total)
 
 
@@ -95,8 +113,10 @@ def _judged(
 def score_grid(
     source_points: Float32,
     source_normals: Float32,
+    source_light: Float32,
     target_points: Float32,
     target_normals: Float32,
+    target_light: Float32,
     source_grid: Float32,
     source_frame: Float64,
     target_grid: Float32,
@@ -104,6 +124,7 @@ def score_grid(
     rotations: Float64,
     translations: Float64,
     reach: float,
+    albedo: float,
     scores: Float32,
     start: int,
     stop: int,
@@ -114,6 +135,8 @@ def score_grid(
     ----------
     source_points, source_normals, target_points, target_normals
         (N, 3) and (M, 3), each in the frame of its own camera.
+    source_light, target_light
+        (N,) and (M,) log albedo around the points, NaN where unknown.
     source_grid, source_frame, target_grid, target_frame
         The images.
     rotations, translations
@@ -121,8 +144,12 @@ def score_grid(
     reach
         Distance of a plane within which a point supports the pose, m; nearer than the surface by
         more than that, it stands where the camera saw through.
+    albedo
+        Standard deviation of the differences in log albedo, exposure apart, with which points
+        that support the pose speak against it as much as for it.
     scores
-        (A, B), written: support less twice the violations, as a share of all points.
+        (A, B), written: support less twice the violations and what albedo says against it, as a
+        share of all points.
     """
     n, m = source_points.shape[0], target_points.shape[0]
     P = np.empty((3, n), np.float32)
@@ -130,6 +157,7 @@ def score_grid(
     Q = np.empty((3, m), np.float32)
     QN = np.empty((3, m), np.float32)
     nodes = np.empty(n, np.int32), np.empty(m, np.int32)
+    lit = np.empty(3)
     share = 1.0 / max(n + m, 1)
     for a in range(start, stop):
         R = rotations[a]
@@ -160,12 +188,43 @@ def score_grid(
         row = min(a, translations.shape[0] - 1)
         for b in range(translations.shape[1]):
             t = translations[row, b]
-            total = _judged(P, PN, target_grid, target_frame, t[0], t[1], t[2], reach, nodes[0])
+            lit[:] = 0.0
+            total = _judged(
+                P,
+                PN,
+                source_light,
+                target_grid,
+                target_frame,
+                t[0],
+                t[1],
+                t[2],
+                reach,
+                1.0,
+                lit,
+                nodes[0],
+            )
             # The inverse moves by -R^T t.
             sx = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
             sy = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
             sz = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
-            total += _judged(Q, QN, source_grid, source_frame, sx, sy, sz, reach, nodes[1])
+            total += _judged(
+                Q,
+                QN,
+                target_light,
+                source_grid,
+                source_frame,
+                sx,
+                sy,
+                sz,
+                reach,
+                -1.0,
+                lit,
+                nodes[1],
+            )
+            if lit[0] > 0:
+                # What all differ by is the exposure.
+                spread = (lit[2] - lit[1] * lit[1] / lit[0]) / (albedo * albedo)
+                total -= min(spread, _MOST_AGAINST * lit[0])
             scores[a, b] = total * share
 
 

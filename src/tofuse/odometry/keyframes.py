@@ -153,7 +153,7 @@ class Recovery:
     patience: int = 10
     score: float = 0.25
     margin: float = 0.025
-    lost_margin: float = 0.15
+    lost_margin: float = 0.1
     relocated_margin: float = 0.05
     contradiction: float = 0.08
     prior_m: float = 0.03

@@ -350,8 +350,8 @@ class _RevisitLoops(Loops):
         options = self._options
         T = there.T_world_source
         if not objection:
-            back = self._align(source, target, se3.inverse(T), options.near)
-            objection = self._objection(back)
+            back = self._freely(source, target, se3.inverse(T), options.near)
+            objection = options.acceptance.objection(back)
             gap = T @ back.T_world_source
             if not objection and (
                 np.linalg.norm(gap[:3, 3]) > options.both_ways_m
@@ -376,11 +376,23 @@ class _RevisitLoops(Loops):
         self, target: SurfaceMap, source: SurfaceMap, guess: Float64, levels: tuple[Level, ...]
     ) -> Aligned:
         """Align with nothing held at the guess, which has drifted; then see what is held."""
-        options = replace(self._options.alignment, levels=levels)
-        free = replace(options, held=_NOT_HELD, common_tilt=0.0, common_slope=0.0)
-        targets = [Target(target, np.eye(4))]
-        T = align(source, targets, guess, free).T_world_source
-        return align(source, targets, T, replace(options, levels=levels[-2:]))
+        freely = self._freely(target, source, guess, levels)
+        if self._options.acceptance.objection(freely):
+            return freely
+        options = replace(self._options.alignment, levels=levels[-2:])
+        return align(source, [Target(target, np.eye(4))], freely.T_world_source, options)
+
+    def _freely(
+        self, target: SurfaceMap, source: SurfaceMap, guess: Float64, levels: tuple[Level, ...]
+    ) -> Aligned:
+        options = replace(
+            self._options.alignment,
+            levels=levels,
+            held=_NOT_HELD,
+            common_tilt=0.0,
+            common_slope=0.0,
+        )
+        return align(source, [Target(target, np.eye(4))], guess, options)
 
     def _objection(self, aligned: Aligned) -> str:
         found = self._options.acceptance.objection(aligned)

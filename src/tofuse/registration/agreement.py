@@ -46,7 +46,7 @@ class AgreementOptions:
     floor_m: float = 0.01
     floor_share: float = 0.01
     max_angle: float = 0.7
-    albedo: float = 0.3
+    albedo: float = 0.2
     violation_weight: float = 2.0
     clash_weight: float = 1.0
 

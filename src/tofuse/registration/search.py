@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, get_args
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,6 +43,10 @@ _PHOTOMETRIC = ProjectiveOptions(
 _POLISHED, _POLISH_POINTS = 10, 2500
 # Score that a candidate may lose by being aligned by albedo.
 _GIVEN_UP = 0.05
+# Width over which albedo is averaged before it scores coarse steps, in the plane z = 1, and the
+# deviation in log albedo at which points that support a pose speak against it as much.
+_BLUR, _ALBEDO = 0.04, 0.12
+_NO_BORDER = cv2.BORDER_CONSTANT
 # Nodes of the grid on which an image is looked up, along its wider side.
 _GRID = 128
 # Points without which a view is not searched.
@@ -213,15 +218,18 @@ class _View:
     frame: Float64
     points: Float32
     normals: Float32
+    light: Float32
     depth: float
 
-    def some(self, count: int, less: NDArray[np.bool_] | None = None) -> tuple[Float32, Float32]:
-        """About so many points and their normals, of those marked `less` only every fourth."""
+    def some(
+        self, count: int, less: NDArray[np.bool_] | None = None
+    ) -> tuple[Float32, Float32, Float32]:
+        """About so many points, their normals and light, of those marked `less` every fourth."""
         keep = np.arange(len(self.points))
         if less is not None:
             keep = np.concatenate([keep[~less], keep[less][::4]])
         keep = keep[np.linspace(0, len(keep) - 1, min(count, len(keep))).round().astype(int)]
-        return np.ascontiguousarray(self.points[keep]), np.ascontiguousarray(self.normals[keep])
+        return self.points[keep], self.normals[keep], self.light[keep]
 
 
 def search(
@@ -293,7 +301,8 @@ def _prepare(view: SurfaceMap) -> _View:
     rays = view.rays[view.planes[..., 3] > 0]
     if len(rays) < _LEAST_POINTS:
         nothing = np.zeros((0, 3), np.float32)
-        return _View(np.zeros((1, 1, 4), np.float32), np.ones(4), nothing, nothing, 1.0)
+        none = np.zeros((1, 1, 5), np.float32)
+        return _View(none, np.ones(4), nothing, nothing, nothing[:, 0], 1.0)
     rays = view.rays[view.z > 0]
     low, high = rays.min(0).astype(float), rays.max(0).astype(float)
     spacing = max(float((high - low).max()) / _GRID, 1e-6)
@@ -317,13 +326,28 @@ def _prepare(view: SurfaceMap) -> _View:
     grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
     grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
     seen = ViewPoints.of(view, _SEEN)
+    light = _around(np.where(known, view.photo[v, u, 0], np.nan), _BLUR / spacing)
+    at = seen.points[:, :2] / seen.points[:, 2:] - (x[0], y[0])
+    j, i = (at / spacing).round().astype(int).T
+    i, j = np.clip(i, 0, len(y) - 1), np.clip(j, 0, len(x) - 1)
     return _View(
-        grid.astype(np.float32),
+        np.dstack([grid, light]).astype(np.float32),
         np.array([x[0], y[0], 1 / spacing, 1 / spacing]),
         seen.points,
         seen.normals,
+        light[i, j],
         float(np.median(seen.points[:, 2])),
     )
+
+
+def _around(light: Float64, sigma: float) -> Float32:
+    """Mean of an image around each pixel, NaN where it is: a coarse step must not matter."""
+    known = np.isfinite(light)
+    size = (0, 0)
+    total = cv2.GaussianBlur(np.where(known, light, 0), size, sigma, borderType=_NO_BORDER)
+    share = cv2.GaussianBlur(known.astype(float), size, sigma, borderType=_NO_BORDER)
+    mean = total / np.maximum(share, 1e-9)
+    return np.where(known, mean, np.nan).astype(np.float32)
 
 
 def _planar(s: _View, t: _View, floor_s: Floor, floor_t: Floor, options: SearchOptions) -> Float64:
@@ -394,6 +418,7 @@ class _Scorer:
                 rotations,
                 translations,
                 self.reach,
+                _ALBEDO,
                 scores,
                 a,
                 b,
@@ -469,7 +494,7 @@ def _settle(
     s: _View, t: _View, poses: Float64, reaches: Float64, points: int, options: SearchOptions
 ) -> None:
     """Settle poses (N, 4, 4) in place by two-way ICP."""
-    some = (*s.some(points), *t.some(points))
+    some = (*s.some(points)[:2], *t.some(points)[:2])
     cosine = float(np.cos(options.agreement.max_angle))
     depth = 0.5 * (s.depth + t.depth)
     run_chunks(
