@@ -259,7 +259,9 @@ def test_what_lies_beyond_the_period_is_brought_back(room_recording, tmp_path) -
     convert(Recording.of(source, "wrapped", "test"), tmp_path / "rec")
     farthest = {}
     for name, options in (("near", []), ("far", ["--unwrap"])):
-        run(tmp_path / "rec", "--out", tmp_path / name, *options)
+        # As it is the recording is refused or spoilt; which of them is not asked here.
+        words = ["run", str(tmp_path / "rec"), "--out", str(tmp_path / name), *options]
+        assert main(words) == 0 or name == "near"
         made = run_json(tmp_path / name)
         told = {finding["code"] for finding in made["findings"]}
         assert ("phase_wrap" in told) == (name == "near")

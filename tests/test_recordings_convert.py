@@ -71,7 +71,7 @@ def test_every_camera(tmp_path: Path, name: str) -> None:
     done = convert(before, tmp_path / "out")
     assert (done.folder, done.frames, done.warnings) == (tmp_path / "out", len(before), ())
     # Float depth without a unit is rounded to 0.1 mm.
-    rounded = 0.51e-4 if name in ("record3d", "r3d") else 1e-6
+    rounded = 1e-6 if "depth_unit_m" in before.metadata else 0.51e-4
     check_same(before, open_recording(tmp_path / "out"), depth=rounded)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "scan"]
 

@@ -88,7 +88,7 @@ class Grid:
             raise _refusal(path)
         frames = _Frames(raster, camera, scale, behind)
         source = CloudFileSource(path, files, frames.load)
-        source.metadata |= {"depth_kind": "z", "depth_unit_m": scale}
+        source.metadata |= {"depth_kind": "z"}
         if behind:
             source.warnings.append(
                 f"points are measured from {1000 * behind:.1f} mm in front of where the pixels' "
