@@ -366,32 +366,12 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         weight[_near_edges(w, jump, options.edge_margin)] = 0
     known = weight > 0
     rows, columns = z.shape
-    planes = np.empty((rows, columns, 4), np.float32)
-    quality = np.empty((rows, columns, 2), np.float32)
     scale = max(
         _noise_scale(w, rays, weight, options.radii[0]),
         _scale_at(_LEAST_NOISE, z, sigma) if own is None else 1.0,
     )
-    radii = np.array(options.radii, np.int64)
     limit = options.misfit * max(scale, _scale_at(options.flatness, z, sigma))
-    run_chunks(
-        lambda a, b: fit_planes(
-            w,
-            rays,
-            weight,
-            known,
-            radii,
-            limit,
-            options.fill,
-            options.offset,
-            planes,
-            quality,
-            a,
-            b,
-        ),
-        rows,
-        _chunks(rows),
-    )
+    planes, quality = _fitted(w, rays, weight, known, limit, options)
     photo = _no_photo(rows, columns)
     has_photo = light is not None
     if light is not None:
@@ -451,29 +431,8 @@ def with_noisy_planes(
     edge = _noisy_edges(w, noise, options)
     missing &= ~edge
     weight = _inverse((noise * w) ** 2, known & ~edge)
-    rows, columns = z.shape
-    planes = np.empty((rows, columns, 4), np.float32)
-    quality = np.empty((rows, columns, 2), np.float32)
     limit = options.misfit * max(1.0, _scale_at(options.flatness, z, surface.sigma))
-    radii = np.array(options.radii, np.int64)
-    run_chunks(
-        lambda a, b: fit_planes(
-            w,
-            surface.rays,
-            weight,
-            missing,
-            radii,
-            limit,
-            options.fill,
-            options.offset,
-            planes,
-            quality,
-            a,
-            b,
-        ),
-        rows,
-        _chunks(rows),
-    )
+    planes, quality = _fitted(w, surface.rays, weight, missing, limit, options)
     new = missing & (planes[..., 3] > 0)
     shared = _shared_sigma(frame, surface.projection.lengths2)
     variance, own = _with_shared(quality[..., 1], planes, shared)
@@ -597,6 +556,30 @@ def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
         _chunks(len(out[0])),
     )
     return out
+
+
+def _fitted(
+    w: Float32,
+    rays: Float32,
+    weight: Float32,
+    wanted: NDArray[np.bool_],
+    limit: float,
+    options: SurfaceOptions,
+) -> tuple[Float32, Float32]:
+    """Planes (H, W, 4) and their quality (H, W, 2) where they are wanted, see `fit_planes`."""
+    rows, columns = w.shape
+    planes = np.empty((rows, columns, 4), np.float32)
+    quality = np.empty((rows, columns, 2), np.float32)
+    radii = np.array(options.radii, np.int64)
+
+    def fit(start: int, stop: int) -> None:
+        fit_planes(
+            w, rays, weight, wanted, radii, limit, options.fill, options.offset,
+            planes, quality, start, stop,
+        )  # fmt: skip
+
+    run_chunks(fit, rows, _chunks(rows))
+    return planes, quality
 
 
 def _chunks(rows: int) -> int:
