@@ -36,6 +36,8 @@ _SURE, _LIKELY, _WORTH = 4.0, 2.5, 0.2
 _CLOSED = (0.01, np.radians(0.5))
 # Of the tolerance: an error that is known less well is not told.
 _VAGUE = 0.4
+# What the support of the views changes by for no other reason than which points are taken.
+_CHANCE = 0.003
 # How much views differ is not known from fewer.
 _LEAST_VIEWS = 8
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
@@ -137,7 +139,7 @@ def suspicion(
     assert best is not None, "what was looked at is held"
     large = any(abs(e) > max(TOLERANCES[n], _SURE * sigmas[n]) for n, e in errors.items())
     gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
-    alarm = gap is not None and gap.closes and _gain(best, views) > 0
+    alarm = gap is not None and gap.closes and _gain(best, views) > _CHANCE
     support = float(best.before.of_views(len(views)).mean())
     return Suspicion(alarm, errors, sigmas, (support, support + _gain(best, views)), gap)
 
