@@ -37,6 +37,8 @@ STILL_M, STILL_RAD = 0.01, np.radians(0.5)
 GOOD_M, GOOD_SHARE = 0.01, 0.01
 # Single poses are told that may be off by twice that, as the way from the first adds to them.
 UNCERTAIN_TIMES, UNCERTAIN_RAD = 2.0, np.radians(2)
+# So small a share of the frames says nothing of the path.
+SELDOM = 0.02
 # Path lengths are measured over so many poses: jitter from frame to frame is no way.
 PATH_POSES = 60
 # Loops miss where odometry leads by a chi-square variable with six degrees of freedom, if both
@@ -254,12 +256,14 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     sigma, turn = _worst(e.covariances[:, :3, :3]), _worst(e.covariances[:, 3:, 3:])
     doubtful = ~((sigma <= UNCERTAIN_TIMES * promised) & (turn <= UNCERTAIN_RAD))
     found = _runs(graph.ids.tolist(), doubtful.tolist())
+    seldom = bool(doubtful.sum() <= SELDOM * len(doubtful))
     if found:
         first, last = max(found, key=lambda ends: ends[1] - ends[0])
         here = (graph.ids >= first) & (graph.ids <= last)
         text = _doubt(first, last, float(sigma[here].max()), float(turn[here].max()))
         text += f" So are {len(found) - 1} other stretches." if len(found) > 1 else ""
-        yield Reason("uncertain_poses", (first, last), text)
+        yield Reason("uncertain_frames" if seldom else "uncertain_poses", (first, last), text)
+    if not seldom:
         return
     _, bound = expected_error(graph)
     if bound > promised:

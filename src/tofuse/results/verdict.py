@@ -28,6 +28,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "not_improved": ("note", "The optimiser found nothing better than what it was given."),
     "not_refined": ("note", "Refining all views together made them agree worse."),
     "sensor_differs": ("note", "A sensor beside the camera does not fit what was tracked."),
+    "uncertain_frames": ("note", "Few frames are held more loosely than the others."),
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
     "single_frame": ("note", "Only one frame has a pose: there was nothing to register."),
     "stood_still": ("note", "The camera never moved: the model is what one view sees."),
