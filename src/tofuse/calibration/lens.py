@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from tofuse.calibration.board import Board, find_corners, picture
 from tofuse.calibration.board_pose import board_pose, pose_of
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import (
     DISTORTION_ORDER,
@@ -24,7 +24,6 @@ from tofuse.geometry.cameras import (
     Pinhole,
     Rational,
 )
-from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 
 Float64 = NDArray[np.float64]
@@ -142,13 +141,7 @@ def board_views(
     views: list[BoardView] = []
     left_out: list[tuple[int, str]] = []
     camera: Camera | None = None
-    for item in recording.sample(_SEARCHED):
-        if isinstance(item, UnreadableFrameError):
-            continue
-        if not isinstance(item, RangeFrame):
-            raise InputError(
-                "holds clouds", where=recording.path, remedy="give a recording of depth images"
-            )
+    for item in recording.images(_SEARCHED):
         seen = picture(item, image)
         if seen is None:
             other = "color" if image == "amplitude" else "amplitude"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.recordings.noise import noise_model_for
@@ -191,10 +191,10 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
 
 
 def _first_frame(recording: Recording) -> Frame:
-    for item in recording.read_all():
-        if not isinstance(item, UnreadableFrameError):
-            return item
-    raise InputError("has no readable frame", where=recording.path)
+    frame = recording.first_readable()
+    if frame is None:
+        raise InputError("has no readable frame", where=recording.path)
+    return frame
 
 
 def _not_still(recording: Recording) -> InputError:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tofuse.calibration.board import Board, find_corners, picture
 from tofuse.calibration.board_pose import board_pose
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, points_from_z, ray_lengths
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
@@ -85,7 +85,7 @@ def board_planes(
     """
     noise = noise_model_for(recording)
     views, camera = [], None
-    for frame in _frames(recording):
+    for frame in recording.images(_SEARCHED):
         camera = camera or frame.camera
         seen = picture(frame, image)
         if seen is None:
@@ -141,7 +141,7 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
     noise = noise_model_for(recording)
     finder = PlaneSets(planes=planes, least_share=0.1, thickness=0.01)
     views, camera = [], None
-    for frame in _frames(recording):
+    for frame in recording.images(_SEARCHED):
         camera = camera or frame.camera
         rng = np.random.default_rng([seed, frame.index])
         taken = np.zeros(frame.depth.shape, bool)
@@ -157,19 +157,6 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
             remedy="record a plain wall or a room, from several distances",
         )
     return views, camera
-
-
-def _frames(recording: Recording) -> list[RangeFrame]:
-    out = []
-    for item in recording.sample(_SEARCHED):
-        if isinstance(item, UnreadableFrameError):
-            continue
-        if not isinstance(item, RangeFrame):
-            raise InputError(
-                "holds clouds", where=recording.path, remedy="give a recording of depth images"
-            )
-        out.append(item)
-    return out
 
 
 def _near(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:

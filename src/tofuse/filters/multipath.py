@@ -169,9 +169,9 @@ def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage 
 
 def _period(frame: RangeFrame, given: float | None) -> float | None:
     """Range after which the phase of a frame's one frequency repeats; None where not known."""
-    period_m = frame.ambiguity_m
     if given is not None:
         return given
+    period_m = frame.ambiguity_m
     if period_m is None or period_m > _LONGEST_PERIOD_M or frame.amplitude_kind == "ir":
         return None
     return period_m

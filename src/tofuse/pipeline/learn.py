@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.errors import UnreadableFrameError
 from tofuse.filters.base import Filter
 from tofuse.filters.correction import Correction
 from tofuse.kernels.threads import threads as use_threads
@@ -58,8 +57,7 @@ def learnt(
 
 
 def _taught(config: Config, recording: Recording) -> Config:
-    sample = recording.sample(_SAMPLE)
-    frames = [item for item in sample if not isinstance(item, UnreadableFrameError)]
+    frames = recording.readable(_SAMPLE)
     check_views(config, kind_of(frames[0]) if frames else "range")
     corrections, frames = _corrections(config.corrections, frames)
     filters, frames = _filters(config.filters, frames)
@@ -81,19 +79,16 @@ def _tried(config: Config, item: Correction, recording: Recording, progress: Pro
 
 def _changes(config: Config, recording: Recording, without: Prepare, corrected: Prepare) -> bool:
     """Whether a correction does anything to the first image of a recording."""
-    for k in range(len(recording)):
-        try:
-            frame = recording[k]
-        except UnreadableFrameError:
-            continue
-        check_views(config, kind_of(frame))
-        if not isinstance(frame, RangeFrame):
-            return False
-        before, after = without(frame), corrected(frame)
-        assert isinstance(before, RangeFrame)
-        assert isinstance(after, RangeFrame)
-        return not np.array_equal(before.depth, after.depth)
-    return False
+    frame = recording.first_readable()
+    if frame is None:
+        return False
+    check_views(config, kind_of(frame))
+    if not isinstance(frame, RangeFrame):
+        return False
+    before, after = without(frame), corrected(frame)
+    assert isinstance(before, RangeFrame)
+    assert isinstance(after, RangeFrame)
+    return not np.array_equal(before.depth, after.depth)
 
 
 def _prepared(config: Config) -> Prepare:

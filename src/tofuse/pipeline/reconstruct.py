@@ -180,12 +180,8 @@ def _known_noise(recording: Recording) -> NoiseModel | None:
 
 def view_kind(recording: Recording) -> ViewKind:
     """Return the kind of the recording's views: that of the first one that can be read."""
-    for k in range(len(recording)):
-        try:
-            return kind_of(recording[k])
-        except UnreadableFrameError:
-            continue
-    return "range"
+    frame = recording.first_readable()
+    return "range" if frame is None else kind_of(frame)
 
 
 def past_frames(

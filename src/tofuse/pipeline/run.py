@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.errors import InputError
 from tofuse.filters.base import apply_filters
 from tofuse.filters.unwrap import Unwrap, wrapped_light
 from tofuse.inspection.finding import Finding
@@ -142,12 +142,9 @@ def run(
 
 def _preview(recording: Recording, progress: Progress) -> None:
     """Show the first frame before any work begins: there the first pose will be."""
-    for k in range(len(recording)):
-        try:
-            progress.placed(recording[k], np.eye(4))
-        except UnreadableFrameError:
-            continue
-        return
+    frame = recording.first_readable()
+    if frame is not None:
+        progress.placed(frame, np.eye(4))
 
 
 def _key(
@@ -249,8 +246,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
 
 def _check_unwrap(recording: Recording) -> None:
     """Refuse what can't be unwrapped before work starts."""
-    frames = [f for f in recording.sample(_LOOKED_AT) if not isinstance(f, UnreadableFrameError)]
-    if not any(wrapped_light(frame, None) for frame in frames):
+    if not any(wrapped_light(frame, None) for frame in recording.readable(_LOOKED_AT)):
         raise InputError(
             "the recording can't be unwrapped: that needs its amplitude, and the range after which "
             "the phase of its camera repeats",

@@ -15,7 +15,7 @@ from tofuse.files.tables import read_numbers
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.reader import SURE, Sniff
-from tofuse.recordings.sources import FileSource, check_timestamps, tum_poses
+from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
 
 Float64 = NDArray[np.float64]
 
@@ -67,15 +67,7 @@ class CloudFileSource(FileSource):
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):
             return
-        table = read_numbers(path)
-        if table.shape != (len(self.files), 1):
-            raise InputError(
-                f"has {len(table)} lines of {table.shape[-1]} numbers for {len(self.files)} clouds",
-                where=path,
-                remedy="give one time in seconds for each cloud",
-            )
-        self.timestamps = table[:, 0]
-        check_timestamps(self.timestamps, path, self.warnings)
+        self.timestamps = read_timestamps(path, len(self.files), "cloud", self.warnings)
 
     def _numbered_poses(self, path: Path) -> Float64 | None:
         """Read 'index x y z qw qx qy qz' lines, the index being the number in the file's name."""

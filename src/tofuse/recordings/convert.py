@@ -76,7 +76,7 @@ def _write(
 ) -> tuple[int, list[str]]:
     warnings: list[str] = []
     recording, correction = _uncorrected(recording)
-    sample = [f for f in recording.sample(_LOOKED_AT) if not isinstance(f, UnreadableFrameError)]
+    sample = recording.readable(_LOOKED_AT)
     if not sample:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     own = not _same_camera(sample)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.kernels.threads import side_threads
-from tofuse.recordings.frames import Frame
+from tofuse.recordings.frames import Frame, RangeFrame
 
 R = TypeVar("R")
 Float64 = NDArray[np.float64]
@@ -175,6 +175,30 @@ class Recording:
             except UnreadableFrameError as error:
                 items.append(error)
         return items
+
+    def readable(self, count: int) -> list[Frame]:
+        """Read as `sample` does, without what can't be read."""
+        return [item for item in self.sample(count) if not isinstance(item, UnreadableFrameError)]
+
+    def images(self, count: int) -> list[RangeFrame]:
+        """Read as `readable` does; raise InputError where there are clouds among the frames."""
+        out: list[RangeFrame] = []
+        for frame in self.readable(count):
+            if not isinstance(frame, RangeFrame):
+                raise InputError(
+                    "holds clouds", where=self.path, remedy="give a recording of depth images"
+                )
+            out.append(frame)
+        return out
+
+    def first_readable(self) -> Frame | None:
+        """Read the first frame that can be read; None if there is none."""
+        for k in range(len(self)):
+            try:
+                return self[k]
+            except UnreadableFrameError:
+                continue
+        return None
 
     def read_all(self, ahead: int = 8, *, first: int = 0) -> Iterator[Frame | UnreadableFrameError]:
         """Iterate over the frames from the `first`, with the error in place of unreadable ones.

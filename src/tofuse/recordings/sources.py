@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
 from tofuse.files.reading import is_file
+from tofuse.files.tables import read_numbers
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
@@ -105,6 +106,20 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
     if not np.isfinite(table).all():
         return np.full((4, 4), np.nan)
     return orthonormalise(check_pose(table, where=where))
+
+
+def read_timestamps(path: Path, count: int, things: str, warnings: list[str]) -> Float64:
+    """Read timestamps.txt: a time in seconds for each of so many images or clouds."""
+    table = read_numbers(path)
+    if table.shape != (count, 1):
+        raise InputError(
+            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} {things}s",
+            where=path,
+            remedy=f"give one time in seconds for each {things}",
+        )
+    times = table[:, 0]
+    check_timestamps(times, path, warnings)
+    return times
 
 
 def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:

@@ -11,13 +11,12 @@ import numpy as np
 
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
-from tofuse.files.tables import read_numbers
 from tofuse.files.tiff import read_tiff
 from tofuse.parts import part
 from tofuse.recordings.camera_file import load_camera
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
-from tofuse.recordings.sources import FARTHEST_M, FileSource, check_timestamps, tum_poses
+from tofuse.recordings.sources import FARTHEST_M, FileSource, read_timestamps, tum_poses
 
 _SUFFIXES = (".tif", ".tiff")
 _RANGE = ".range"
@@ -88,15 +87,7 @@ class TiffSource(FileSource):
             self.amplitude = []
         times = folder / "timestamps.txt"
         if is_file(times):
-            table = read_numbers(times)
-            if table.shape != (len(self.depth), 1):
-                raise InputError(
-                    f"has {len(table)} lines for {len(self.depth)} images",
-                    where=times,
-                    remedy="give one time in seconds for each image",
-                )
-            self.timestamps = table[:, 0]
-            check_timestamps(self.timestamps, times, self.warnings)
+            self.timestamps = read_timestamps(times, len(self.depth), "image", self.warnings)
         if is_file(folder / "groundtruth.txt"):
             self.reference = tum_poses(self, folder / "groundtruth.txt")
         if is_file(folder / "odometry.txt"):
