@@ -23,7 +23,6 @@ from tofuse.sensor.noise import (
     NoiseModel,
     RangeLaw,
     incidence_cosine,
-    noise_model,
 )
 
 CAMERA = Pinhole(40, 30, 30.0, 30.0, 19.5, 14.5)
@@ -236,12 +235,6 @@ def test_broken_files(tmp_path: Path, text: str) -> None:
     (tmp_path / "noise.json").write_text(text)
     with pytest.raises(InputError, match=r"noise\.json"):
         NoiseModel.load(tmp_path / "noise.json")
-
-
-def test_families_by_name() -> None:
-    assert noise_model("kinect2").name == "kinect2"
-    with pytest.raises(InputError, match="no camera called 'leica'"):
-        noise_model("leica")
 
 
 def test_the_documented_file_is_one() -> None:

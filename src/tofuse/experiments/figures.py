@@ -10,33 +10,15 @@ from numpy.typing import NDArray
 
 from tofuse.experiments.peaks import AXES, PeaksRun, PeaksSweep
 from tofuse.report import plots
-from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, svg
+from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, framed, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Float64 = NDArray[np.float64]
 
 _POINTS_RGB = (112, 138, 176)
-
-
-def _axes(width: float, height: float) -> tuple[Figure, Axes]:
-    """Make a figure of that many pixels with one pair of axes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width / 72, height / 72), dpi=72)
-    axes = figure.add_axes((50 / width, 36 / height, (width - 62) / width, (height - 62) / height))
-    axes.patch.set_visible(False)
-    figure.patch.set_visible(False)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(MUTED)
-    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=10.5, length=3)
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    return figure, axes
+_MARGINS = (50.0, 36.0, 12.0, 26.0)  # left, bottom, right, top, in pixels
 
 
 def plan_limits(*groups: Float64) -> Float64:
@@ -70,7 +52,7 @@ def plan(
     extent = box[1] - box[0]
     inner = width - 62.0
     height = float(np.clip(inner * extent[1] / extent[0], 120, 1.15 * inner))
-    figure, axes = _axes(width, height + 62)
+    figure, axes = framed(width, height + 62, _MARGINS)
     scale = max(extent[0] / inner, extent[1] / height)
     middle = box.mean(0)
     x0, x1 = middle[0] - scale * inner / 2, middle[0] + scale * inner / 2
@@ -174,7 +156,7 @@ def sweep(found: PeaksSweep) -> list[str]:
     """Draw figure 5.12: error of each parameter over the noise, with the spread of the seeds."""
     drawn = []
     for k, name in enumerate(AXES):
-        figure, axes = _axes(330, 220)
+        figure, axes = framed(330, 220, _MARGINS)
         unit, factor = ("m", 1.0) if k < 3 else ("°", 180 / np.pi)
         for which, color in ((0, BEFORE), (1, AFTER)):
             mean = factor * found.axes[:, which, k]
@@ -209,7 +191,7 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         points = np.concatenate(
             [c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)]
         )
-        figure, axes = _axes(400, 400 * 0.95)
+        figure, axes = framed(400, 400 * 0.95, _MARGINS)
         some = points[:: max(1, len(points) // 3000)]
         axes.plot(
             some[:, 0], some[:, 2], ".", color=MUTED, markersize=1.2, alpha=0.5, rasterized=True

@@ -16,7 +16,6 @@ Int64 = NDArray[np.int64]
 
 # States of the four tables: literal runs, copy lengths, distances, literals.
 STATES = (64, 64, 256, 1024)
-SYMBOLS = (20, 20, 64, 256)
 
 _RUN_BITS = np.array([0] * 16 + [2, 3, 5, 8], np.int64)
 _COPY_BITS = np.array([0] * 16 + [3, 5, 8, 11], np.int64)

@@ -57,7 +57,6 @@ SCALE = 1  # missing from the depth, a share
 FOCAL = 2  # by which rays are wider than thought, a share
 ERRORS = 3
 
-POSE = 6
 EXPOSURE = 6  # index of the exposure among the unknowns
 UNKNOWNS = 7 + ERRORS
 

@@ -37,7 +37,8 @@ _FULL = 1.5
 # Sizes above the smallest that is flat to begin with, and beyond the last that is full.
 _BACK = 3
 _MORE = 3
-# By which support changes when points are cut in another way.
+# By which the support of clouds changes when their points are cut in another way. The support of
+# pairs of images is counted otherwise, and has a limit of its own (`suspicion`).
 CHANCE = 0.003
 # Farther than such a share of a cell no step moves the points of a view.
 _BOLDEST = 0.5

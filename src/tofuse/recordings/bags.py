@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
-from tofuse.recordings.ros_messages import GREY, check_size, image, taken
+from tofuse.recordings.camera_file import check_size
+from tofuse.recordings.ros_messages import GREY, image, taken
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

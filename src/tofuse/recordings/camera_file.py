@@ -208,6 +208,17 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
     return description, camera
 
 
+def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
+    """Refuse an image (H, W) or (H, W, 3) that isn't of its camera's size, by an InputError."""
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
+            f"{camera.width} x {camera.height}",
+            where=where,
+            remedy="give the camera of these images by --camera",
+        )
+
+
 def read_rays(path: Path) -> RayTable:
     """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
     try:

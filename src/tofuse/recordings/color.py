@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.recordings.camera_file import ColorCamera
+from tofuse.recordings.camera_file import ColorCamera, check_size
 from tofuse.recordings.frames import RangeFrame
 
 Float64 = NDArray[np.float64]
@@ -15,13 +17,21 @@ HIDDEN_SHARE = 0.05
 
 
 def sampled_color(
-    frame: RangeFrame, image: NDArray[np.uint8], color: ColorCamera
+    frame: RangeFrame, image: NDArray[np.uint8], color: ColorCamera | None, where: str | Path
 ) -> NDArray[np.uint8]:
     """Colour (H, W, 3) of each valid depth pixel, from where its point lands in the image.
 
     Black where the point is out of the colour image, or hidden there by a nearer surface that the
-    depth camera sees too.
+    depth camera sees too. Without a camera of its own (None) the image is of the depth pixels.
+
+    Raises
+    ------
+    InputError
+        If the image, which comes from `where`, isn't of its camera's size.
     """
+    check_size(image, frame.camera if color is None else color.camera, where)
+    if color is None:
+        return image
     T = color.T_color_depth
     points = frame.points @ T[:3, :3].T + T[:3, 3]
     uv = color.camera.project(points)

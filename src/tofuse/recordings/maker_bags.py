@@ -22,12 +22,12 @@ from tofuse.recordings.bags import (
     open_bag,
     open_container,
 )
-from tofuse.recordings.camera_file import ColorCamera, load_camera
+from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions
-from tofuse.recordings.ros_messages import ENCODINGS, check_size, color_image, image
+from tofuse.recordings.ros_messages import ENCODINGS, color_image, image
 from tofuse.recordings.sources import FileSource
 
 
@@ -159,15 +159,9 @@ class BagSource(FileSource):
         k = None if self.color is None else self.color.near(frame.timestamp, APART_S)
         if k is None or self.color is None or self.color_camera is None:
             return frame
-        image = color_image(self.message(self.color, k), f"{where}, colour")
-        camera = self.color_camera.camera
-        if image.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
-                f"{camera.width} x {camera.height}",
-                where=f"{where}, colour",
-            )
-        return replace(frame, color_image=sampled_color(frame, image, self.color_camera))
+        where = f"{where}, colour"
+        image = color_image(self.message(self.color, k), where)
+        return replace(frame, color_image=sampled_color(frame, image, self.color_camera, where))
 
     def track(self, topic: str) -> Track | None:
         """Return the messages of a topic, None if there are none."""

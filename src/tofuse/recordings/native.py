@@ -141,7 +141,8 @@ class NativeSource(FileSource):
             confidence = read_image(self.confidence[index], size=size, dtype="uint8")
             confidence = confidence.astype(np.uint8, copy=False)
         if self.color:
-            color = self._registered(frame, self.color[index])
+            path = self.color[index]
+            color = sampled_color(frame, read_color(path), self.description.color, path)
         if self.sigma:
             counts = read_image(self.sigma[index], size=size, dtype="uint16")
             sigma = counts.astype(np.float32) * np.float32(self.description.sigma_unit_m or 0)
@@ -341,19 +342,6 @@ class NativeSource(FileSource):
                     remedy=f"use the camera.json of these images{hint}",
                 )
             return
-
-    def _registered(self, frame: RangeFrame, path: Path) -> NDArray[np.uint8]:
-        """Return the colour of each depth pixel (H, W, 3); black where there is none."""
-        image = read_color(path)
-        color = self.description.color
-        camera = frame.camera if color is None else color.camera
-        if image.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
-                f"{camera.width} x {camera.height}",
-                where=path,
-            )
-        return image if color is None else sampled_color(frame, image, color)
 
     def _fill_metadata(self) -> None:
         about = self.description

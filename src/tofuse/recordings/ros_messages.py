@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
-from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.recordings.camera_file import checked_lens
 
 Float32 = NDArray[np.float32]
@@ -178,17 +178,6 @@ def lens(message: Any, where: str) -> Pinhole:
             )
     coefficients = dict(zip(DISTORTION_ORDER[name], D, strict=False))
     return checked_lens(MODELS[name], info.size, info.values | coefficients, where)
-
-
-def check_size(counts: NDArray[Any], camera: Camera, where: str) -> None:
-    """Refuse an image (H, W) that isn't of its camera's size, by an InputError."""
-    if counts.shape != (camera.height, camera.width):
-        raise InputError(
-            f"is {counts.shape[1]} x {counts.shape[0]} pixels, its camera "
-            f"{camera.width} x {camera.height}",
-            where=where,
-            remedy="give the camera of these images by --camera",
-        )
 
 
 @dataclass(frozen=True)

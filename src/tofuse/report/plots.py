@@ -52,7 +52,9 @@ def _figure_class() -> type[Figure]:
     return Figure
 
 
-def _new(width: float, height: float, margins: tuple[float, float, float, float]) -> Any:
+def framed(
+    width: float, height: float, margins: tuple[float, float, float, float]
+) -> tuple[Figure, Axes]:
     """Make a figure of that many pixels, and axes; margins are left, bottom, right, top."""
     figure = _figure_class()(figsize=(width / 72, height / 72), dpi=72)
     left, bottom, right, top = margins
@@ -129,7 +131,7 @@ def lines(
     bad
         x of frames without a value, marked by crosses on the axis.
     """
-    figure, axes = _new(*size, (52, 36, 10, 20))
+    figure, axes = framed(*size, (52, 36, 10, 20))
     one = len(x) == 1
     for y, color, style in series:
         few = int(np.isfinite(y).sum()) <= 30
@@ -211,7 +213,7 @@ def _plan(box: Float64, view: str, width: int) -> Any:
     extent = box[1] - box[0]
     inner = width - left - right
     height = float(np.clip(inner * extent[1] / extent[0], 130, 1.1 * inner))
-    figure, axes = _new(width, height + bottom + top, (left, bottom, right, top))
+    figure, axes = framed(width, height + bottom + top, (left, bottom, right, top))
     # Grow the box to the shape of the axes, about its middle.
     scale = max(extent[0] / inner, extent[1] / height)
     middle = box.mean(0)

@@ -364,18 +364,3 @@ NOISE: dict[str, NoiseModel] = {
         NoiseModel("unknown", RangeLaw(0.003, 0.003)),
     )
 }
-
-
-def noise_model(name: str) -> NoiseModel:
-    """Return the noise of the family called `name`.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    if name not in NOISE:
-        raise InputError(
-            f"there is no camera called {name!r}", where="noise", remedy=f"use one of {[*NOISE]}"
-        )
-    return NOISE[name]

@@ -203,7 +203,7 @@ class AzureKinectSource(FileSource):
         image = as_color(
             parse_image(self.file.read(block), where, size=(camera.width, camera.height))
         )
-        return sampled_color(frame, image, self.color_camera)
+        return sampled_color(frame, image, self.color_camera, where)
 
     def _beside(self, track: Track | None, limit: float, delay: int) -> list[Block | None]:
         """Return the block of another track at the time of each depth frame, or None."""

@@ -22,7 +22,7 @@ from tofuse.recordings.bags import (
     damaged,
     open_bag,
 )
-from tofuse.recordings.camera_file import load_camera
+from tofuse.recordings.camera_file import check_size, load_camera
 from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import ReaderOptions, Sniff
@@ -30,7 +30,6 @@ from tofuse.recordings.ros_messages import (
     ENCODINGS,
     GREY,
     Cloud,
-    check_size,
     cloud,
     decompressed,
     image,

@@ -123,8 +123,9 @@ class SensSource(FileSource):
         frame = RangeFrame(index, float(self.timestamps[index]), self.camera, depth, self.kind)
         if not packed_color or self.color is None:
             return frame
+        where = f"{where}: colour"
         image = self._color(packed_color, where)
-        return replace(frame, color_image=sampled_color(frame, image, self.color))
+        return replace(frame, color_image=sampled_color(frame, image, self.color, where))
 
     def _read_header(self, file: BinaryIO) -> int:
         version, length = struct.unpack("<IQ", self._take(file, 12))
@@ -224,9 +225,9 @@ class SensSource(FileSource):
         assert self.color is not None
         size = (self.color.camera.width, self.color.camera.height)
         if self.color_packing != RAW:
-            return as_color(parse_image(packed, f"{where}: colour", size=size))
+            return as_color(parse_image(packed, where, size=size))
         if len(packed) != 3 * size[0] * size[1]:
-            raise InputError(f"has {len(packed)} bytes of colour", where=where)
+            raise InputError(f"has {len(packed)} bytes", where=where)
         return np.frombuffer(packed, np.uint8).reshape(size[1], size[0], 3)
 
     def _take(self, file: BinaryIO, count: int) -> bytes:
