@@ -31,82 +31,105 @@ SQUARES_M = 4
 AGREE_SIZE = 5
 
 
+# Poses are scored so many at a time, the numbers of each in a column of a block, so that the
+# processor works on several at once. Rows of a block: the pose (rotation, then translation), a
+# point where the pose moves it to, what the other image holds there, and the sums: support less
+# violations, the weights of the points whose albedo is compared, and their differences in log
+# albedo, once and squared.
+_LANES = 128
+_TURN, _MOVE, _AT, _SEEN, _TOTAL, _LIT = 0, 9, 12, 15, 20, 21
+_ROWS = 24
+
+
 @kernel
-def _judged(
+def _judge(
     points: Float32,
     normals: Float32,
     light: Float32,
     grid: Float32,
     frame: Float64,
-    tx: float,
-    ty: float,
-    tz: float,
     reach: float,
-    sign: float,
-    lit: Float64,
+    block: Float32,
     node: NDArray[np.int32],
-) -> float:
-    """Support less twice the free-space violation, of points that are turned already.
+) -> None:
+    """Add to the sums of each pose what one image's points say of it, landing in the other's.
 
-    Points and normals are (3, N), so that several points are projected at once; `node` (N,) is
-    where their places in the image, row by row, are kept meanwhile. Adds to `lit` (3,) the weights
-    of the points whose albedo is compared, and their differences in log albedo, times `sign`, once
-    and squared.
+    A point supports a pose by up to 1, and counts twice against it where the other camera saw
+    through. `node` (LANES,) is where the point's places in the image, row by row, are kept
+    meanwhile.
     """
     rows, columns = np.int32(grid.shape[0]), np.int32(grid.shape[1])
-    mx, my, mz = np.float32(tx), np.float32(ty), np.float32(tz)
+    planes = grid.reshape(grid.size)
     su, sv = np.float32(frame[2]), np.float32(frame[3])
     u0, v0 = np.float32(0.5 - frame[0] * frame[2]), np.float32(0.5 - frame[1] * frame[3])
-    nearest, none, one = np.float32(_NEAREST), np.float32(0), np.float32(1)
-    px, py, pz = points[0], points[1], points[2]
-    n0, n1, n2 = normals[0], normals[1], normals[2]
+    nearest, none, one, two = np.float32(_NEAREST), np.float32(0), np.float32(1), np.float32(2)
     # What is beyond is cut here, so that it has a place in an integer.
     far_u, far_v = np.float32(columns), np.float32(rows)
-    for k in range(len(node)):
-        z = pz[k] + mz
-        before = z > nearest
-        inverse = one / z if before else none
-        u = (px[k] + mx) * inverse * su + u0
-        v = (py[k] + my) * inverse * sv + v0
-        inside = before & (u > none) & (v > none) & (u < far_u) & (v < far_v)
-        j = np.int32(u if inside else none)
-        i = np.int32(v if inside else none)
-        node[k] = i * columns + j if inside else np.int32(-1)
-    planes = grid.reshape(grid.size // 5, 5)
-    times = np.float32(sign)
-    weights, first, second = np.float32(0), np.float32(0), np.float32(0)
-    reach32 = np.float32(reach)
-    per2 = np.float32(1.0 / (reach * reach))
-    two = np.float32(2)
-    total = none
-    for k in range(len(node)):
-        at = node[k]
-        if at < 0:
+    reach32, per2 = np.float32(reach), np.float32(1.0 / (reach * reach))
+    for k in range(len(points)):
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        landed = 0
+        for b in range(_LANES):
+            x = block[b] * px + block[_LANES + b] * py + block[2 * _LANES + b] * pz
+            y = block[3 * _LANES + b] * px + block[4 * _LANES + b] * py + block[5 * _LANES + b] * pz
+            z = block[6 * _LANES + b] * px + block[7 * _LANES + b] * py + block[8 * _LANES + b] * pz
+            x += block[_MOVE * _LANES + b]
+            y += block[(_MOVE + 1) * _LANES + b]
+            z += block[(_MOVE + 2) * _LANES + b]
+            before = z > nearest
+            inverse = one / z if before else none
+            u = x * inverse * su + u0
+            v = y * inverse * sv + v0
+            inside = before & (u > none) & (v > none) & (u < far_u) & (v < far_v)
+            j = np.int32(u if inside else none)
+            i = np.int32(v if inside else none)
+            node[b] = i * columns + j if inside else np.int32(-1)
+            landed += inside
+            block[_AT * _LANES + b] = x
+            block[(_AT + 1) * _LANES + b] = y
+            block[(_AT + 2) * _LANES + b] = z
+        if landed == 0:
             continue
-        plane = planes[at]
-        d = plane[3]
-        z = pz[k] + mz
-        if d <= none:
-            if d < none and z < -d - reach32:
-                total -= two
-            continue
-        r = plane[0] * (px[k] + mx) + plane[1] * (py[k] + my) + plane[2] * z - d
-        if r < -reach32:
-            total -= two
-        elif r < reach32:
-            c = plane[0] * n0[k] + plane[1] * n1[k] + plane[2] * n2[k]
-            if c > none:
-                w = c * (one - r * r * per2)
-                total += w
-                lighter = times * (plane[4] - light[k])
-                if lighter == lighter:
-                    weights += w
-                    first += w * lighter
-                    second += w * lighter * lighter
-    lit[0] += weights
-    lit[1] += first
-    lit[2] += second
-    return float(total)
+        for b in range(_LANES):
+            at = 5 * max(node[b], np.int32(0))
+            block[_SEEN * _LANES + b] = planes[at]
+            block[(_SEEN + 1) * _LANES + b] = planes[at + 1]
+            block[(_SEEN + 2) * _LANES + b] = planes[at + 2]
+            block[(_SEEN + 3) * _LANES + b] = planes[at + 3] if node[b] >= 0 else none
+            block[(_SEEN + 4) * _LANES + b] = planes[at + 4]
+        nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
+        level = light[k]
+        for b in range(_LANES):
+            m0, m1 = block[_SEEN * _LANES + b], block[(_SEEN + 1) * _LANES + b]
+            m2, d = block[(_SEEN + 2) * _LANES + b], block[(_SEEN + 3) * _LANES + b]
+            z = block[(_AT + 2) * _LANES + b]
+            r = m0 * block[_AT * _LANES + b] + m1 * block[(_AT + 1) * _LANES + b] + m2 * z - d
+            c = (
+                m0 * (block[b] * nx + block[_LANES + b] * ny + block[2 * _LANES + b] * nz)
+                + m1
+                * (
+                    block[3 * _LANES + b] * nx
+                    + block[4 * _LANES + b] * ny
+                    + block[5 * _LANES + b] * nz
+                )
+                + m2
+                * (
+                    block[6 * _LANES + b] * nx
+                    + block[7 * _LANES + b] * ny
+                    + block[8 * _LANES + b] * nz
+                )
+            )
+            through = ((d > none) & (r < -reach32)) | ((d < none) & (z < -d - reach32))
+            fits = (d > none) & (r >= -reach32) & (r < reach32) & (c > none)
+            w = c * (one - r * r * per2) if fits else none
+            block[_TOTAL * _LANES + b] += w - (two if through else none)
+            lighter = block[(_SEEN + 4) * _LANES + b] - level
+            known = lighter == lighter
+            w = w if known else none
+            lighter = lighter if known else none
+            block[_LIT * _LANES + b] += w
+            block[(_LIT + 1) * _LANES + b] += w * lighter
+            block[(_LIT + 2) * _LANES + b] += w * lighter * lighter
 
 
 @kernel
@@ -151,81 +174,44 @@ def score_grid(
         (A, B), written: support less twice the violations and what albedo says against it, as a
         share of all points.
     """
-    n, m = source_points.shape[0], target_points.shape[0]
-    P = np.empty((3, n), np.float32)
-    PN = np.empty((3, n), np.float32)
-    Q = np.empty((3, m), np.float32)
-    QN = np.empty((3, m), np.float32)
-    nodes = np.empty(n, np.int32), np.empty(m, np.int32)
-    lit = np.empty(3)
-    share = 1.0 / max(n + m, 1)
-    for a in range(start, stop):
-        R = rotations[a]
-        for k in range(n):
+    share = 1.0 / max(len(source_points) + len(target_points), 1)
+    per2 = 1.0 / (albedo * albedo)
+    many = translations.shape[1]
+    there, back = np.zeros(_ROWS * _LANES, np.float32), np.zeros(_ROWS * _LANES, np.float32)
+    node = np.empty(_LANES, np.int32)
+    for first in range(start * many, stop * many, _LANES):
+        count = min(_LANES, stop * many - first)
+        for b in range(_LANES):
+            a, c = divmod(first + min(b, count - 1), many)
+            R, t = rotations[a], translations[min(a, translations.shape[0] - 1), c]
             for i in range(3):
-                P[i, k] = (
-                    R[i, 0] * source_points[k, 0]
-                    + R[i, 1] * source_points[k, 1]
-                    + R[i, 2] * source_points[k, 2]
-                )
-                PN[i, k] = (
-                    R[i, 0] * source_normals[k, 0]
-                    + R[i, 1] * source_normals[k, 1]
-                    + R[i, 2] * source_normals[k, 2]
-                )
-        for k in range(m):
-            for i in range(3):
-                Q[i, k] = (
-                    R[0, i] * target_points[k, 0]
-                    + R[1, i] * target_points[k, 1]
-                    + R[2, i] * target_points[k, 2]
-                )
-                QN[i, k] = (
-                    R[0, i] * target_normals[k, 0]
-                    + R[1, i] * target_normals[k, 1]
-                    + R[2, i] * target_normals[k, 2]
-                )
-        row = min(a, translations.shape[0] - 1)
-        for b in range(translations.shape[1]):
-            t = translations[row, b]
-            lit[:] = 0.0
-            total = _judged(
-                P,
-                PN,
-                source_light,
-                target_grid,
-                target_frame,
-                t[0],
-                t[1],
-                t[2],
-                reach,
-                1.0,
-                lit,
-                nodes[0],
-            )
-            # The inverse moves by -R^T t.
-            sx = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
-            sy = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
-            sz = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
-            total += _judged(
-                Q,
-                QN,
-                target_light,
-                source_grid,
-                source_frame,
-                sx,
-                sy,
-                sz,
-                reach,
-                -1.0,
-                lit,
-                nodes[1],
-            )
-            if lit[0] > 0:
-                # What all differ by is the exposure.
-                spread = (lit[2] - lit[1] * lit[1] / lit[0]) / (albedo * albedo)
-                total -= min(spread, _MOST_AGAINST * lit[0])
-            scores[a, b] = total * share
+                moved_back = 0.0
+                for j in range(3):
+                    there[(_TURN + 3 * i + j) * _LANES + b] = R[i, j]
+                    back[(_TURN + 3 * i + j) * _LANES + b] = R[j, i]
+                    moved_back -= R[j, i] * t[j]
+                there[(_MOVE + i) * _LANES + b] = t[i]
+                back[(_MOVE + i) * _LANES + b] = moved_back
+        there[_TOTAL * _LANES :] = np.float32(0)
+        back[_TOTAL * _LANES :] = np.float32(0)
+        _judge(
+            source_points, source_normals, source_light, target_grid, target_frame, reach, there,
+            node,
+        )  # fmt: skip
+        _judge(
+            target_points, target_normals, target_light, source_grid, source_frame, reach, back,
+            node,
+        )  # fmt: skip
+        for b in range(count):
+            total = np.float64(there[_TOTAL * _LANES + b]) + back[_TOTAL * _LANES + b]
+            weight = np.float64(there[_LIT * _LANES + b]) + back[_LIT * _LANES + b]
+            if weight > 0:
+                # What all differ by is the exposure; the way back sees its negative.
+                mean = np.float64(there[(_LIT + 1) * _LANES + b]) - back[(_LIT + 1) * _LANES + b]
+                square = np.float64(there[(_LIT + 2) * _LANES + b]) + back[(_LIT + 2) * _LANES + b]
+                total -= min((square - mean * mean / weight) * per2, _MOST_AGAINST * weight)
+            a, c = divmod(first + b, many)
+            scores[a, c] = total * share
 
 
 @kernel
