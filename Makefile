@@ -1,8 +1,11 @@
-# Each target sets up its own .venv from the pinned versions in requirements/dev.txt.
+# `make help` says what there is. Each target sets up its own .venv from the pinned versions in requirements/dev.txt.
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint docs format lock clean
+.PHONY: help demo test lint docs format lock clean
+
+help:                       ## this list
+	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 .venv/.ready: requirements/dev.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit("tofuse needs Python 3.11 or newer, and $(PYTHON) is %s; try: make PYTHON=python3.12 ..." % sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
@@ -44,5 +47,5 @@ lock: .venv/.ready          ## pin the newest versions that pyproject.toml allow
 	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group docs -c requirements/dev.txt -o requirements/docs.txt --upgrade
 	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --all-extras pyproject.toml -o requirements/extras.txt --upgrade
 
-clean:
+clean:                      ## remove the environment and what was built
 	rm -rf .venv build dist

@@ -248,6 +248,12 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
         ("--max-depth", "3.0", "2.0"),
         "tofuse: ",
     ),
+    "misspelt option": (
+        (*RUN, "--maxdepth", "3"),
+        ("--maxdepth", "--max-depth"),
+        "tofuse run: ",
+    ),
+    "one word too many": (("demo", "room"), ("room",), "tofuse demo: "),
     "unknown method": ((*RUN, "--method", "magic"), ("--method", "'magic'", "thesis"), "tofuse: "),
     "unknown format": ((*RUN, "--format", "magic"), ("--format", "'magic'", "native"), "tofuse: "),
     "wrong format": ((*RUN, "--format", "tum"), ("REC",), "tofuse: "),

@@ -119,6 +119,8 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     (tmp_path / "file.mkv").write_bytes(bytes(10))
     (tmp_path / "file").mkdir()
     (tmp_path / "file" / "a.docx").touch()
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.PNG").touch()
     for name, words in (
         ("missing", "doesn't exist"),
         ("empty", "empty folder"),
@@ -126,6 +128,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         ("inside", "no recording that is known"),
         ("file.mkv", "suffix '.mkv'"),
         ("file", r"1 \.docx"),
+        ("images", r"1 \.PNG; put .* into a folder depth/ .* camera\.json"),
         ("file.mkv/x", "no folder"),
         ("a\0b", "no path"),
         ("n" * 300, "too long"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -30,6 +31,31 @@ class Parser(argparse.ArgumentParser):
         sys.stderr.write(f"{self.prog}: {message}; see `{self.prog} --help`\n")
         sys.exit(2)
 
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        """Parse; the command itself says which of its words it does not know."""
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            command: Parser = getattr(found, "parser", self)
+            command.refuse(unknown)
+        return found
+
+    def refuse(self, unknown: Sequence[str]) -> NoReturn:
+        """Say what is not known, and which option is nearest to it."""
+        word = unknown[0].partition("=")[0]
+        near = get_close_matches(word, self._option_string_actions, 1)
+        self.error(f"{word} is not known" + (f", {near[0]} is" if near else ""))
+
+
+class _Help(argparse.HelpFormatter):
+    """Puts each command and what it does on one line."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog)
+        # What argparse itself counts leaves out that commands are indented once more.
+        self._action_max_length = 15
+
 
 def make_parser() -> Parser:
     """Return the parser of the whole command line."""
@@ -37,9 +63,11 @@ def make_parser() -> Parser:
         prog="tofuse",
         description="Turn recordings of Time-of-Flight cameras into one 3D model and the "
         "camera's trajectory, and say how far the result can be trusted.",
+        epilog="To begin: `tofuse demo`. `tofuse COMMAND --help` tells more of each.",
+        formatter_class=_Help,
     )
     parser.add_argument("--version", action="version", version=f"tofuse {__version__}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _run(commands)
     _demo(commands)
     _simulate(commands)
@@ -73,7 +101,7 @@ def _command(
         function: Callable[[argparse.Namespace], int] = getattr(functions, name)
         return function(arguments)
 
-    parser.set_defaults(command=call)
+    parser.set_defaults(command=call, parser=parser)
     return parser
 
 
@@ -157,7 +185,11 @@ def _demo(commands: Any) -> None:
     )
     p.add_argument("--scene", choices=DEMO_SCENES, default="room", help="what to simulate (room)")
     p.add_argument(
-        "--out", type=Path, default=Path("tofuse-demo"), metavar="DIR", help="(tofuse-demo)"
+        "--out",
+        type=Path,
+        default=Path("tofuse-demo"),
+        metavar="DIR",
+        help="folder for it (tofuse-demo)",
     )
     p.add_argument("--overwrite", action="store_true", help="replace an earlier demo in DIR")
     p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
@@ -200,7 +232,7 @@ def _inspect(commands: Any) -> None:
 
 
 def _convert(commands: Any) -> None:
-    p = _command(commands, "convert", "write any recording as a native folder")
+    p = _command(commands, "convert", "write any recording as a native, TUM or Open3D folder")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder for it")
     p.add_argument(
@@ -293,7 +325,12 @@ def _noise(commands: Any) -> None:
 def _evaluate(commands: Any) -> None:
     p = _command(commands, "evaluate", "compare a trajectory with a reference")
     p.add_argument("estimate", type=Path, metavar="ESTIMATE", help="a TUM trajectory or a result")
-    p.add_argument("reference", type=Path, metavar="REFERENCE", help="a TUM trajectory")
+    p.add_argument(
+        "reference",
+        type=Path,
+        metavar="REFERENCE",
+        help="a TUM trajectory, or a folder with a groundtruth.txt",
+    )
     p.add_argument(
         "--recording", type=Path, metavar="REC", help="also measure how well its images agree"
     )

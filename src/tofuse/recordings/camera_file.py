@@ -21,6 +21,7 @@ SCHEMA = 1
 MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
 AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
+_METRES = "the metres of one count, such as 0.001"
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 _KEYS = (
     "schema",
@@ -142,7 +143,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     kind: DepthKind = "z"
     if not (clouds and "model" not in data):
         camera, size = _lens(get)
-        unit = get.positive("depth_unit_m", needed=True) or 0.001
+        unit = get.positive("depth_unit_m", needed=True, hint=_METRES) or 0.001
         if not 1e-9 <= unit <= 1:
             raise get.error("depth_unit_m", f"is {unit}", "give the metres of one count, at most 1")
         kind = get.choice("depth_kind", ("z", "range"), needed=True)  # type: ignore[assignment]
@@ -284,10 +285,12 @@ class _Fields:
             raise self.error(field, f"is {value}", f"give a finite {hint.removeprefix('a ')}")
         return value
 
-    def positive(self, field: str, *, needed: bool = False) -> float | None:
-        value = self.number(field, needed=needed, hint="a positive number")
+    def positive(
+        self, field: str, *, needed: bool = False, hint: str = "a positive number"
+    ) -> float | None:
+        value = self.number(field, needed=needed, hint=hint)
         if value is not None and value <= 0:
-            raise self.error(field, f"is {value}", "give a positive number")
+            raise self.error(field, f"is {value}", f"give {hint}")
         return value
 
     def pixels(self, field: str) -> int:

@@ -22,6 +22,9 @@ CLOSED = {
     ),
 }
 
+# A folder with these may be depth images whose camera is not told.
+_IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
+
 
 def readers() -> dict[str, Reader]:
     """Return the readers by name."""
@@ -174,14 +177,19 @@ def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> Input
             where=path,
             remedy=", or ".join(dict.fromkeys(settle)),
         )
+    remedy = "check the path"
     if path.is_dir():
         kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
         saw = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
         what = f"is no recording that is known: there are {saw}"
+        if any(kind.lower() in _IMAGES for kind in kinds):
+            remedy = (
+                "put the depth images into a folder depth/ in it, and a camera.json beside that"
+            )
     else:
         what = f"is no recording that is known: a file with the suffix {path.suffix!r}"
     return InputError(
-        what, where=path, remedy=f"check the path, or give --format ({', '.join(readers())})"
+        what, where=path, remedy=f"{remedy}, or give --format ({', '.join(readers())})"
     )
 
 
