@@ -46,6 +46,8 @@ def print_figures(folder: Path, recording: Path) -> None:
     tracked = sum(frame["status"] == "tracked" for frame in run["frames"])
     print(f"method: {run['config']['method']}")
     print(f"verdict: {run['verdict']} ({', '.join(r['code'] for r in run['reasons']) or 'none'})")
+    for reason in run["reasons"]:
+        print(f"  {reason['code']}: {reason['text']}")
     print(f"frames tracked: {tracked} of {len(run['frames'])}, loops closed: {closed}")
     error = evaluate_trajectory(
         *read_tum(folder / "trajectory.txt"), *read_tum(recording / "groundtruth.txt")

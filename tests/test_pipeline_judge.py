@@ -282,7 +282,8 @@ def test_drift_counts_by_what_the_registrations_know() -> None:
     # The end is off by the square root of eight of them, and a loop halves that.
     (whole,) = judge(evidence(gaps=(), sigma=(0.008, 0.0001)))[1]
     assert whole.code == "uncertain_poses"
-    assert "off by 18 mm rms, more than 14 mm" in whole.text
+    assert "off by 18 mm rms, " in whole.text
+    assert "held to 14 mm" in whole.text
     assert codes(evidence(sigma=(0.008, 0.0001))) == []
 
 

@@ -268,8 +268,9 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     _, bound = expected_error(graph)
     if bound > promised:
         text = (
-            f"By what the registrations know of their errors, the path may be off by "
-            f"{bound * 1e3:.0f} mm rms, more than {promised * 1e3:.0f} mm."
+            f"The path may be off by {bound * 1e3:.0f} mm rms, by what was measured (two sigma). "
+            f"To be called good it must be held to {promised * 1e3:.0f} mm: 1 cm and 1 % of its "
+            "length."
         )
         yield Reason("uncertain_poses", _all_posed(e), text)
 
