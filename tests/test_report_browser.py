@@ -104,6 +104,14 @@ def test_looks_follow_the_reader(browser, report, tmp_path, scheme, size):
         assert (min(brightness) > 200) == (scheme == "light")
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.screenshot(path=tmp_path / f"{scheme}.png", full_page=True)
+        page.locator("#viewer.live").wait_for(timeout=20_000)
+        page.wait_for_timeout(200)
+        # The model fills the canvas, all but a border on all sides.
+        bright = seen.pixels("#viewer canvas")[8:-8, 8:-8].max(-1) > 60  # its corners are round
+        rows, columns = bright.any(1), bright.any(0)
+        assert not rows[[0, -1]].any()
+        assert not columns[[0, -1]].any()
+        assert max(rows.mean(), columns.mean()) > 0.7
         seen.check()
 
 

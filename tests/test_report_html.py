@@ -20,6 +20,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
 from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.report import plots
 from tofuse.report.extras import ReportExtras
 from tofuse.report.html import write_report
 from tofuse.report.pictures import draw
@@ -370,6 +371,13 @@ def test_a_turned_model_is_measured_along_its_own_sides(exact, tmp_path):
     for name, size in (("width", 0.3), ("height", 0.4), ("depth", 0.6)):
         for cell in got.row(name)[1:3]:
             assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
+
+
+def test_a_camera_that_hardly_moves_is_drawn_in_millimetres():
+    points = np.random.default_rng(2).uniform(-1, 1, (500, 3))
+    for size, unit in ((3.0, "m"), (0.01, "mm")):
+        drawn = plots.model(size * points, np.zeros((1, 3)), None, "above", measured=None, label="")
+        assert f"forward, {unit}<" in drawn
 
 
 def test_reasons_of_one_kind_are_said_together(tmp_path):

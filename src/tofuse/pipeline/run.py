@@ -33,7 +33,14 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import average_still
-from tofuse.results.output import OutputFolder, is_result, plain, read_run_json, write_result
+from tofuse.results.output import (
+    RECORDING,
+    OutputFolder,
+    is_result,
+    plain,
+    read_run_json,
+    write_result,
+)
 from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import verdict_of
 
@@ -288,7 +295,7 @@ def _report(recording: Recording, config: Config, result: Reconstruction, folder
     pictures = draw(result.diagnostics.samples)
     clouds = () if pictures else recording.sample(_CLOUDS)
     extras = ReportExtras(
-        title=Path(recording.path).name or recording.path,
+        title=_title(Path(recording.path)) or recording.path,
         filter_steps=_filter_steps(config, recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth_points(recording),
@@ -297,6 +304,11 @@ def _report(recording: Recording, config: Config, result: Reconstruction, folder
     )
     write_report(result, folder / "report.html", extras)
     write_kept(result, pictures, folder / NAME)
+
+
+def _title(path: Path) -> str:
+    """What a recording is called: by its folder, where its own name says nothing."""
+    return (path.parent.name if path.name == RECORDING else "") or path.name
 
 
 def _filter_steps(

@@ -31,6 +31,7 @@ _VARIABLES = {
     BAD: "bad",
 }
 _MODEL = (112, 138, 176)  # of the model's points: readable on white and on near-black
+_SMALL_M = 0.6
 _STYLE: Any = {
     "svg.fonttype": "none",
     "image.composite_image": False,
@@ -154,7 +155,7 @@ def lines(
     if zero:
         axes.axhline(0, color=MUTED, linewidth=0.8)
     if floor:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.03 * axes.get_ylim()[1])
     if bad is not None and len(bad):
         axes.plot(
             bad,
@@ -220,12 +221,16 @@ def _plan(box: Float64, view: str, width: int) -> Any:
     axes.set_xlim(middle[0] - scale * inner / 2, middle[0] + scale * inner / 2)
     axes.set_ylim(middle[1] - scale * height / 2, middle[1] + scale * height / 2)
     (a, sa), (b, sb) = VIEWS[view]
+    # In metres, the places of a camera that hardly moves would take three digits each.
+    unit, per_m = ("mm", 1000) if max(extent) < _SMALL_M else ("m", 1)
     for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
         axis.set_major_locator(_locator(inner / 60 if axis is axes.xaxis else height / 40))
-        if sign < 0:
-            axis.set_major_formatter(lambda value, _: f"{-value + 0.0:.6g}".replace("-", "−"))
-    axes.set_xlabel(f"{_NAMES[a]}, m", color=MUTED, fontsize=10.5, labelpad=2)
-    axes.set_ylabel(f"{_NAMES[b]}, m", color=MUTED, fontsize=10.5, labelpad=2)
+        by = sign * per_m
+        axis.set_major_formatter(
+            lambda value, _, by=by: f"{by * value + 0.0:.6g}".replace("-", "−")
+        )
+    axes.set_xlabel(f"{_NAMES[a]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
+    axes.set_ylabel(f"{_NAMES[b]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
     return figure, axes
 
 

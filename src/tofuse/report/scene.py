@@ -160,6 +160,7 @@ def packed(scene: Scene) -> dict[str, Any]:
         "extent": extent.tolist(),
         "center": scene.center.tolist(),
         "size": scene.size,
+        "box": scene.box.tolist(),
         "spacing": scene.spacing,
         "heights": list(height_range(scene.points)),
         "yaw": YAW,

@@ -30,6 +30,8 @@ def filters(s: Subject) -> Values:
                 gone = len(last) - len(frame)
                 part = words.share(gone / len(last) if len(last) else None)
                 text = f"removed {part} ({gone:,} points), {len(frame):,} are left"
+                if not gone and name not in removed:
+                    text = f"corrects; {words.count(len(frame), 'point')}"
                 before = here.get(name, (0, 0))
                 here[name] = (before[0] + gone, before[1] + len(last))
             else:
@@ -56,7 +58,8 @@ def filters(s: Subject) -> Values:
                 " In the images grey has no measurement and pink was removed by this filter; "
                 "below, the points seen from above and to the side."
             )
-    names = [*removed, *(n for n in here if n not in removed)]
+    # What corrects removes nothing.
+    names = [*removed, *(n for n in here if n not in removed and here[n][0])]
     rows = []
     for name in names:
         gone, seen = here.get(name, (0, 0))

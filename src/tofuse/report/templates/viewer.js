@@ -113,7 +113,33 @@
   const eye = {};
   function reset(changes) {
     Object.assign(eye, start, { target: start.target.slice() }, changes || {});
+    fit();
     draw();
+  }
+  // Half the height that is seen at depth 1; less of a canvas that is narrow.
+  const lens = () => {
+    const aspect = canvas.clientWidth / Math.max(1, canvas.clientHeight);
+    const f = Math.min(1, aspect / 1.2) / Math.tan(0.35);
+    return [f / aspect, f];
+  };
+  // Moves the eye until the box fills the canvas, all but a border.
+  function fit() {
+    const R = turn(), f = lens(), corners = [];
+    for (let k = 0; k < 8; k++) corners.push([0, 1, 2].map((axis) => scene.box[(k >> axis) & 1][axis]));
+    for (let round = 0; round < 8; round++) {
+      let fill = 0;
+      for (let k = 0; k < 2; k++) {
+        const seen = corners.map((corner) => {
+          const from = corner.map((value, axis) => value - eye.target[axis]);
+          return f[k] * dot(R[k], from) / Math.max(dot(R[2], from) + eye.distance, 0.05 * scene.size);
+        });
+        const low = Math.min(...seen), high = Math.max(...seen);
+        fill = Math.max(fill, (high - low) / 2);
+        const step = (low + high) / 2 * eye.distance / f[k];
+        for (let axis = 0; axis < 3; axis++) eye.target[axis] += step * R[k][axis];
+      }
+      eye.distance = Math.max(0.3 * scene.size, eye.distance * (1 + fill / 0.85) / 2);
+    }
   }
 
   // The world is x right, y down, z forward; rows of the turn into such a view.
@@ -147,10 +173,9 @@
     const view = new Float32Array([
       R[0][0], -R[1][0], -R[2][0], 0, R[0][1], -R[1][1], -R[2][1], 0,
       R[0][2], -R[1][2], -R[2][2], 0, t[0], -t[1], -t[2], 1]);
-    const f = 1 / Math.tan(0.35), near = 0.01 * eye.distance, far = eye.distance + 50 * scene.size;
-    const narrow = Math.min(1, (width / height) / 1.2);
-    const lens = new Float32Array([
-      f * narrow * height / width, 0, 0, 0, 0, f * narrow, 0, 0,
+    const [fx, fy] = lens(), near = 0.01 * eye.distance, far = eye.distance + 50 * scene.size;
+    const projection = new Float32Array([
+      fx, 0, 0, 0, 0, fy, 0, 0,
       0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0]);
     const at = [0, 1, 2].map((k) => eye.target[k] - R[2][k] * eye.distance);
 
@@ -159,11 +184,11 @@
       gl.useProgram(dots);
       const u = (name) => gl.getUniformLocation(dots, name);
       gl.uniformMatrix4fv(u("view"), false, view);
-      gl.uniformMatrix4fv(u("lens"), false, lens);
+      gl.uniformMatrix4fv(u("lens"), false, projection);
       gl.uniform3fv(u("low"), scene.low);
       gl.uniform3fv(u("extent"), scene.extent);
       gl.uniform3fv(u("eye"), at);
-      gl.uniform1f(u("size"), 1.5 * scene.spacing * f * narrow * height / 2);
+      gl.uniform1f(u("size"), 1.5 * scene.spacing * fy * height / 2);
       gl.uniform1f(u("most"), 10 * ratio);
       gl.uniform1f(u("byHeight"), on("height") ? 1 : 0);
       gl.uniform2f(u("heights"), scene.heights[0], Math.max(scene.heights[1] - scene.heights[0], 1e-6));
@@ -193,7 +218,7 @@
     }
     gl.useProgram(wires);
     gl.uniformMatrix4fv(gl.getUniformLocation(wires, "view"), false, view);
-    gl.uniformMatrix4fv(gl.getUniformLocation(wires, "lens"), false, lens);
+    gl.uniformMatrix4fv(gl.getUniformLocation(wires, "lens"), false, projection);
     for (const name in lines) {
       if (!lines[name].count || !(name === "chosen" || on(name))) continue;
       gl.uniform3fv(gl.getUniformLocation(wires, "ink"), inks[name]);
