@@ -34,6 +34,7 @@ from tofuse.posegraph.refinement import NoRefinement
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
+from tofuse.results.verdict import REASONS
 from tofuse.simulation.record import simulate
 
 Float64 = NDArray[np.float64]
@@ -184,6 +185,11 @@ def table(runs: list[Run]) -> str:
     for right, name in ((True, "right"), (False, "wrong")):
         cells = "".join(f"{counts[right, v]:10}" for v in ("good", "degraded", "failed"))
         lines.append(f"{name:8}{cells}")
+    for right, name in ((True, "right"), (False, "wrong")):
+        codes = [run.codes for run in runs if run.right == right and run.verdict == "degraded"]
+        forced = Counter(c for each in codes for c in each if REASONS[c][0] == "degraded")
+        told = ", ".join(f"{count} {code}" for code, count in forced.most_common())
+        lines.append(f"{len(codes)} {name} and degraded, by reason: {told}")
     good = counts[True, "good"] + counts[False, "good"]
     wrong = sum(not run.right for run in runs)
     lines.append(f"of {good} called good {counts[True, 'good'] / max(good, 1):.1%} are right")
