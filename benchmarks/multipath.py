@@ -1,20 +1,26 @@
-"""Errors of range before and after the compensation of multipath.
+"""Errors of range before and after the compensation of multipath, and when it stays.
 
-    python benchmarks/multipath.py [folder of sr4000_corridor]
+    python benchmarks/multipath.py errors [--corridor folder of sr4000_corridor]
+    python benchmarks/multipath.py trial [--scenes room rail] [--seeds 1] [--no-runs]
 
-Simulated scenes: |error| against the truth over the pixels that no other gross error hits (mixed,
-wrapped, saturated, smeared), median and 90th percentile, and the median of the signed error. Under
-"all effects" the noise of single pixels is in the first two. The gain is found from the frames
-themselves; that of the simulated camera is 3482. Of the corner, the angles between the planes
-through its surfaces, whose truth is 90 degrees.
+`errors`. Simulated scenes: |error| against the truth over the pixels that no other gross error
+hits (mixed, wrapped, saturated, smeared), median and 90th percentile, and the median of the signed
+error. Under "all effects" the noise of single pixels is in the first two. The gain is found from
+the frames themselves; that of the simulated camera is 3482. Of the corner, the angles between the
+planes through its surfaces, whose truth is 90 degrees.
 
 The recording has no truth. Its corridor has flat walls that stand at right angles: printed is how
 far the pixels lie from the planes of its large surfaces, and the angles between them.
+
+`trial`. Simulated recordings with all effects, and with all but multipath: whether the trial lets
+the compensation stay, in the whole recording and in five parts of it (halves, the middle half, and
+either every second frame), and the final error of whole runs (ATE rms) that keep it and that leave
+it out.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,18 +28,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.filters.multipath import Multipath, MultipathCorrector
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.threads import threads
+from tofuse.pipeline.config import Config
+from tofuse.pipeline.learn import learnt
+from tofuse.pipeline.reconstruct import fitted, reconstruct
+from tofuse.pipeline.run import Options, resolve
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
 from tofuse.simulation import record
 from tofuse.simulation.effects import Effects, Flag
 from tofuse.simulation.render import render
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
 SCENES = ("corner", "room", "empty-room", "corridor", "box", "torso")
+TRIED = ("room", "empty-room", "corridor", "rail", "box", "torso")
+OBJECTS = ("box", "torso")
 ALBEDOS = (0.2, 0.35, 0.6, 0.9)
 FRAMES = 8
 GROSS = Flag.NO_RETURN | Flag.UNDER_EXPOSED | Flag.SATURATED | Flag.MIXED | Flag.WRAPPED
@@ -208,8 +222,77 @@ def surfaces_of(frame: RangeFrame, trusted: NDArray[np.bool_]) -> list[NDArray[n
     return [mask for mask in grouped(normals, points, free, 0.94, 0.06) if mask.sum() > 700]
 
 
+def stays(config: Config, recording: Recording) -> bool:
+    """Whether the compensation is still there after its trial."""
+    tried = learnt(fitted(config, recording), recording, 1)
+    return any(isinstance(item, Multipath) for item in tried.corrections)
+
+
+def parts(recording: Recording) -> list[Recording]:
+    """Halves, the middle half, and either every second frame."""
+    n = len(recording)
+    cuts = [(0, n // 2, 1), (n // 2, n, 1), (n // 4, n - n // 4, 1), (0, n, 2), (1, n, 2)]
+    return [recording.select(*cut) for cut in cuts]
+
+
+def final_error(config: Config, recording: Recording, keep: bool) -> str:
+    """ATE rms in mm of a whole run that keeps the compensation or leaves it out."""
+    chosen = [
+        replace(item, trial=False) if isinstance(item, Multipath) else item
+        for item in config.corrections
+        if keep or not isinstance(item, Multipath)
+    ]
+    result = reconstruct(recording, replace(config, corrections=tuple(chosen)))
+    truth, has = recording.reference, result.has_pose
+    assert truth is not None
+    times = np.arange(len(has), dtype=float)[has]
+    if len(times) < 3:
+        return "no poses"
+    ate = evaluate_trajectory(times, result.trajectory[has], times, truth[has]).ate_rms_m
+    lost = f", {len(has) - len(times)} lost" * (len(times) < len(has))
+    return f"{ate * 1e3:.1f}{lost}"
+
+
+def tried(scene: str, seed: int, multipath: bool, runs: bool) -> str:
+    """One row of the trial's table."""
+    effects = Effects() if multipath else Effects().without("multipath")
+    recording = record.simulate_recording(scene, seed=seed, effects=effects)
+    config = resolve(Options(Path("unused"), object=scene in OBJECTS))
+    outcome = "stays" if stays(config, recording) else "left out"
+    pieces = parts(recording)
+    kept = sum(stays(config, piece) for piece in pieces)
+    errors = [final_error(config, recording, keep) if runs else "" for keep in (True, False)]
+    name = f"{scene}, seed {seed}" if seed else scene
+    cells = [name, "yes" if multipath else "no", outcome, f"{kept} of {len(pieces)}", *errors]
+    return f"| {' | '.join(cells)} |"
+
+
+def print_trial(scenes: list[str], seeds: int, multipath: list[bool], runs: bool) -> None:
+    print("| recording | multipath | compensation | stays in parts | final, kept | left out |")
+    print("|---|---|---|---|---|---|")
+    for there in multipath:
+        for scene in scenes:
+            for seed in range(seeds):
+                print(tried(scene, seed, there, runs), flush=True)
+
+
 def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else DATA
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=["errors", "trial"])
+    parser.add_argument("--corridor", type=Path, default=DATA, help="a real recording, in 'errors'")
+    parser.add_argument("--scenes", nargs="*", default=TRIED, help="in 'trial'")
+    parser.add_argument("--seeds", type=int, default=1, help="in 'trial'")
+    parser.add_argument("--effect", choices=["with", "without", "both"], default="both")
+    parser.add_argument("--no-runs", action="store_true", help="'trial' without the final errors")
+    given = parser.parse_args()
+    if given.what == "errors":
+        print_errors(given.corridor)
+        return
+    there = {"with": [True], "without": [False], "both": [False, True]}[given.effect]
+    print_trial(list(given.scenes), given.seeds, there, not given.no_runs)
+
+
+def print_errors(folder: Path) -> None:
     print(f"{'':36s}{'mm before':>22s}  |{'mm after':>22s}  |")
     print(f"{'scene':25s}{'effects':11s}" + 2 * "    med    90%  signed  |" + "   gain      ms")
     with threads(1):
