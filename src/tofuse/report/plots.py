@@ -6,6 +6,7 @@ import io
 import logging
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -225,13 +226,14 @@ def _plan(box: Float64, view: str, width: int) -> Any:
     unit, per_m = ("mm", 1000) if max(extent) < _SMALL_M else ("m", 1)
     for axis, sign in ((axes.xaxis, sa), (axes.yaxis, sb)):
         axis.set_major_locator(_locator(inner / 60 if axis is axes.xaxis else height / 40))
-        by = sign * per_m
-        axis.set_major_formatter(
-            lambda value, _, by=by: f"{by * value + 0.0:.6g}".replace("-", "−")
-        )
+        axis.set_major_formatter(partial(_tick, by=sign * per_m))
     axes.set_xlabel(f"{_NAMES[a]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
     axes.set_ylabel(f"{_NAMES[b]}, {unit}", color=MUTED, fontsize=10.5, labelpad=2)
     return figure, axes
+
+
+def _tick(value: float, _: int, *, by: float) -> str:
+    return f"{by * value + 0.0:.6g}".replace("-", "−")
 
 
 def _locator(most: float) -> Any:
