@@ -201,6 +201,7 @@ def refine(
     *,
     calibrate: Sequence[int] = (),
     beside: Beside | None = None,
+    pairs: Integers | None = None,
 ) -> Refined:
     """Move all views until they agree with all that they overlap with.
 
@@ -212,6 +213,9 @@ def refine(
         Errors of the camera to estimate as well, by their number in `kernels.refinement`.
     beside
         What is known of the poses beside what the views show.
+    pairs
+        (M, 2) positions of the views i < j that are compared; unless given, those that overlap,
+        found anew for each round.
     """
     start = poses
     beside = beside or Beside.nothing()
@@ -221,9 +225,12 @@ def refine(
     moved: list[float] = []
     state = _no_pairs()
     for stage in options.rounds:
-        pairs = chosen(overlaps(views, poses, options.overlap)[0], options.neighbours)
-        state = _directed(views, pairs, options, state, beside)
-        for _ in range(stage.iterations if len(pairs) else 0):
+        if pairs is None or not len(state.target):
+            near = pairs
+            if near is None:
+                near = chosen(overlaps(views, poses, options.overlap)[0], options.neighbours)
+            state = _directed(views, near, options, state, beside)
+        for _ in range(stage.iterations if len(state.target) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
             step, change = _solve(poses, state, known, beside)
             poses = se3.orthonormalise(poses @ se3.exp(step))

@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.posegraph.refine import Beside, Refined, RefineOptions, Round, alone, refine, response
+from tofuse.posegraph.refine import (
+    Beside,
+    Refined,
+    RefineOptions,
+    Round,
+    alone,
+    chosen,
+    refine,
+    response,
+)
 from tofuse.posegraph.views import KeptView
 
 Float64 = NDArray[np.float64]
@@ -42,10 +51,10 @@ _CHANCE = 0.003
 _LEAST_VIEWS = 8
 _NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
 # The way to what fits may be long.
-_ROUNDS = (Round(4, 0.02, 0.1), Round(4, 0.005, 0.03), Round(6, 0.0, 0.0))
-# Errors that all views share are known from so many pairs; where there are many more, about as
-# many and a third of the points take part.
-_ENOUGH_PAIRS = 500
+_ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
+# Errors that all views share are known from so many pairs; where there are more, about as many and
+# every so manieth point take part.
+_ENOUGH_PAIRS, _EVERY = 500, 3
 
 
 @dataclass(frozen=True)
@@ -118,19 +127,21 @@ def suspicion(
     errors: dict[str, float] = {}
     sigmas: dict[str, float] = {}
     best: Refined | None = None
-    some, few = replace(options, rounds=_ROUNDS), list(views)
-    if len(pairs) > 2 * _ENOUGH_PAIRS:
-        some = replace(some, neighbours=-(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
-        few = [KeptView(v.surface, np.ascontiguousarray(v.points[::3])) for v in views]
+    few, some = list(views), pairs
+    if len(pairs) > _ENOUGH_PAIRS:
+        few = [KeptView(v.surface, np.ascontiguousarray(v.points[::_EVERY])) for v in views]
+        some = chosen(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
     for name in _NUMBERS:
         if sigma[_NUMBERS[name]] > _VAGUE * TOLERANCES[name]:
             continue
+        # The views overlap as they did: the poses have to follow, not to be found.
         found = refine(
             few,
             poses,
-            some,
+            replace(options, rounds=_ROUNDS),
             calibrate=[_NUMBERS[name]],
             beside=beside,
+            pairs=some,
         )
         errors[name] = float(found.errors[_NUMBERS[name]])
         sigmas[name] = float(sigma[_NUMBERS[name]])
