@@ -1,10 +1,22 @@
-"""Sums over triangles, beside a slow twin."""
+"""Groups of vertices and sums over their triangles, beside slow twins."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from tofuse.kernels.clustering import plane_sums
+from tofuse.kernels.clustering import number_keys, plane_sums
+
+
+def test_equal_keys_have_one_number_in_the_order_in_which_they_come() -> None:
+    rng = np.random.default_rng(0)
+    for keys in (rng.integers(0, 3000, 9000), rng.integers(0, 1 << 62, 3000), np.zeros(0, int)):
+        number = np.full(len(keys), -1)
+        first = number_keys(keys, number)
+        known: dict[int, int] = {}
+        wanted = [known.setdefault(key, len(known)) for key in keys.tolist()]
+        np.testing.assert_array_equal(number, wanted)
+        assert keys[first].tolist() == list(known)
+        np.testing.assert_array_equal(number[first], np.arange(len(known)))
 
 
 def test_sums_are_those_of_each_corner_s_plane() -> None:

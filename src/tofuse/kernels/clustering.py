@@ -1,13 +1,49 @@
-"""Sums over the triangles around groups of vertices that are put together."""
+"""Groups of vertices that are put together, and sums over the triangles around them."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels.blocks import EMPTY, slot_of
 from tofuse.kernels.jit import kernel
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+@kernel
+def number_keys(keys: Int64, number: Int64) -> Int64:
+    """Number keys (N,), none below 0, in the order in which they first come, into `number` (N,).
+
+    Returns the row in which each comes first.
+    """
+    size = 1 << 10
+    table = np.full(size, EMPTY, np.int64)
+    numbers = np.empty(size, np.int64)
+    first = np.empty(size // 2, np.int64)
+    count = 0
+    for k in range(len(keys)):
+        slot = slot_of(table, keys[k])
+        if table[slot] == EMPTY:
+            if 2 * (count + 1) > size:
+                size *= 2
+                table = np.full(size, EMPTY, np.int64)
+                numbers = np.empty(size, np.int64)
+                larger = np.empty(size // 2, np.int64)
+                larger[:count] = first[:count]
+                first = larger
+                for n in range(count):
+                    slot = slot_of(table, keys[first[n]])
+                    table[slot] = keys[first[n]]
+                    numbers[slot] = n
+                slot = slot_of(table, keys[k])
+            table[slot] = keys[k]
+            numbers[slot] = count
+            first[count] = k
+            count += 1
+        number[k] = numbers[slot]
+    return first[:count]
 
 
 @kernel

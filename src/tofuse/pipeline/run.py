@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from tofuse.errors import InputError
 from tofuse.filters.base import apply_filters
@@ -136,7 +137,9 @@ def run(
         seconds = {**watch.seconds, **result.diagnostics.seconds}
         result = replace(result, diagnostics=replace(result.diagnostics, seconds=seconds))
         progress.stage("writing")
-        write_result(result, folder, lambda r, f: _report(recording, config, r, f), texture)
+        # BLAS sums differ with its number of threads, and its threads wait by spinning.
+        with threadpool_limits(1):
+            write_result(result, folder, lambda r, f: _report(recording, config, r, f), texture)
     except BaseException as error:
         kept.give_up(error)
         raise

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels.splat import nearest_points
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
+Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 
 GONE = (128, 128, 132)  # no measurement: a grey that differs from both ends of the colour map
@@ -91,13 +93,19 @@ def depth_limits(frame: Frame) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-3))
 
 
-def depth_image(frame: RangeFrame, limits: tuple[float, float], removed: Bool | None) -> UInt8:
-    """Colour the z depth; pixels without a measurement are grey, those in `removed` marked."""
+def depth_image(
+    frame: RangeFrame, limits: tuple[float, float], removed: Bool | None, width: int | None = None
+) -> UInt8:
+    """Colour the z depth; pixels without a measurement are grey, those in `removed` marked.
+
+    With a `width`, as `shrink` would leave it.
+    """
     low, high = limits
-    image = viridis((frame.z.astype(float) - low) / (high - low))
-    image[~frame.valid] = GONE
+    step = 1 if width is None else -(-frame.z.shape[1] // width)
+    image = viridis((frame.z[::step, ::step].astype(float) - low) / (high - low))
+    image[~frame.valid[::step, ::step]] = GONE
     if removed is not None:
-        image[removed] = REMOVED
+        image[removed[::step, ::step]] = REMOVED
     return image
 
 
@@ -138,34 +146,41 @@ def splat(
         Pixels per metre (at the centre, where there is a perspective).
     distance
         Of the eye from the view's origin in m; None for a parallel projection.
+    radius
+        Pixels along the side of a square.
 
     Returns
     -------
     (H, W, 4) RGBA, transparent where there is no point.
     """
-    width, height = size
-    view = points @ T_view_world[:3, :3].T + T_view_world[:3, 3]
-    depth = view[:, 2]
-    zoom: Float64 | float = scale
-    if distance is not None:
-        depth = depth + distance
-        zoom = scale * distance / np.maximum(depth, 1e-6)
-    u = np.round(width / 2 + view[:, 0] * zoom).astype(int)
-    v = np.round(height / 2 + view[:, 1] * zoom).astype(int)
-    seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    if distance is not None:
-        seen &= depth > 0.02 * distance
-    order = np.flatnonzero(seen)
-    order = order[np.argsort(-depth[order], kind="stable")]  # far first: the nearest is left
-    image = np.zeros((height + radius, width + radius, 4), np.uint8)
-    # One offset after another: a far point may cover the edge of a nearer square, which is
-    # invisible at a few pixels.
-    for dv in range(radius):
-        for du in range(radius):
-            rows, columns = v[order] + dv, u[order] + du
-            image[rows, columns, :3] = colors[order]
-            image[rows, columns, 3] = 255
-    return image[:height, :width]
+    found = nearest(points, T_view_world, size, scale=scale, distance=distance, radius=radius)
+    return _colored(found, colors[found[found >= 0]])
+
+
+def nearest(
+    points: Float64,
+    T_view_world: Float64,
+    size: tuple[int, int],
+    *,
+    scale: float,
+    distance: float | None = None,
+    radius: int = 1,
+) -> Int32:
+    """Which point (N, 3) is seen at each pixel, (H, W), as `splat` draws them; -1 for none."""
+    found = np.full(size[::-1], -1, np.int32)
+    depth = np.full(found.shape, np.inf)
+    nearest_points(
+        np.ascontiguousarray(points), T_view_world, scale, distance or 0.0, radius, depth, found
+    )
+    return found
+
+
+def _colored(found: Int32, colors: UInt8) -> UInt8:
+    """Image (H, W, 4) of the points found, with the colours (K, 3) of those, pixel by pixel."""
+    image = np.zeros((*found.shape, 4), np.uint8)
+    image[found >= 0, :3] = colors
+    image[found >= 0, 3] = 255
+    return image
 
 
 def turned(yaw: float, pitch: float) -> Float64:
@@ -214,13 +229,12 @@ class Framing:
 def cloud_image(frame: Frame, limits: tuple[float, float], framing: Framing) -> UInt8:
     """Draw a view's points in the colours of `depth_image`, (H, W, 4) RGBA."""
     points = frame.points.astype(float)
-    if isinstance(frame, RangeFrame):
-        depth = points[:, 2]
-    else:
-        depth = np.linalg.norm(points - frame.origin, axis=1)
-    low, high = limits
-    colors = viridis((depth - low) / (high - low))
     radius = 1 if len(points) > 60_000 else 2
-    return splat(
-        points, colors, framing.T_view_world, framing.size, scale=framing.scale, radius=radius
-    )
+    found = nearest(points, framing.T_view_world, framing.size, scale=framing.scale, radius=radius)
+    seen = points[found[found >= 0]]
+    if isinstance(frame, RangeFrame):
+        depth = seen[:, 2]
+    else:
+        depth = np.linalg.norm(seen - frame.origin, axis=1)
+    low, high = limits
+    return _colored(found, viridis((depth - low) / (high - low)))

@@ -269,9 +269,10 @@ def model(
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     columns = int(0.8 * (width - 58))
     rows = max(2, int(columns * (y1 - y0) / (x1 - x0)))
-    density, _, _ = np.histogram2d(
-        flat[:, 1], flat[:, 0], bins=(rows, columns), range=((y0, y1), (x0, x1))
-    )
+    j, i = np.floor((columns, rows) * (flat - (x0, y0)) / (x1 - x0, y1 - y0)).T
+    inside = (i >= 0) & (j >= 0) & (i < rows) & (j < columns)
+    cell = (columns * i[inside] + j[inside]).astype(np.intp)
+    density = np.bincount(cell, minlength=rows * columns).reshape(rows, columns)
     top = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
     image = np.zeros((rows, columns, 4), np.uint8)
     image[..., :3] = _MODEL

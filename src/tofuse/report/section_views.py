@@ -41,8 +41,8 @@ def filters(s: Subject) -> Values:
                 lost = None
                 if k and isinstance(last, RangeFrame):
                     lost = last.valid & ~frame.valid
-                depth = images.depth_image(frame, limits, lost)
-                pictures.append(images.data_uri(images.shrink(depth, _FILTER)))
+                depth = images.depth_image(frame, limits, lost, _FILTER)
+                pictures.append(images.data_uri(depth))
             pictures.append(images.data_uri(images.cloud_image(frame, limits, framing)))
             shown.append({"name": name, "text": text, "images": pictures})
             last = frame
