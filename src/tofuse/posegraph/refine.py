@@ -37,6 +37,8 @@ _UPPER = np.triu_indices(kernels.UNKNOWNS)
 # How firmly poses and errors are held where they are, in units of 1 cm and 1 degree, and of 0.01.
 _STILL, _ERROR_UNIT = 1e-3, 0.01
 _DAMPING = 1e-6
+# Motion, in these units, that changes little about which views overlap.
+_MOVED = 2.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class RefineOptions:
     Attributes
     ----------
     rounds
-        Coarse and wide to fine; which views overlap is found anew for each.
+        Coarse and wide to fine; which views overlap is found anew for each if any has moved by
+        more than about 2 cm or 2 degrees.
     overlap
         Least share of each other that two views must see.
     neighbours
@@ -215,7 +218,7 @@ def refine(
         What is known of the poses beside what the views show.
     pairs
         (M, 2) positions of the views i < j that are compared; unless given, those that overlap,
-        found anew for each round.
+        found anew for each round before which something has moved.
     """
     start = poses
     beside = beside or Beside.nothing()
@@ -224,12 +227,14 @@ def refine(
     known[list(calibrate)] = 0
     moved: list[float] = []
     state = _no_pairs()
+    since = np.inf
     for stage in options.rounds:
-        if pairs is None or not len(state.target):
+        if since >= _MOVED:
             near = pairs
             if near is None:
                 near = chosen(overlaps(views, poses, options.overlap)[0], options.neighbours)
             state = _directed(views, near, options, state, beside)
+            since = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
             step, change = _solve(poses, state, known, beside)
@@ -238,6 +243,7 @@ def refine(
             errors = errors + change
             _rescale(state, stage)
             moved.append(float(np.abs(step / UNITS).max()))
+            since += moved[-1] if pairs is None else 0.0
             if moved[-1] < options.settled:
                 break
     half = len(state.target) // 2
