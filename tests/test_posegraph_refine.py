@@ -78,6 +78,18 @@ def test_drift_is_taken_out_by_all_views_together(swing):
     assert np.linalg.eigvalsh(found.information).min() > 0
 
 
+def test_only_pairs_that_are_given_are_compared(swing):
+    views, truth = swing
+    start = drifted(truth)
+    chain = np.stack([np.arange(11), np.arange(1, 12)], 1)
+    found = refine(views, start, OPTIONS, pairs=chain)
+    np.testing.assert_array_equal(found.pairs, chain)
+    assert away(found.poses, truth) < 0.2 * away(start, truth)
+    # A view that nothing is compared with stays.
+    alone = refine(views, start, OPTIONS, pairs=chain[:-1])
+    np.testing.assert_allclose(alone.poses[-1], start[-1], atol=1e-12)
+
+
 def test_threads_change_nothing(swing):
     views, truth = swing
     results = []

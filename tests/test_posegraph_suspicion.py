@@ -19,8 +19,12 @@ def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
     return views, refine(views, truth, OPTIONS)
 
 
-def test_a_camera_that_errs_is_suspected():
+def test_a_camera_that_errs_is_suspected(monkeypatch):
     views, refined = kept(0.06)
+    # Where there are many pairs, some of them and of their points tell as much.
+    monkeypatch.setattr("tofuse.posegraph.suspicion._ENOUGH_PAIRS", len(refined.pairs) // 2)
+    some = suspicion(views, refined, OPTIONS, Beside.nothing())
+    monkeypatch.undo()
     found = suspicion(views, refined, OPTIONS, Beside.nothing())
     assert found.alarm
     assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
@@ -32,6 +36,11 @@ def test_a_camera_that_errs_is_suspected():
     assert found.gap.closes
     assert found.support is not None
     assert found.support[1] > found.support[0]
+    assert some.alarm
+    assert some.errors["offset"] == pytest.approx(found.errors["offset"], abs=0.01)
+    assert some.errors != found.errors
+    assert some.gap is not None
+    assert some.gap.before == found.gap.before
 
 
 def test_a_camera_that_does_not_err_is_not():
