@@ -287,6 +287,11 @@ class SurfaceMap:
             np.float32
         )
 
+    @property
+    def pixels(self) -> int:
+        """How many there are, valid or not."""
+        return self.z.size
+
     def once(self) -> SurfaceMap:
         """Return the view with `pixel_variance` for `plane_variance`, if it has both.
 

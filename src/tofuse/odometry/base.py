@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
@@ -37,8 +38,8 @@ class Step:
         The view as it was made ready for tracking; None where the method makes none, and for
         frames without a pose.
     earlier
-        Steps of frames that were lost when they came, by `Frame.index`, and that this frame shows
-        to have been where they seemed to be.
+        Steps of frames that were lost when they came, by `Frame.index` and in its order, and that
+        are found from this frame.
     """
 
     status: Status
@@ -73,6 +74,15 @@ class Tracker(Protocol):
         Other threads may ask for it while frames before it are tracked.
         """
         return None
+
+    @property
+    def waiting(self) -> Collection[int]:
+        """Indices of the lost frames that may yet be found; what others are needed for no more."""
+        return ()
+
+    def finish(self) -> tuple[tuple[int, Step], ...]:
+        """Hear that no frame follows; returns steps as `Step.earlier` has them."""
+        return ()
 
     def interrupt(self) -> None:
         """Hear that the next frame begins another recording: the motion need not go on."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Literal
@@ -24,6 +24,7 @@ from tofuse.odometry.mending import (
     mendings,
 )
 from tofuse.odometry.motion import Moment, Motion, is_small
+from tofuse.odometry.waiting import Waiting
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
@@ -137,6 +138,9 @@ class Recovery:
     margin, lost_margin
         Least lead in score before the best other pose; the second after a frame was lost, when
         the keyframe may show another place that looks alike.
+    late_searches, alike
+        At the end, lost frames are searched for so many times in all, each in so many of the
+        keyframes that look most like it.
     relocated_margin
         Least lead, as a share of the points, of the keyframe that a lost view fits best before
         others that put it elsewhere.
@@ -151,6 +155,8 @@ class Recovery:
 
     keyframes: int = 1
     patience: int = 10
+    late_searches: int = 30
+    alike: int = 3
     score: float = 0.25
     margin: float = 0.025
     lost_margin: float = 0.1
@@ -165,6 +171,9 @@ class Recovery:
             raise ValueError(f"keyframes is {self.keyframes}, not 0 to {_REMEMBERED}")
         if not 1 <= self.patience <= 1_000_000:
             raise ValueError(f"patience is {self.patience}, not 1 or more")
+        for name in ("late_searches", "alike"):
+            if not 0 <= getattr(self, name) <= 1_000_000:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
         for name in ("score", "margin", "lost_margin", "relocated_margin", "contradiction"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
@@ -284,6 +293,8 @@ class _KeyframeTracker(Tracker):
         self._doubted: tuple[int, Step] | None = None  # a surprise that may yet be confirmed
         self._lost = False
         self._depth = 0.0  # median of the last frame with a pose, m
+        self._waiting: Waiting[SurfaceMap] = Waiting()
+        self._tried: set[tuple[int, int]] = set()  # lost frames, and keyframes they are not in
         self._searched = 0  # frames in a row that only a search could find, or not even that
         self._frame: RangeFrame | None = None  # the last one where it was expected, and its depths
         self._glance = np.zeros((0, 0), np.float32)
@@ -354,8 +365,9 @@ class _KeyframeTracker(Tracker):
             # It was there a moment ago, and an older keyframe may show a place that looks alike.
             found = self._search(view) or self._leading(self._relocated(view), reasons)
         if found is None:
+            self._waiting.add(view.bare())
             return self._lose(reasons[0])
-        reference = found.reference
+        reference, was_lost = found.reference, self._lost
         T = found.aligned.T_world_source
         surprise = self._motion.surprise(T, expected, since)
         if surprise:  # few iterations do for small motions alone
@@ -376,7 +388,81 @@ class _KeyframeTracker(Tracker):
             self._motion.interrupt()
         if self._is_new(T, reference):
             self._keep(view, T)
+        if was_lost:
+            earlier = tuple(sorted([*earlier, *self._found_beside(_keyframe(view, T))]))
         return replace(step, earlier=earlier)
+
+    @property
+    def waiting(self) -> Collection[int]:
+        """See `Tracker.waiting`."""
+        doubted = () if self._doubted is None else (self._doubted[0],)
+        return {*self._waiting.indices, *doubted}
+
+    def finish(self) -> tuple[tuple[int, Step], ...]:
+        """See `Tracker.finish`: lost views are searched for where keyframes look most like them."""
+        recovery = self._options.recovery
+        found: list[tuple[int, Step]] = []
+        searches = recovery.late_searches
+        again = True
+        while again:
+            again = False
+            for view in self._waiting.views:
+                if view.index not in self._waiting.indices:
+                    continue  # it has been found beside another one
+                for keyframe in self._alike(view, recovery.alike):
+                    if (view.index, keyframe.view.index) in self._tried or not searches:
+                        continue
+                    searches -= 1
+                    fit = self._searched_in(view, keyframe, lost=True)
+                    if fit is not None:
+                        found += self._place(view, fit)
+                        again = True
+                        break
+        return tuple(sorted(found))
+
+    def _place(self, view: SurfaceMap, found: _Found) -> list[tuple[int, Step]]:
+        """Take the pose of a view that waited, and look for others beside it."""
+        self._waiting.remove(view.index)
+        step = self._step(view, found, lit=view.has_photo)
+        keyframe = _keyframe(view, found.aligned.T_world_source)
+        if self._is_new(keyframe.T_world_camera, found.reference):
+            self._keep_older(keyframe)
+        return [(view.index, step), *self._found_beside(keyframe)]
+
+    def _found_beside(self, keyframe: _Keyframe) -> list[tuple[int, Step]]:
+        """Find lost views just before and after one that was found, as far as they hang together.
+
+        The camera was there a moment before or after, so that what fits need not lead by much.
+        """
+        found: list[tuple[int, Step]] = []
+        for views in self._waiting.away_from(keyframe.view.index):
+            reference = keyframe
+            for view in views:
+                fit = self._beside(view, reference)
+                if fit is None:
+                    break
+                self._waiting.remove(view.index)
+                found.append((view.index, self._step(view, fit, lit=view.has_photo)))
+                T = fit.aligned.T_world_source
+                if self._is_new(T, reference):
+                    reference = _keyframe(view, T)
+                    self._keep_older(reference)
+        return found
+
+    def _beside(self, view: SurfaceMap, keyframe: _Keyframe) -> _Found | None:
+        """Where a lost view is that was taken just before or after a keyframe."""
+        options = self._options
+        if not _is_comparable(view.depth, keyframe.depth):
+            return None
+        how = replace(options.alignment, levels=_PATIENT)
+        aligned = align(view, [keyframe.target], keyframe.T_world_camera, how)
+        near = is_small(se3.inverse(keyframe.T_world_camera) @ aligned.T_world_source)
+        acceptance = options.acceptance if near else options.relocated
+        held = aligned.converged and not len(aligned.unobservable)
+        if held and not acceptance.objection(aligned, view.depth):
+            words = f"was lost, and is found beside frame {keyframe.view.index}"
+            return _Found(aligned, [keyframe.target], keyframe, words)
+        return self._searched_in(view, keyframe, lost=False)
 
     def _follow(
         self,
@@ -628,30 +714,50 @@ class _KeyframeTracker(Tracker):
         return None
 
     def _search(self, view: SurfaceMap) -> _Found | None:
-        """Search the newest keyframes exhaustively, from no guess at all."""
-        options = self._options
-        recovery = options.recovery
+        """Search keyframes exhaustively, from no guess at all: the newest, or those alike if lost."""
+        recovery = self._options.recovery
         self._searched += 1
         if self._searched > recovery.patience and self._searched % recovery.patience:
             return None
-        for keyframe in self._keyframes[: -recovery.keyframes - 1 : -1]:
-            if not _is_comparable(view.depth, keyframe.depth):
-                continue
-            match = search(view, keyframe.view, recovery.search)
-            if match is None or not recovery.believes(match, self._lost):
-                continue
-            T = keyframe.T_world_camera @ match.T_target_source
-            target = [keyframe.target]
-            near = replace(
-                options.alignment,
-                levels=_PATIENT,
-                prior_m=recovery.prior_m,
-                prior_rad=recovery.prior_rad,
-            )
-            lead = f"leading by {match.margin:.0%} of the points"
-            how = f"found by a search of keyframe {keyframe.view.index}, {lead}"
-            return _Found(align(view, target, T, near), target, keyframe, how)
+        keyframes = self._keyframes[: -recovery.keyframes - 1 : -1]
+        if keyframes and self._lost:
+            newest = {keyframe.view.index for keyframe in keyframes}
+            alike = self._alike(view, 1)
+            keyframes += [k for k in alike if k.view.index not in newest]
+        for keyframe in keyframes:
+            found = self._searched_in(view, keyframe, lost=self._lost)
+            if found is not None:
+                return found
         return None
+
+    def _alike(self, view: SurfaceMap, most: int) -> list[_Keyframe]:
+        """So many keyframes that look most like a view, the likest first."""
+        looks = [keyframe.thumbnail for keyframe in self._keyframes]
+        return [self._keyframes[k] for k in likeness(thumbnail(view), looks)[:most]]
+
+    def _searched_in(
+        self, view: SurfaceMap, keyframe: _Keyframe, *, lost: bool
+    ) -> _Found | None:
+        """Search a keyframe exhaustively; `lost` if it may show another place."""
+        options = self._options
+        recovery = options.recovery
+        self._tried.add((view.index, keyframe.view.index))
+        if not _is_comparable(view.depth, keyframe.depth):
+            return None
+        match = search(view, keyframe.view, recovery.search)
+        if match is None or not recovery.believes(match, lost):
+            return None
+        T = keyframe.T_world_camera @ match.T_target_source
+        target = [keyframe.target]
+        near = replace(
+            options.alignment,
+            levels=_PATIENT,
+            prior_m=recovery.prior_m,
+            prior_rad=recovery.prior_rad,
+        )
+        lead = f"leading by {match.margin:.0%} of the points"
+        how = f"found by a search of keyframe {keyframe.view.index}, {lead}"
+        return _Found(align(view, target, T, near), target, keyframe, how)
 
     def _is_new(self, T: Float64, reference: _Keyframe) -> bool:
         options = self._options
@@ -666,6 +772,13 @@ class _KeyframeTracker(Tracker):
         if before >= 0:  # only lost views are held against it from here on
             keyframe = self._keyframes[before]
             self._keyframes[before] = replace(keyframe, view=keyframe.view.bare())
+        if len(self._keyframes) > _REMEMBERED:
+            del self._keyframes[self._dispensable()]
+
+    def _keep_older(self, keyframe: _Keyframe) -> None:
+        """Keep a view that is found late; the newest ones, which are tracked against, stay so."""
+        at = max(len(self._keyframes) - self._options.targets, 0)
+        self._keyframes.insert(at, replace(keyframe, view=keyframe.view.bare()))
         if len(self._keyframes) > _REMEMBERED:
             del self._keyframes[self._dispensable()]
 

@@ -45,7 +45,6 @@ T = TypeVar("T")
 Float64 = NDArray[np.float64]
 
 _KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
-_DOUBTED_FRAMES = 3  # so many lost ones may get a pose from what comes after
 _CHECKED_IMAGES = 60  # how many images are compared with each other in the end
 
 
@@ -171,7 +170,7 @@ class Mapper:
         self._ambiguity_m: float | None = None
         self._before: RangeFrame | None = None  # as the camera gave it
         self._repeated: list[int] = []
-        self._lost: dict[int, _Place] = {}  # the last frames, if they have no pose
+        self._lost: dict[int, _Place] = {}  # that may yet get a pose
         self._interruptions: list[int] = []
         self._sensed: dict[int, tuple[Float64 | None, Float64 | None]] = {}
         self._knows_errors = False
@@ -231,7 +230,7 @@ class Mapper:
         self._sensed[frame.index] = (T_odometry, gravity)
         repeated = self._is_repeated(frame)
         # A search for a lost camera is worth dividing, while those who prepare frames are waiting.
-        busy = prepared is not None and prepared.ready is not None and not self._lost
+        busy = prepared is not None and prepared.ready is not None and not self._is_lost
         with threads(self.threads), undivided(busy):
             with self.watch.timing("filters"):
                 before = self._history if history is None else history
@@ -251,22 +250,19 @@ class Mapper:
                 reason = f"the same image as frame {self._records[-1].index}, to the last pixel"
                 step = replace(step, status="predicted", reason=reason)
             self._follow(filtered, step)
-            for index, believed in step.earlier:
-                if index in self._lost:
-                    self._take(self._lost.pop(index), believed)
+            self._take_lost(step.earlier)
             place = _Place(len(self._records), frame, clean)
             self._records.append(FrameRecord(frame.index, frame.timestamp, "lost"))
             self._steps.append(None)
             self._take(place, replace(step, earlier=()))
             if step.T_world_camera is None:
                 self._lost[frame.index] = place
-                while len(self._lost) > _DOUBTED_FRAMES:
-                    del self._lost[next(iter(self._lost))]
             else:
-                self._lost.clear()
                 with self.watch.timing("loops"):
                     if self._live.step():
                         self._follow_loops()
+            waiting = self._tracker.waiting
+            self._lost = {index: p for index, p in self._lost.items() if index in waiting}
             if (
                 isinstance(frame, RangeFrame)
                 and isinstance(filtered, RangeFrame)
@@ -360,8 +356,12 @@ class Mapper:
 
     def _expected(self) -> Float64 | None:
         """Where the camera is expected; None where that is not known, or the camera was lost."""
-        lost = bool(self._steps) and (self._steps[-1] is None or self._steps[-1].status == "lost")
-        return None if lost else self._motion.expected
+        return None if self._is_lost else self._motion.expected
+
+    @property
+    def _is_lost(self) -> bool:
+        """Whether the newest frame has no pose."""
+        return bool(self._steps) and (self._steps[-1] is None or self._steps[-1].status == "lost")
 
     def _follow(self, frame: Frame, step: Step) -> None:
         """Tell the corrections where a frame is, and note how the camera moves."""
@@ -399,6 +399,11 @@ class Mapper:
                 where=f"frame {index}",
                 remedy="number the frames in the order in which they are pushed",
             )
+
+    def _take_lost(self, found: Sequence[tuple[int, Step]]) -> None:
+        """Take what became of frames that had been lost."""
+        for index, step in found:
+            self._take(self._lost.pop(index), step)
 
     def _take(self, place: _Place, step: Step) -> None:
         """Take what became of a frame, or what it turns out later to have been."""
@@ -459,6 +464,10 @@ class Mapper:
     def end(self) -> None:
         """Say that no frame follows: what only they would ask for need not be kept any longer."""
         if not self._ended:
+            with threads(self.threads), self.watch.timing("tracking"):
+                found = self._tracker.finish()
+            with threads(self.threads):
+                self._take_lost(found)
             del self._tracker, self._correctors, self._history
             self._before = None
             self._lost.clear()
@@ -659,7 +668,7 @@ class Mapper:
                 continue
             if step.reference is not None and r is not None:
                 # What was predicted frame by frame since then adds up.
-                frames = place[record.index] - place[step.reference]
+                frames = abs(place[record.index] - place[step.reference])
                 predicted = (sigma[0] * frames, sigma[1] * frames)
                 information = with_prediction(r.information, r.unobservable, predicted)
                 edge = Measured(step.reference, record.index, r.T_target_source, information)

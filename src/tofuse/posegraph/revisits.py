@@ -300,7 +300,7 @@ class _RevisitLoops(Loops):
     ) -> bool:
         """Whether the trajectory may have drifted so far as T_target_source says."""
         path = np.stack(
-            [pose for k, pose in self._poses.items() if target.index <= k <= source.index]
+            [self._poses[k] for k in sorted(self._poses) if target.index <= k <= source.index]
         )
         off = se3.inverse(se3.inverse(path[0]) @ path[-1]) @ T
         depth = 0.5 * (target.depth + source.depth)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -101,7 +102,7 @@ class ViewStore(Generic[V]):
     Attributes
     ----------
     views
-        The kept views, oldest first; the first one that was pushed stays.
+        The kept views in the order of their indices; the first of them stays.
     """
 
     def __init__(self, spacing: Spacing) -> None:
@@ -111,11 +112,13 @@ class ViewStore(Generic[V]):
         self._stretch = 1.0
 
     def push(self, view: V, T_world_camera: Float64) -> None:
-        """Add the next view that has a pose."""
-        if self.views and not self._far(view, self._poses[-1], T_world_camera):
+        """Add a view that has a pose; mostly the next one, but lost ones may be found late."""
+        at = bisect(self.views, view.index, key=lambda kept: kept.index)
+        beside = self._poses[max(at - 1, 0) : at + 1]
+        if not all(self._far(view, T, T_world_camera) for T in beside):
             return
-        self.views.append(view)
-        self._poses.append(T_world_camera)
+        self.views.insert(at, view)
+        self._poses.insert(at, T_world_camera)
         if len(self.views) > self._spacing.most:
             self.views, self._poses = self.views[::2], self._poses[::2]
             self._stretch *= 2

@@ -1,0 +1,70 @@
+"""Views that were lost, kept for as long as a later one may show where they were."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import Generic, Protocol, TypeVar
+
+# Pixels of all that wait together: 20 images of 640x480, or 240 of 176x144.
+_PIXELS = 6_200_000
+
+
+class Seen(Protocol):
+    """What is asked of a view that waits."""
+
+    @property
+    def index(self) -> int:
+        """Of the frame in its recording."""
+        ...
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels it has."""
+        ...
+
+
+V = TypeVar("V", bound=Seen)
+
+
+class Waiting(Generic[V]):
+    """Lost views in the order of time, never more than fit into a fixed memory.
+
+    Parameters
+    ----------
+    pixels
+        Of all views together. When there are more, every other view is given up.
+    """
+
+    def __init__(self, pixels: int = _PIXELS) -> None:
+        self._views: dict[int, V] = {}
+        self._most = pixels
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @property
+    def indices(self) -> Collection[int]:
+        """Of the views that wait."""
+        return self._views.keys()
+
+    @property
+    def views(self) -> list[V]:
+        """All of them, oldest first."""
+        return list(self._views.values())
+
+    def add(self, view: V) -> None:
+        """Let the newest view wait."""
+        self._views[view.index] = view
+        while len(self) > 1 and sum(v.pixels for v in self._views.values()) > self._most:
+            # The newest one stays: it is the likeliest to be found.
+            self._views = dict(reversed(list(reversed(self._views.items()))[::2]))
+
+    def remove(self, index: int) -> None:
+        """Wait no longer for a view."""
+        del self._views[index]
+
+    def away_from(self, index: int) -> Iterator[Iterator[V]]:
+        """Views before a frame, newest first, and those after it, oldest first."""
+        views = self.views
+        yield (view for view in reversed(views) if view.index < index)
+        yield (view for view in views if view.index > index)
