@@ -525,8 +525,12 @@ def test_a_search_is_believed_only_with_a_lead_and_without_contradiction():
         return Match((Candidate(np.eye(4), said), Candidate(np.eye(4), other)), "full")
 
     recovery = Recovery()
+    # It lies where surfaces are, which reflect otherwise, though not so much that each is told.
+    shaded = Agreement(0.6, 0.55, 0.0, 0.01, 0.01, 1000, 0.05)
+    unlike = Match((Candidate(np.eye(4), shaded),), "full")
     assert recovery.believes(match(0.5, 0.4, 0.0))
     assert not recovery.believes(match(0.2, 0.0, 0.0))
+    assert not recovery.believes(unlike)
     assert not recovery.believes(match(0.5, 0.49, 0.0))
     assert not recovery.believes(match(0.5, 0.4, 0.1))
     # A camera that was lost may stand anywhere, and rooms look alike.

@@ -133,8 +133,9 @@ class Recovery:
     patience
         After so many frames in a row that the search did not find, only every so many-th is
         searched for.
-    score
-        Least share of both views' points that support the pose, less those that contradict it.
+    support, score
+        Least share of both views' points that support the pose, and least score: the same, by how
+        alike they reflect, less those that contradict it.
     margin, lost_margin
         Least lead in score before the best other pose; the second after a frame was lost, when
         the keyframe may show another place that looks alike.
@@ -157,7 +158,8 @@ class Recovery:
     patience: int = 10
     late_searches: int = 30
     alike: int = 3
-    score: float = 0.25
+    support: float = 0.25
+    score: float = 0.1
     margin: float = 0.025
     lost_margin: float = 0.1
     relocated_margin: float = 0.05
@@ -174,18 +176,32 @@ class Recovery:
         for name in ("late_searches", "alike"):
             if not 0 <= getattr(self, name) <= 1_000_000:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
-        for name in ("score", "margin", "lost_margin", "relocated_margin", "contradiction"):
+        for name in (
+            "support",
+            "score",
+            "margin",
+            "lost_margin",
+            "relocated_margin",
+            "contradiction",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
         for name in ("prior_m", "prior_rad"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
 
-    def believes(self, match: Match, lost: bool = False) -> bool:
-        """Whether what both views say of the best pose, and of its rivals, is convincing."""
+    def believes(self, match: Match, lost: bool = False, said_before: bool = False) -> bool:
+        """Whether what both views say of the best pose, and of its rivals, is convincing.
+
+        Of a camera that was `lost` half the lead is enough if the frame before said the same.
+        """
+        margin = self.margin
+        if lost:
+            margin = max(margin, self.lost_margin * (0.5 if said_before else 1))
         return (
-            match.score >= self.score
-            and match.margin >= (self.lost_margin if lost else self.margin)
+            match.agreement.support >= self.support
+            and match.score >= self.score
+            and match.margin >= margin
             and match.agreement.contradiction <= self.contradiction
         )
 
@@ -714,7 +730,7 @@ class _KeyframeTracker(Tracker):
         return None
 
     def _search(self, view: SurfaceMap) -> _Found | None:
-        """Search keyframes exhaustively, from no guess at all: the newest, or those alike if lost."""
+        """Search keyframes exhaustively, from no guess at all."""
         recovery = self._options.recovery
         self._searched += 1
         if self._searched > recovery.patience and self._searched % recovery.patience:
@@ -735,9 +751,7 @@ class _KeyframeTracker(Tracker):
         looks = [keyframe.thumbnail for keyframe in self._keyframes]
         return [self._keyframes[k] for k in likeness(thumbnail(view), looks)[:most]]
 
-    def _searched_in(
-        self, view: SurfaceMap, keyframe: _Keyframe, *, lost: bool
-    ) -> _Found | None:
+    def _searched_in(self, view: SurfaceMap, keyframe: _Keyframe, *, lost: bool) -> _Found | None:
         """Search a keyframe exhaustively; `lost` if it may show another place."""
         options = self._options
         recovery = options.recovery
@@ -745,9 +759,13 @@ class _KeyframeTracker(Tracker):
         if not _is_comparable(view.depth, keyframe.depth):
             return None
         match = search(view, keyframe.view, recovery.search)
-        if match is None or not recovery.believes(match, lost):
+        if match is None:
             return None
         T = keyframe.T_world_camera @ match.T_target_source
+        doubted = None if self._doubted is None else self._doubted[1].T_world_camera
+        said_before = doubted is not None and is_small(se3.inverse(doubted) @ T)
+        if not recovery.believes(match, lost, said_before):
+            return None
         target = [keyframe.target]
         near = replace(
             options.alignment,

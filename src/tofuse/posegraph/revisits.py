@@ -409,8 +409,10 @@ def _not_believed(match: Match | None, recovery: Recovery) -> str:
     """Why what a search found is no loop, in words."""
     if match is None:
         return "there is too little to search with"
+    if match.agreement.support < recovery.support:
+        return f"a search finds nothing that {recovery.support:.0%} of the points support"
     if match.score < recovery.score:
-        return f"a search finds nothing that {recovery.score:.0%} of the points support"
+        return "what a search finds lies where the surfaces are, but they reflect otherwise"
     if match.margin < recovery.margin:
         return f"what a search finds leads its best rival by {match.margin:.1%} of the points only"
     share = match.agreement.contradiction

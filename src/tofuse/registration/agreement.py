@@ -18,6 +18,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 _CHUNK_POINTS = 6000
+_CLASH = 2.0  # times the difference that counts neither way
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 
@@ -35,10 +36,11 @@ class AgreementOptions:
     max_angle
         Largest angle between the normals of surfaces that support each other, rad.
     albedo
-        Largest difference in log albedo, exposure apart, of points that support.
+        Difference in log albedo, exposure apart, with which a point on the surface counts neither
+        for nor against the pose; one that differs more than twice as much does not support it.
     violation_weight, clash_weight
-        How many supporting points are outweighed by a point in free space, and by one that lies
-        on a surface of another albedo.
+        How many supporting points are outweighed by a point in free space, and at most by one
+        that lies on a surface of another albedo.
     """
 
     points: int = 2500
@@ -46,11 +48,13 @@ class AgreementOptions:
     floor_m: float = 0.01
     floor_share: float = 0.01
     max_angle: float = 0.7
-    albedo: float = 0.2
+    albedo: float = 0.1
     violation_weight: float = 2.0
     clash_weight: float = 1.0
 
     def __post_init__(self) -> None:
+        if not 1e-6 <= self.albedo <= 1e6:
+            raise ValueError(f"albedo is {self.albedo}, not above 0")
         if not 10 <= self.points <= 10_000_000:
             raise ValueError(f"points is {self.points}, not 10 or more")
         for name in (
@@ -58,7 +62,6 @@ class AgreementOptions:
             "floor_m",
             "floor_share",
             "max_angle",
-            "albedo",
             "violation_weight",
             "clash_weight",
         ):
@@ -85,7 +88,9 @@ class Agreement:
     points
         How many were compared, of both images.
     score
-        Support less twice the violation and less the clash. Points that are hidden, or out of
+        Points on the surface, each by how alike it reflects: 1 - (difference / `albedo`)^2, and
+        no less than the negative clash weight; less twice the violation. Of poses that geometry
+        can't tell apart the right one makes the albedo agree. Points that are hidden, or out of
         view, say nothing.
     """
 
@@ -130,20 +135,20 @@ def agreement(
     # Exposure is what most of them differ by; the way back sees its negative.
     lighter = np.concatenate([differences[0], -differences[1]])
     lighter = lighter[np.isfinite(lighter)]
-    clash = 0
+    clash, alike = 0, float(on_surface)
     if len(lighter):
-        clash = int(np.count_nonzero(np.abs(lighter - np.median(lighter)) > options.albedo))
-    support = on_surface - clash
-    against = options.violation_weight * violation + options.clash_weight * clash
+        apart = np.abs(lighter - np.median(lighter)) / options.albedo
+        clash = int(np.count_nonzero(apart > _CLASH))
+        alike -= float(np.minimum(apart**2, 1 + options.clash_weight).sum(dtype=np.float64))
     share = 1 / max(count, 1)
     return Agreement(
         overlap=float(total[kernels.COMPARED] * share),
-        support=float(support * share),
+        support=float((on_surface - clash) * share),
         violation=float(violation * share),
         clash=float(clash * share),
         rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
         points=count,
-        score=float(share * (support - against)),
+        score=float(share * (alike - options.violation_weight * violation)),
     )
 
 
