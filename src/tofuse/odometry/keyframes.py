@@ -15,7 +15,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Step, Tracker
-from tofuse.odometry.likeness import likeness, thumbnail
+from tofuse.odometry.likeness import look_of, unlikeness
 from tofuse.odometry.mending import (
     Mending,
     glance,
@@ -57,6 +57,9 @@ _CLEARLY, _NEARLY = 1.02, 0.95
 # Keyframes that are kept, so that memory stays flat, and those of them that a lost view is aligned
 # with, so that it does not cost more than ten that are not.
 _REMEMBERED, _TRIED = 40, 5
+# By which share of its width the image of a lost view may be shifted against that of a keyframe
+# which it is aligned with, and of one which it is searched in.
+_TURNED, _TURNED_FAR = 0.25, 0.5
 
 
 @dataclass(frozen=True)
@@ -132,16 +135,13 @@ class Recovery:
         In how many of the newest keyframes a frame is searched for; 0 never searches.
     patience
         After so many frames in a row that the search did not find, only every so many-th is
-        searched for.
+        searched for; at the end, lost frames are searched for until it fails so many times.
     support, score
         Least share of both views' points that support the pose, and least score: the same, by how
         alike they reflect, less those that contradict it.
     margin, lost_margin
         Least lead in score before the best other pose; the second after a frame was lost, when
         the keyframe may show another place that looks alike.
-    late_searches, alike
-        At the end, lost frames are searched for so many times in all, each in so many of the
-        keyframes that look most like it.
     relocated_margin
         Least lead, as a share of the points, of the keyframe that a lost view fits best before
         others that put it elsewhere.
@@ -156,8 +156,6 @@ class Recovery:
 
     keyframes: int = 1
     patience: int = 10
-    late_searches: int = 30
-    alike: int = 3
     support: float = 0.25
     score: float = 0.1
     margin: float = 0.025
@@ -173,9 +171,6 @@ class Recovery:
             raise ValueError(f"keyframes is {self.keyframes}, not 0 to {_REMEMBERED}")
         if not 1 <= self.patience <= 1_000_000:
             raise ValueError(f"patience is {self.patience}, not 1 or more")
-        for name in ("late_searches", "alike"):
-            if not 0 <= getattr(self, name) <= 1_000_000:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
         for name in (
             "support",
             "score",
@@ -270,7 +265,11 @@ class _Keyframe:
     view: SurfaceMap
     T_world_camera: Float64
     depth: float  # median, m
-    thumbnail: Float64
+
+    @cached_property
+    def look(self) -> Float32:
+        """See `look_of`."""
+        return look_of(self.view)
 
     @cached_property
     def target(self) -> Target:
@@ -415,26 +414,38 @@ class _KeyframeTracker(Tracker):
         return {*self._waiting.indices, *doubted}
 
     def finish(self) -> tuple[tuple[int, Step], ...]:
-        """See `Tracker.finish`: lost views are searched for where keyframes look most like them."""
-        recovery = self._options.recovery
+        """See `Tracker.finish`: lost views are searched for where they look most alike."""
         found: list[tuple[int, Step]] = []
-        searches = recovery.late_searches
-        again = True
-        while again:
-            again = False
-            for view in self._waiting.views:
-                if view.index not in self._waiting.indices:
-                    continue  # it has been found beside another one
-                for keyframe in self._alike(view, recovery.alike):
-                    if (view.index, keyframe.view.index) in self._tried or not searches:
-                        continue
-                    searches -= 1
-                    fit = self._searched_in(view, keyframe, lost=True)
-                    if fit is not None:
-                        found += self._place(view, fit)
-                        again = True
-                        break
+        unlike: dict[tuple[int, int], float] = {}
+        in_vain = 0
+        while in_vain < self._options.recovery.patience:
+            self._compare(unlike)
+            left = {pair: far for pair, far in unlike.items() if pair not in self._tried}
+            if not left:
+                break
+            lost, known = min(left, key=lambda pair: (left[pair], pair))
+            view = self._waiting[lost]
+            keyframe = next(k for k in self._keyframes if k.view.index == known)
+            fit = self._searched_in(view, keyframe, lost=True)
+            in_vain += 1
+            if fit is not None:
+                found += self._place(view, fit)
+                in_vain = 0
         return tuple(sorted(found))
+
+    def _compare(self, unlike: dict[tuple[int, int], float]) -> None:
+        """See how much each lost view differs from each keyframe, where that is not known yet."""
+        frames = {k.view.index for k in self._keyframes}
+        for lost, frame in list(unlike):
+            if lost not in self._waiting.indices or frame not in frames:
+                del unlike[lost, frame]
+        for view in self._waiting.views:
+            new = [k for k in self._keyframes if (view.index, k.view.index) not in unlike]
+            if new:
+                far = unlikeness(look_of(view), np.stack([k.look for k in new]), _TURNED_FAR)
+                unlike |= {
+                    (view.index, k.view.index): float(f) for k, f in zip(new, far, strict=True)
+                }
 
     def _place(self, view: SurfaceMap, found: _Found) -> list[tuple[int, Step]]:
         """Take the pose of a view that waited, and look for others beside it."""
@@ -688,17 +699,15 @@ class _KeyframeTracker(Tracker):
         wide = replace(options.alignment, levels=_WIDE, prior_m=3.0, prior_rad=3.0)
         fine = replace(options.alignment, levels=_PATIENT)
         found = []
-        for k in likeness(thumbnail(view), [k.thumbnail for k in self._keyframes])[:_TRIED]:
-            keyframe = self._keyframes[k]
+        for keyframe in self._alike(view, _TURNED, _TRIED):
             if not _is_comparable(view.depth, keyframe.depth):
                 continue
             target = [keyframe.target]
             coarse = align(view, target, keyframe.T_world_camera, wide)
             if not options.relocated.objection(coarse, view.depth):
-                found.append((coarse.score, k, coarse.T_world_source))
+                found.append((coarse.score, keyframe, coarse.T_world_source))
         fits = []
-        for _, k, T in sorted(found, key=lambda one: (-one[0], one[1])):
-            keyframe = self._keyframes[k]
+        for _, keyframe, T in sorted(found, key=lambda one: (-one[0], one[1].view.index)):
             target = [keyframe.target]
             aligned = align(view, target, T, fine)
             # A flat wall fits anywhere: only a view that is held in every direction is found again.
@@ -738,7 +747,7 @@ class _KeyframeTracker(Tracker):
         keyframes = self._keyframes[: -recovery.keyframes - 1 : -1]
         if keyframes and self._lost:
             newest = {keyframe.view.index for keyframe in keyframes}
-            alike = self._alike(view, 1)
+            alike = self._alike(view, _TURNED_FAR, 1)
             keyframes += [k for k in alike if k.view.index not in newest]
         for keyframe in keyframes:
             found = self._searched_in(view, keyframe, lost=self._lost)
@@ -746,10 +755,11 @@ class _KeyframeTracker(Tracker):
                 return found
         return None
 
-    def _alike(self, view: SurfaceMap, most: int) -> list[_Keyframe]:
-        """So many keyframes that look most like a view, the likest first."""
-        looks = [keyframe.thumbnail for keyframe in self._keyframes]
-        return [self._keyframes[k] for k in likeness(thumbnail(view), looks)[:most]]
+    def _alike(self, view: SurfaceMap, shift: float, most: int) -> list[_Keyframe]:
+        """So many keyframes that look most like a view, the likest first, of equals the newest."""
+        far = unlikeness(look_of(view), np.stack([k.look for k in self._keyframes]), shift)
+        order = np.lexsort((-np.arange(len(far)), far))
+        return [self._keyframes[k] for k in order[:most]]
 
     def _searched_in(self, view: SurfaceMap, keyframe: _Keyframe, *, lost: bool) -> _Found | None:
         """Search a keyframe exhaustively; `lost` if it may show another place."""
@@ -819,7 +829,7 @@ class _KeyframeTracker(Tracker):
 
 
 def _keyframe(view: SurfaceMap, T: Float64) -> _Keyframe:
-    return _Keyframe(view, T, view.depth, thumbnail(view))
+    return _Keyframe(view, T, view.depth)
 
 
 def _is_comparable(depth: float, other: float) -> bool:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import Generic, Protocol, TypeVar
 
-# Pixels of all that wait together: 20 images of 640x480, or 240 of 176x144.
-_PIXELS = 6_200_000
+# Pixels of all that wait together: 10 images of 640x480, or 120 of 176x144.
+_PIXELS = 3_100_000
 
 
 class Seen(Protocol):
@@ -41,6 +41,9 @@ class Waiting(Generic[V]):
 
     def __len__(self) -> int:
         return len(self._views)
+
+    def __getitem__(self, index: int) -> V:
+        return self._views[index]
 
     @property
     def indices(self) -> Collection[int]:

@@ -1,9 +1,4 @@
-"""Places known again by how they look, wherever the trajectory has them.
-
-Of each view a small image is kept of how far the surfaces are and how they reflect, both as
-logarithms. Two views look alike if their images differ little at some shift of one against the
-other, as a camera that is turned a little sees the same, moved. No pose takes part.
-"""
+"""Places known again by how they look, wherever the trajectory has them: no pose takes part."""
 
 from __future__ import annotations
 
@@ -14,23 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.likeness import mutual_unlikeness
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-_ROWS, _COLUMNS = 9, 12
-_CHUNKS = 16
 # Of pairs of nearly the same views (this many positions off either way) so many are taken: two can
 # confirm each other, and more would take the place of other loops.
 _BESIDE, _TOGETHER = 3, 2
 # How far apart views that look alike may stand: rad, and share of the depth.
 ALIKE = 0.35
-# Logarithms that differ by more are as good as unknown.
-_MOST_DEPTH, _MOST_LIGHT = 0.3, 0.5
-# Share of the cells of which both views know the albedo, below which it is not compared.
-_LIT = 0.2
 
 
 @dataclass(frozen=True)
@@ -77,7 +65,7 @@ class Appearance:
         Parameters
         ----------
         looks
-            Of all views in the order of time, see `look_of`.
+            Of all views in the order of time, see `likeness.look_of`.
         possible
             Whether the trajectory allows that two views show the same place.
         known
@@ -92,7 +80,7 @@ class Appearance:
         refused: list[tuple[int, int]] = []
         if self.most == 0 or len(looks) < 3:
             return chosen, refused
-        far = unlikeness(looks, self.shift)
+        far = mutual_unlikeness(looks, self.shift)
         away = far >= self.left
         found = [
             (float(far[i, j]), int(i), int(j))
@@ -134,67 +122,3 @@ class Appearance:
 def _beside(i: int, j: int, pairs: Collection[tuple[int, int]]) -> int:
     """Number of the pairs that are of nearly the same views."""
     return sum(abs(i - k) <= _BESIDE and abs(j - m) <= _BESIDE for k, m in pairs)
-
-
-def look_of(view: SurfaceMap) -> Float32:
-    """(2, 9, 12) mean log depth and log albedo of each cell, NaN where little is known."""
-    rows, columns = view.z.shape
-    i = np.arange(rows) * _ROWS // rows
-    j = np.arange(columns) * _COLUMNS // columns
-    cell = (i[:, None] * _COLUMNS + j).ravel()
-    size = _ROWS * _COLUMNS
-    third = np.bincount(cell, minlength=size) / 3
-    look = np.full((2, size), np.nan, np.float32)
-    depth = np.log(np.where(view.z > 0, view.z, np.float32(np.nan)))
-    for image, out in ((depth, look[0]), (view.photo[..., 0], look[1])):
-        known = np.isfinite(image).ravel()
-        count = np.bincount(cell[known], minlength=size)
-        total = np.bincount(cell[known], image.ravel()[known].astype(float), minlength=size)
-        enough = (count > third) & (count > 0)
-        out[enough] = total[enough] / count[enough]
-    return look.reshape(2, _ROWS, _COLUMNS)
-
-
-def unlikeness(looks: Sequence[Float32], shift: float) -> Float64:
-    """(N, N) how much views (2, 9, 12) differ from each other, at the best shift of each pair.
-
-    0 for the same image, 1 for nothing in common. Exposure is what the albedo differs by on
-    average, and does not count. Pairs without light on both sides are compared by depth alone.
-
-    Parameters
-    ----------
-    shift
-        Largest one, as a share of the width.
-    """
-    stack = np.stack(looks)
-    across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
-    far = np.ones((len(stack), len(stack)))
-
-    def rows(a: int, b: int) -> None:
-        for k in range(a, b):
-            best = far[k, k:]
-            for v in range(-down, down + 1):
-                for u in range(-across, across + 1):
-                    here = stack[k, :, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
-                    there = stack[k:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
-                    np.minimum(best, _differ(here, there), out=best)
-
-    run_chunks(rows, len(stack), _CHUNKS)
-    return np.minimum(far, far.T)
-
-
-def _differ(here: Float32, there: Float32) -> Float64:
-    """(N,) mean of what cells differ by, of the most that counts."""
-    apart = there - here
-    known = np.isfinite(apart)
-    count = known.sum((2, 3))
-    apart = np.where(known, apart, 0)
-    exposure = apart[:, 1].sum((1, 2)) / np.maximum(count[:, 1], 1)
-    depth = np.minimum(np.abs(apart[:, 0]) / _MOST_DEPTH, 1)
-    light = np.minimum(np.abs(apart[:, 1] - exposure[:, None, None]) / _MOST_LIGHT, 1)
-    cells = here[0].size
-    far = (depth.sum((1, 2)) + cells - count[:, 0]) / cells
-    # Albedo is known of smooth surfaces alone: where it is not, nothing is told.
-    shade = np.where(known[:, 1], light, 0).sum((1, 2)) / np.maximum(count[:, 1], 1)
-    lit = count[:, 1] > _LIT * cells
-    return np.asarray(np.where(lit, 0.5 * (far + shade), far), np.float64)

@@ -13,8 +13,9 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframes import Acceptance, Recovery
+from tofuse.odometry.likeness import look_of
 from tofuse.parts import part
-from tofuse.posegraph.appearance import ALIKE, Appearance, look_of
+from tofuse.posegraph.appearance import ALIKE, Appearance
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import (
     ClosedLoop,
