@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.odometry.likeness import likeness, thumbnail
+from tofuse.odometry.likeness import look_of, mutual_unlikeness, unlikeness
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
@@ -27,47 +27,61 @@ def views():
     ]
 
 
-def test_a_thumbnail_is_the_mean_inverse_depth_of_each_cell(views) -> None:
+@pytest.fixture(scope="module")
+def looks(views):
+    return np.stack([look_of(view) for view in views])
+
+
+def test_a_look_is_the_mean_log_depth_and_albedo_of_each_cell(views, looks) -> None:
     view = views[0]
-    made = thumbnail(view)
-    assert made.shape == (9, 12)
+    made = looks[0]
+    assert made.shape == (2, 9, 12)
     rows, columns = view.z.shape
     for i, j in ((0, 0), (4, 7), (8, 11)):
-        picked = [
-            1 / float(view.z[r, c])
+        cell = [
+            (r, c)
             for r in range(rows)
             for c in range(columns)
-            if r * 9 // rows == i and c * 12 // columns == j and view.z[r, c] > 0
+            if r * 9 // rows == i and c * 12 // columns == j
         ]
-        assert made[i, j] == pytest.approx(np.log(np.mean(picked)), rel=1e-6)
+        depth = [np.log(view.z[r, c]) for r, c in cell if view.z[r, c] > 0]
+        light = [view.photo[r, c, 0] for r, c in cell if np.isfinite(view.photo[r, c, 0])]
+        assert made[0, i, j] == pytest.approx(np.mean(depth), rel=1e-5)
+        if 3 * len(light) > len(cell):
+            assert made[1, i, j] == pytest.approx(np.mean(light), rel=1e-5)
+        else:
+            assert np.isnan(made[1, i, j])
+    assert np.isfinite(made[1]).sum() > 20
     empty = replace(view, z=np.where(np.arange(columns) < columns // 2, 0, view.z))
-    assert np.isnan(thumbnail(empty)[:, :6]).all()
-    np.testing.assert_array_equal(thumbnail(empty)[:, 6:], made[:, 6:])
+    assert np.isnan(look_of(empty)[0, :, :6]).all()
+    np.testing.assert_array_equal(look_of(empty)[0, :, 6:], made[0, :, 6:])
 
 
-def test_the_same_place_comes_first(views) -> None:
-    known = [thumbnail(view) for view in views]
-    for k, look in enumerate(known):
-        order = likeness(look, known)
-        assert sorted(order) == list(range(len(known)))
-        assert order[0] == k
+def test_the_same_place_is_likest(looks) -> None:
+    for k, look in enumerate(looks):
+        far = unlikeness(look, looks, 0.25)
+        assert far[k] == 0
+        assert np.delete(far, k).min() > 0.02
 
 
-def test_neighbours_come_before_what_is_elsewhere(views) -> None:
-    known = [thumbnail(view) for view in views]
-    for k, look in enumerate(known[:-1]):
-        others = [j for j in range(len(known)) if j != k]
-        first = [others[n] for n in likeness(look, [known[j] for j in others])[:5]]
-        assert {k - 1, k + 1} & set(first), k
+def test_neighbours_are_liker_than_what_is_elsewhere(looks) -> None:
+    """They share more than half of what they see: at a shift of half the width each comes first."""
+    for k, look in enumerate(looks[:-1]):
+        far = unlikeness(look, looks, 0.5)
+        far[k] = np.inf
+        assert {k - 1, k + 1} & set(np.argsort(far)[:2]), k
 
 
-def test_of_equals_the_newest_comes_first(views) -> None:
-    look = thumbnail(views[0])
-    assert likeness(look, [look, thumbnail(views[9]), look]) == [2, 0, 1]
+def test_one_against_many_is_what_all_against_each_other_are(looks) -> None:
+    mutual = mutual_unlikeness(looks, 0.25)
+    for k, look in enumerate(looks):
+        np.testing.assert_array_equal(mutual[k, k:], unlikeness(look, looks[k:], 0.25))
 
 
-def test_what_is_unknown_is_unlike(views) -> None:
-    look = thumbnail(views[0])
+def test_what_is_unknown_is_unlike(looks) -> None:
+    look = looks[0]
     nothing = np.full_like(look, np.nan)
-    far = look + 10.0
-    assert likeness(look, [nothing, look, far])[0] == 1
+    far = unlikeness(look, np.stack([nothing, look, look + 10.0]), 0.25)
+    assert far[1] == 0
+    # What differs by the same everywhere is exposure, to the albedo, but another place, to depth.
+    np.testing.assert_allclose(far[[0, 2]], [1.0, 0.5], atol=1e-5)

@@ -149,6 +149,13 @@ CASES = {
 }
 
 
+def test_views_in_no_order_are_told_of_once() -> None:
+    at = np.random.default_rng(1).permutation(16)
+    mixed = evidence(("tracked",) * 16, steps=[(0, 0, 0, 0, 0.4 * k, 0) for k in at])
+    (jumped,) = [r for r in judge(mixed)[1] if r.code == "jumped"]
+    assert "views were in no order" in jumped.text
+
+
 def test_every_reason_has_a_case() -> None:
     # Whether there is a surface is no question of trust: fusion tells. What is wrong with the
     # recording itself is found before it is run.

@@ -12,7 +12,8 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Recovery
-from tofuse.posegraph.appearance import Appearance, look_of, unlikeness
+from tofuse.odometry.likeness import look_of, mutual_unlikeness
+from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing
 from tofuse.recordings.frames import RangeFrame
@@ -169,12 +170,12 @@ def test_unlikeness_against_a_slow_twin(once_round):
 
     expected = [[min(slow(a, b), slow(b, a)) for b in looks] for a in looks]
     with threads(2):
-        np.testing.assert_allclose(unlikeness(looks, 0.25), expected, atol=1e-5)
+        np.testing.assert_allclose(mutual_unlikeness(looks, 0.25), expected, atol=1e-5)
 
 
 def test_the_same_place_is_more_alike_than_any_other(once_round):
     views, _truth = once_round
-    far = unlikeness([look_of(view) for view in views], 0.25)
+    far = mutual_unlikeness([look_of(view) for view in views], 0.25)
     # The last two views show again what the first two did.
     assert far[0, 18] < 0.1
     assert far[1, 19] < 0.1
@@ -186,7 +187,7 @@ def test_exposure_does_not_count():
     frame = room(0.3, 0)
     brighter = replace(frame, amplitude_image=3 * frame.amplitude_image)
     looks = [look_of(surface_map(f, SurfaceOptions(radii=(2,)))) for f in (frame, brighter)]
-    assert unlikeness(looks, 0.25)[0, 1] < 0.01
+    assert mutual_unlikeness(looks, 0.25)[0, 1] < 0.01
 
 
 def test_candidates_left_and_came_back(once_round):

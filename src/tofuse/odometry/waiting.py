@@ -32,12 +32,15 @@ class Waiting(Generic[V]):
     Parameters
     ----------
     pixels
-        Of all views together. When there are more, every other view is given up.
+        Of all views together. When there are more, every other view is given up, and of those to
+        come as many; but the newest one stays until the next, as it is the likeliest to be found.
     """
 
     def __init__(self, pixels: int = _PIXELS) -> None:
         self._views: dict[int, V] = {}
         self._most = pixels
+        self._step, self._count = 1, 0
+        self._extra: int | None = None  # the newest one, if it stays for that alone
 
     def __len__(self) -> int:
         return len(self._views)
@@ -57,10 +60,16 @@ class Waiting(Generic[V]):
 
     def add(self, view: V) -> None:
         """Let the newest view wait."""
+        if self._extra is not None:
+            self._views.pop(self._extra, None)
         self._views[view.index] = view
+        self._extra = view.index if self._count % self._step else None
+        self._count += 1
         while len(self) > 1 and sum(v.pixels for v in self._views.values()) > self._most:
-            # The newest one stays: it is the likeliest to be found.
-            self._views = dict(reversed(list(reversed(self._views.items()))[::2]))
+            kept = [v for v in self.views if v.index != self._extra][::2]
+            self._step *= 2
+            self._views = {v.index: v for v in kept} | {view.index: view}
+            self._extra = None if kept[-1] is view else view.index
 
     def remove(self, index: int) -> None:
         """Wait no longer for a view."""

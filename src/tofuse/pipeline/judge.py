@@ -31,6 +31,8 @@ UNSETTLED_SHARE = 0.05
 UNHELD_SHARE = 0.1
 # Typical depths in m that ToF cameras hardly have.
 NEAREST_M, FARTHEST_M = 0.3, 12.0
+# More jumps than a few, and than this share of the poses, are views in no order.
+UNORDERED, UNORDERED_SHARE = 3, 0.2
 # A camera that moved by no more than this stood still.
 STILL_M, STILL_RAD = 0.01, np.radians(0.5)
 # A result is good if its path is right to 1 cm and 1 % of its length: what the verdict promises.
@@ -142,7 +144,16 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     has_pose = [r.status in ("tracked", "predicted") for r in e.records]
     poses = [next(posed) if has else None for has in has_pose]
     moments = [Moment(r.index, r.timestamp) for r in e.records]
-    for k, words in jumps(poses, e.interruptions, moments):
+    found = jumps(poses, e.interruptions, moments)
+    if len(found) > max(UNORDERED, UNORDERED_SHARE * sum(has_pose)):
+        first, last = (e.records[found[k][0]].index for k in (0, -1))
+        text = (
+            f"{len(found)} of {sum(has_pose)} poses are not where the motion before leads to, as "
+            "if the views were in no order; so no motion tells whether they are right."
+        )
+        yield Reason("jumped", (first, last), text)
+        found = []
+    for k, words in found:
         frame = e.records[k].index
         yield Reason("jumped", (frame, frame), f"Frame {frame} has a pose, but {words}.")
     for first, last in _runs(
