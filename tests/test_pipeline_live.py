@@ -13,7 +13,7 @@ from test_kernels_refinement import corner
 from test_posegraph_revisits import ALL, DRIFT, away_and_back
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.odometry.base import Step
+from tofuse.odometry.base import Step, Tracker
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.live import DELAY, LiveLoops
 from tofuse.pipeline.mapper import Mapper
@@ -39,12 +39,9 @@ class Drifting:
         return _Drifting()
 
 
-class _Drifting:
+class _Drifting(Tracker):
     def __init__(self):
         self.before = None
-
-    def interrupt(self):
-        """Nothing to forget."""
 
     def push(self, frame, T_odometry=None, surface=None):
         at = min(frame.index, COUNT - 1)
