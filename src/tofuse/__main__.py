@@ -2,6 +2,6 @@
 
 import sys
 
-from tofuse.cli import main
+from tofuse.cli import console
 
-sys.exit(main())
+sys.exit(console())

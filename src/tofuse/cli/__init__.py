@@ -6,9 +6,18 @@ but some readable frame has none; 2, nothing was written: one line on stderr say
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
+
+
+def console() -> int:
+    """Run the command of this process, which ends with it, and return its exit status."""
+    status = main()
+    # Else all that is left is looked through for cycles once more, which takes half a second.
+    gc.freeze()
+    return status
 
 
 def main(argv: Sequence[str] | None = None) -> int:
