@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,8 @@ class Scene:
         (n, 4, 4) poses, finite ones only; `reference` may be empty.
     loops
         (L, 2, 3) ends of the accepted loops.
-    mesh
-        The surface, with so few faces that a browser on a phone shows it; None without one.
+    surface
+        All of it; None without one.
     """
 
     points: Float64
@@ -55,7 +56,14 @@ class Scene:
     after: Float64
     reference: Float64
     loops: Float64
-    mesh: Mesh | None = None
+    surface: Mesh | None = None
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The surface, with so few faces that a browser on a phone shows it; None without any."""
+        if self.surface is None or len(self.surface.faces) == 0:
+            return None
+        return self.surface.decimated(MAX_FACES)
 
     @property
     def box(self) -> Float64:
@@ -93,7 +101,7 @@ class Scene:
             after=T @ self.after,
             reference=T @ self.reference,
             loops=self.loops @ R.T,
-            mesh=self.mesh
+            surface=self.mesh
             and replace(
                 self.mesh,
                 vertices=(self.mesh.vertices @ R.T).astype(np.float32),
@@ -134,13 +142,8 @@ def make_scene(
         finite(result.trajectory),
         finite(reference),
         loops[np.isfinite(loops).all((1, 2))],
-        _shown(result.mesh),
+        result.mesh,
     )
-
-
-def _shown(mesh: Mesh | None) -> Mesh | None:
-    """The mesh with at most `MAX_FACES` faces; None where there are none."""
-    return None if mesh is None or len(mesh.faces) == 0 else mesh.decimated(MAX_FACES)
 
 
 def packed(scene: Scene) -> dict[str, Any]:

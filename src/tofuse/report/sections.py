@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tofuse._version import __version__
+from tofuse.kernels.threads import side_threads
 from tofuse.report import section_frames, section_model, section_path, section_views, words
 from tofuse.report.extras import ReportExtras
 from tofuse.report.subject import Subject, Values
@@ -21,7 +22,6 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     out: Values = {}
     parts: tuple[Callable[[Subject], Values], ...] = (
         _verdict,
-        section_model.model,
         section_model.views,
         section_path.cameras,
         section_path.error,
@@ -36,8 +36,12 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         _timings,
         _settings,
     )
-    for part in parts:
-        out.update(part(subject))
+    # To thin the surface takes as long as to draw all plots, and leaves the interpreter to these.
+    with side_threads(1, "tofuse-report") as beside:
+        model = beside.submit(section_model.model, subject)
+        for part in parts:
+            out.update(part(subject))
+        out.update(model.result())
     if out["sizes"]:
         size = " × ".join(row[2 if out["true_sizes"] else 1] for row in out["sizes"])
         out["facts"].insert(5, ("width × height × depth", size))
