@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +51,8 @@ class Inspection:
 
     Attributes
     ----------
-    facts
-        By name, for people.
+    recording
+        What was looked at.
     findings
         The gravest first.
     notes
@@ -60,10 +61,15 @@ class Inspection:
         Those that were looked at.
     """
 
-    facts: dict[str, str]
+    recording: Recording
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
-    frames: tuple[Frame, ...] = ()
+    frames: tuple[Frame, ...]
+
+    @cached_property
+    def facts(self) -> dict[str, str]:
+        """What it is, by name, for people."""
+        return facts.facts_of(self.recording, self.frames)
 
     @property
     def severe(self) -> bool:
@@ -125,6 +131,4 @@ def inspect_recording(
     with threadpool_limits(1):
         findings = [f for check in (QUICK if quick else CHECKS) for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
-    return Inspection(
-        facts.facts_of(recording, sample.frames), tuple(findings), tuple(notes), sample.frames
-    )
+    return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
