@@ -30,13 +30,14 @@ import sequences
 from tofuse.fusion.options import Fusion
 from tofuse.kernels.threads import run_chunks, threads
 from tofuse.maps.surface_map import SurfaceMap, surface_map
-from tofuse.odometry.keyframes import Keyframes
+from tofuse.odometry.keyframes import Keyframes, Recovery
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Stopwatch
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.search import search
 from tofuse.results.types import Reconstruction
 
 
@@ -142,6 +143,8 @@ def main(arguments: list[str] | None = None) -> int:
             f"{'pairs':>6} {'refinement':>13} {'ms a pair':>10} {'all':>13}"
         )
         mapped(frames, 30)
+        ends = [surface_map(frames[k], Keyframes().surface) for k in (0, -1)]
+        search(ends[0], ends[1], Recovery().search)
         for count in options.frames:
             result, watch = mapped(frames, count)
             print(row(result, watch), flush=True)
