@@ -538,6 +538,14 @@ def test_a_search_is_believed_only_with_a_lead_and_without_contradiction():
     assert recovery.believes(match(0.5, 0.2, 0.0), lost=True)
 
 
+def test_a_box_that_turns_by_half_a_corner_is_told_from_its_other_sides():
+    """At 46 degrees an alignment from where it was may as well end a quarter of a turn off."""
+    scene = Sequence("box", range(0, 4 * 72, 72))
+    first = se3.inverse(scene.poses[0])
+    for step, true in zip(run([f.keep(f.z < 1.8) for f in scene.frames]), scene.poses, strict=True):
+        assert_near(step, first @ true)
+
+
 def turned_box(albedos):
     """A tracker that saw a box from four sides alike, in other colours, and was lost; a view."""
     frame = Sequence("box", [0]).frames[0]

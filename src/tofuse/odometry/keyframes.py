@@ -51,6 +51,8 @@ _GLANCE = Level(4, 2, 0.0, 0.0)
 
 # From one frame to the next no view gets so many times deeper, nor as much nearer.
 _RESCALED = 4.0
+# Nor does the camera; so far, as a share of the depth, it may have been taken elsewhere by mistake.
+_FAR_RAD, _FAR_SHARE = 0.35, 0.35
 # An image that fits is wrong all the same if it fits so many times better otherwise, or, where the
 # camera would have had to jump, nearly as well.
 _CLEARLY, _NEARLY = 1.02, 0.95
@@ -648,6 +650,11 @@ class _KeyframeTracker(Tracker):
             else:
                 acceptance = options.acceptance if self._is_near(aligned) else options.relocated
                 objection = acceptance.objection(aligned, view.depth) or self._doubt(aligned)
+            if not objection and chosen and self._is_far(aligned):
+                found = self._unrivalled(view, _Found(aligned, targets, newest[-1], chosen))
+                if found is not None:
+                    return found
+                objection = "it is far from where the camera was, and a rival fits as well"
             if not objection:
                 return _Found(aligned, targets, newest[-1], chosen)
             reasons.append(f"does not fit keyframe {newest[-1].view.index}: {objection}")
@@ -657,6 +664,26 @@ class _KeyframeTracker(Tracker):
         """Whether the camera hardly moved since the last frame, which needs no prediction."""
         assert self._T is not None
         return not self._lost and is_small(se3.inverse(self._T) @ aligned.T_world_source)
+
+    def _is_far(self, aligned: Aligned) -> bool:
+        """Whether the camera moved so far that a rival may lie nearer, as a box looks alike."""
+        assert self._T is not None
+        distance, angle = distance_and_angle(self._T, aligned.T_world_source)
+        return angle > _FAR_RAD or distance > _FAR_SHARE * self._depth
+
+    def _unrivalled(self, view: SurfaceMap, found: _Found) -> _Found | None:
+        """Ask an exhaustive search about an alignment that nothing predicted.
+
+        Returns it if the search finds nothing better, else what that finds, if it is believed.
+        """
+        search_options = self._options.recovery.search
+        match = search(view, found.reference.view, search_options)
+        if match is None:
+            return found
+        T = found.reference.T_world_camera @ match.T_target_source
+        if not search_options.differ(T, found.aligned.T_world_source):
+            return found
+        return self._searched_in(view, found.reference, lost=self._lost)
 
     def _doubt(self, aligned: Aligned) -> str:
         """Why an alignment that nothing predicted is not believed though it fits."""
