@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
+from tofuse.kernels import shared_error as patch_kernels
 from tofuse.kernels import steps
 from tofuse.kernels.threads import run_chunks
-from tofuse.posegraph import robust
+from tofuse.posegraph import robust, shared_error
 from tofuse.posegraph.descent import vertical
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import PairSystem
@@ -31,6 +32,8 @@ Integers = NDArray[np.intp]
 
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 _PAIRS_A_CHUNK = 8
+# So many pairs, about, are asked by how much patches disagree.
+_PAIRS_ASKED = 200
 # Few residuals tell no scale.
 _LEAST_COMPARED = 50
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
@@ -75,6 +78,10 @@ class RefineOptions:
         As in `ProjectiveOptions`.
     settled
         Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
+    shared
+        Errors of depth that the pixels of a patch share are taken to be so many times as large as
+        patches disagree (in the last round, of views that have albedo, and where no error of the
+        camera is estimated); 0: there are none. See `shared_error`.
     """
 
     rounds: tuple[Round, ...] = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(5, 0.0, 0.0))
@@ -86,6 +93,7 @@ class RefineOptions:
     photometric: bool = True
     most_sigma_m: float = 0.02
     settled: float = 0.02
+    shared: float = 1.0
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.rounds) <= 20:
@@ -98,6 +106,8 @@ class RefineOptions:
         for name in ("robust", "max_angle", "most_sigma_m", "settled"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+        if not 0 <= self.shared <= 100:
+            raise ValueError(f"shared is {self.shared}, not 0 to 100")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +247,8 @@ def refine(
             since = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
+            if stage is options.rounds[-1] and not calibrate:
+                _allow_for_shared(views, poses, state, options)
             step, change = _solve(poses, state, known, beside)
             poses = se3.orthonormalise(poses @ se3.exp(step))
             poses[0] = start[0]
@@ -460,6 +472,60 @@ def _evaluate(
 
     run_chunks(work, len(rows), -(-len(rows) // _PAIRS_A_CHUNK))
     state.rows = rows
+
+
+def _allow_for_shared(
+    views: Sequence[KeptView], poses: Float64, state: _Pairs, options: RefineOptions
+) -> None:
+    """Take off the normal equations what can't be told from errors that patches share.
+
+    Only where albedo tells as well: without it there is nothing that errs less to rely on.
+    """
+    lit = np.flatnonzero(state.scale_p > 0)
+    if options.shared == 0 or not len(lit):
+        return
+    T = se3.inverse(poses[state.target[lit]]) @ poses[state.source[lit]]
+    depth = np.array([v.surface.depth for v in views])[state.target[lit]]
+    growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
+    sums = np.empty((len(lit), shared_error.PATCHES, patch_kernels.PATCH_SIZE))
+    cosine = float(np.cos(options.max_angle))
+
+    def sum_up(which: Integers) -> None:
+        def work(a: int, b: int) -> None:
+            for k in which[a:b]:
+                source = views[state.source[lit[k]]]
+                target = views[state.target[lit[k]]].surface
+                patch_kernels.patch_sums(
+                    source.points,
+                    source.patches,
+                    target.target,
+                    target.projection.lookup,
+                    target.projection.frame,
+                    np.ascontiguousarray(T[k]),
+                    state.scale_g[lit[k]],
+                    options.robust,
+                    cosine,
+                    sums[k],
+                )
+
+        run_chunks(work, len(which), -(-len(which) // _PAIRS_A_CHUNK))
+
+    # Views of one recording come from one camera: they err alike.
+    alike = shared_error.alike(views[0].surface)
+    every = np.arange(len(lit))
+    some = every[:: -(-len(lit) // _PAIRS_ASKED)]
+    sum_up(some)
+    found = shared_error.disagreement(sums[some], state.rows[lit[some]], alike)
+    variance = options.shared**2 * found.variance(growth[some]) * growth
+    if not variance.any():
+        return
+    sum_up(np.setdiff1d(every, some))
+
+    def work(a: int, b: int) -> None:
+        for k in range(a, b):
+            patch_kernels.allow(sums[k], alike, variance[k], state.rows[lit[k]])
+
+    run_chunks(work, len(lit), -(-len(lit) // _PAIRS_A_CHUNK))
 
 
 def _support(

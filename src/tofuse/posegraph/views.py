@@ -16,6 +16,7 @@ from tofuse.kernels import refinement as kernels
 from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
+from tofuse.posegraph import shared_error
 from tofuse.registration.projective import points_of
 
 Float32 = NDArray[np.float32]
@@ -47,6 +48,11 @@ class KeptView:
     def coarse(self) -> SurfaceMap:
         """The surface at few pixels, which is enough to tell what overlaps."""
         return self.surface.thinned(_OVERLAP_COLUMNS)
+
+    @cached_property
+    def patches(self) -> NDArray[np.int64]:
+        """(N,) the patch of the image that each point is of, see `shared_error`."""
+        return shared_error.patches_of(self.points, self.surface)
 
     @cached_property
     def sigma(self) -> float:

@@ -1,0 +1,135 @@
+"""Errors that the pixels of a patch share, in a refinement of many views.
+
+Light by way of other surfaces, scattering and motion bend whole patches of a range image, and each
+view's patches otherwise, so that a thousand pixels of a wall know little more of a pose than one.
+By how much shows in the residuals: patches of two views disagree by more than the noise of their
+pixels allows, and the more so the more the view has changed. What they disagree about is the
+variance of an unknown for each patch of each pair (a component of variance, estimated by moments
+as in restricted maximum likelihood). Where nothing of the kind shows, all pixels count.
+
+Albedo is not bent like that. So where distances are, it counts for more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels import refinement as kernels
+from tofuse.kernels import shared_error as patch_kernels
+from tofuse.maps.surface_map import SurfaceMap
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# Patches in a row, and rows of patches; errors this far apart are still alike (by 1/e), as a share
+# of the image's width, as the tracker's covariance has it.
+ACROSS, DOWN = 6, 4
+PATCHES = ACROSS * DOWN
+_REACH = 0.31
+# A patch with less than this share of the weight of the typical one says nothing.
+_LEAST_WEIGHT = 0.1
+# Views that have changed by less than this, in rad, may still disagree as if by so much.
+_LEAST_CHANGE = 0.02
+# What a single pair can fake is bounded, in units of 1 cm and 1 degree (and 1 of the exposure).
+_LOOSEST = 1.8
+_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
+_UPPER = np.triu_indices(kernels.UNKNOWNS)
+
+
+def patches_of(points: Float32, surface: SurfaceMap) -> Int64:
+    """(N,) the patch of each point of a view."""
+    rays = points[:, :2] / points[:, 2:3]
+    low, high = np.nanmin(surface.rays, (0, 1)), np.nanmax(surface.rays, (0, 1))
+    share = (rays - low) / np.maximum(high - low, 1e-9)
+    most = np.array([ACROSS, DOWN])
+    u, v = np.clip((share * most).astype(np.int64), 0, most - 1).T
+    return np.asarray(v * ACROSS + u, np.int64)
+
+
+@cache
+def _alike(aspect: float) -> Float64:
+    v, u = np.mgrid[:DOWN, :ACROSS]
+    x, y = u.ravel() / ACROSS, v.ravel() * aspect / DOWN
+    return np.exp(-np.hypot(x[:, None] - x, y[:, None] - y) / _REACH)
+
+
+def alike(surface: SurfaceMap) -> Float64:
+    """(PATCHES, PATCHES) correlation of the errors of the patches of a view."""
+    rows, columns = surface.z.shape
+    return _alike(rows / columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Disagreement:
+    """By how much patches of pairs disagree, and how much of it noise and shared errors explain.
+
+    Attributes
+    ----------
+    seen, noise
+        (P,) weighted mean squares of the patches' residuals, and what noise makes of them, m^2.
+    share
+        (P,) what shared errors of variance 1 make of them.
+    """
+
+    seen: Float64
+    noise: Float64
+    share: Float64
+
+    def variance(self, growth: Float64) -> float:
+        """Of the errors, for a growth of 1, where that of each pair is `growth` (P,) times it."""
+        explained = float(self.share @ growth)
+        return max(float((self.seen - self.noise).sum()), 0.0) / max(explained, 1e-12)
+
+
+def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagreement:
+    """Tell by how much the patches of pairs disagree, after allowing for what poses take up.
+
+    Parameters
+    ----------
+    sums
+        (P, PATCHES, PATCH_SIZE) of `kernels.shared_error.patch_sums`.
+    rows
+        (P, SIZE) normal equations of the pairs, see `kernels.refinement`.
+    correlation
+        (PATCHES, PATCHES) of the errors.
+    """
+    count = len(sums)
+    weight = sums[..., patch_kernels.WEIGHT]
+    per_weight = 1 / np.maximum(weight, 1e-12)
+    known = weight > _LEAST_WEIGHT * np.median(weight, axis=1, keepdims=True)
+    A = np.zeros((count, kernels.UNKNOWNS, kernels.UNKNOWNS))
+    A[:, _UPPER[0], _UPPER[1]] = rows[:, kernels.H : kernels.G]
+    A[:, _UPPER[1], _UPPER[0]] = rows[:, kernels.H : kernels.G]
+    normal = A[:, :7, :7] * np.outer(_UNITS, _UNITS) + np.eye(7) / _LOOSEST**2
+    J = np.zeros((count, PATCHES, 7))
+    J[..., :6] = sums[..., patch_kernels.RESPONSE :]
+    J *= _UNITS
+    taken = per_weight[..., None] * J @ np.linalg.inv(normal) @ np.swapaxes(J, 1, 2)
+    left = (np.eye(PATCHES) - taken) * known[:, :, None] * known[:, None, :]
+    share = np.where(known, weight, 0.0)
+    share /= np.maximum(share.sum(1, keepdims=True), 1e-12)
+    means = sums[..., patch_kernels.RESIDUAL] * per_weight
+    return Disagreement(
+        (share * means**2).sum(1),
+        (share * (left**2 * np.where(known, per_weight, 0.0)[:, None]).sum(2)).sum(1),
+        (share * ((left @ correlation) * left).sum(2)).sum(1),
+    )
+
+
+def growth(depth: Float64, turned: Float64, moved: Float64) -> Float64:
+    """(P,) how the variance of the errors grows with the change from one view of a pair to the other.
+
+    Parameters
+    ----------
+    depth
+        (P,) median depth of the targets, m.
+    turned, moved
+        (P,) rad and m from one view to the other.
+    """
+    change = np.maximum(turned + moved / depth, _LEAST_CHANGE)
+    return np.asarray((depth * change) ** 2, np.float64)
