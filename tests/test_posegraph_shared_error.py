@@ -1,4 +1,4 @@
-"""Errors that patches of views share, in a refinement: their sums, their size, and what they cost."""
+"""Errors that patches of views share, in a refinement: their sums, size, and what they cost."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from test_kernels_refinement import SHARP, corner, unpack
-from test_posegraph_refine import away, path
+from test_posegraph_refine import path
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels

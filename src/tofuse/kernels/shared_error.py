@@ -2,8 +2,8 @@
 
 With D the sums of the weights of the distances that fall into each patch, R the sums of weight
 times (r, J) over the root of D, and K the covariance of the patches' errors, an alignment that
-allows for these errors has the products R^T (1 + D^1/2 K D^1/2)^-1 R where one that takes all pixels
-for independent has R^T R (the normal equations with an unknown for each patch, eliminated).
+allows for these errors has the products R^T (1 + D^1/2 K D^1/2)^-1 R where one that takes all
+pixels for independent has R^T R (the normal equations with an unknown for each patch, eliminated).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tofuse.kernels.alignment import (
     move,
 )
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.refinement import G, H, UNKNOWNS
+from tofuse.kernels.refinement import UNKNOWNS, G, H
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -122,7 +122,7 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
 
 
 def growth(depth: Float64, turned: Float64, moved: Float64) -> Float64:
-    """(P,) how the variance of the errors grows with the change from one view of a pair to the other.
+    """(P,) how the variance of the errors grows with the change between the views of a pair.
 
     Parameters
     ----------
