@@ -92,10 +92,12 @@ class Suspicion:
     alarm
         Whether the camera ought to be checked.
     errors, sigmas
-        Of each error by itself, where the views hold it, as in `Refinement.errors`, and their
-        standard deviations by how much views differ: proposals, nothing is changed by them.
+        Of each error by itself, as in `Refinement.errors`, and their standard deviations by how
+        much views differ: proposals, nothing is changed by them. Those that stand out, and where
+        there is an alarm all that the views hold.
     support
-        How well the views agree without and with the error that serves best, see `refine.Support`.
+        How well the views agree without and with the error that serves best of those that stand
+        out, see `refine.Support`.
     gap
         Of the longest loop; None where there is none, or nothing was suspected.
     """
@@ -116,43 +118,44 @@ def suspicion(
         return Suspicion()
     said = response(views, poses, pairs, options, beside=beside)
     estimate, sigma = said.estimate(), said.sigma(pairs, len(views))
+    held = [name for name, k in _NUMBERS.items() if sigma[k] < _VAGUE * TOLERANCES[name]]
     looked = [
         name
-        for name, k in _NUMBERS.items()
-        if sigma[k] < _VAGUE * TOLERANCES[name]
-        and abs(estimate[k]) > max(_LIKELY * sigma[k], _WORTH * TOLERANCES[name])
+        for name in held
+        if abs(estimate[_NUMBERS[name]])
+        > max(_LIKELY * sigma[_NUMBERS[name]], _WORTH * TOLERANCES[name])
     ]
     if not looked:
         return Suspicion()
-    errors: dict[str, float] = {}
-    sigmas: dict[str, float] = {}
-    best: Refined | None = None
     few, some = list(views), pairs
     if len(pairs) > _ENOUGH_PAIRS:
         few = [KeptView(v.surface, np.ascontiguousarray(v.points[::_EVERY])) for v in views]
         some = chosen(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
-    for name in _NUMBERS:
-        if sigma[_NUMBERS[name]] > _VAGUE * TOLERANCES[name]:
-            continue
+    patient = replace(options, rounds=_ROUNDS)
+
+    def asked(name: str) -> Refined:
         # The views overlap as they did: the poses have to follow, not to be found.
-        found = refine(
-            few,
-            poses,
-            replace(options, rounds=_ROUNDS),
-            calibrate=[_NUMBERS[name]],
-            beside=beside,
-            pairs=some,
-        )
-        errors[name] = float(found.errors[_NUMBERS[name]])
-        sigmas[name] = float(sigma[_NUMBERS[name]])
-        if best is None or _gain(found, views) > _gain(best, views):
-            best = found
-    assert best is not None, "what was looked at is held"
-    large = any(abs(e) > max(TOLERANCES[n], _SURE * sigmas[n]) for n, e in errors.items())
+        number = [_NUMBERS[name]]
+        return refine(few, poses, patient, calibrate=number, beside=beside, pairs=some)
+
+    found = {name: asked(name) for name in looked}
+    best = max(found.values(), key=lambda one: _gain(one, views))
+    large = any(
+        abs(one.errors[_NUMBERS[name]]) > max(TOLERANCES[name], _SURE * sigma[_NUMBERS[name]])
+        for name, one in found.items()
+    )
     gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
     alarm = gap is not None and gap.closes and _gain(best, views) > _CHANCE
+    if alarm:  # what it may be as well
+        found |= {name: asked(name) for name in held if name not in found}
     support = float(best.before.of_views(len(views)).mean())
-    return Suspicion(alarm, errors, sigmas, (support, support + _gain(best, views)), gap)
+    return Suspicion(
+        alarm,
+        {name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found},
+        {name: float(sigma[k]) for name, k in _NUMBERS.items() if name in found},
+        (support, support + _gain(best, views)),
+        gap,
+    )
 
 
 def _gain(found: Refined, views: Sequence[KeptView]) -> float:
