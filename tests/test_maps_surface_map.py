@@ -16,6 +16,7 @@ from tofuse.maps.surface_map import (
     SurfaceMap,
     SurfaceOptions,
     surface_map,
+    with_more_planes,
 )
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.projective import ProjectiveOptions, Target, align
@@ -453,3 +454,28 @@ def test_views_without_light_share_one_image_of_it():
     assert np.isnan(dark[0].photo).all()
     assert np.isnan(dark[0].thinned(50).photo).all()
     assert surface_map(wall(), OPTIONS).photo is not dark[0].photo
+
+
+def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
+    """A slanted wall with a bar in front, whose left border mixes the light of both."""
+    frame = wall(sigma=0.004, seed=5)
+    depth = frame.depth.copy()
+    truth = wall().depth.copy()
+    depth[:, 40:60] -= 0.8
+    truth[:, 40:60] -= 0.8
+    depth[:, 40] += 0.4
+    frame = replace(frame, depth=depth)
+    view = surface_map(frame, OPTIONS)
+    more = with_more_planes(view, frame, OPTIONS)
+    before, after = (v.planes[6:-6, :, 3] > 0 for v in (view, more))
+    assert not before[:, [*range(37, 43), *range(58, 62)]].any()
+    assert not after[:, 40].any()
+    assert after[:, [36, 37, 38, 41, 42, 43, 57, 58]].mean() > 0.95
+    np.testing.assert_array_equal(more.planes[view.planes[..., 3] > 0][:, 3] > 0, True)
+    # They lie where the surfaces are, and say how well they know.
+    new = after & ~before
+    off = 1 / more.planes[6:-6, :, 3][new] - truth[6:-6][new]
+    assert np.abs(off).mean() < 0.003
+    sigma = np.sqrt(more.plane_variance[6:-6][new]) * truth[6:-6][new] ** 2
+    assert 0.5 < np.std(off / sigma) < 1.6
+    assert np.median(sigma) > 1.2 * np.median(np.sqrt(view.plane_variance[before.nonzero()]) * 4)

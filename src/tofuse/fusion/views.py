@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.middle import median
-from tofuse.kernels.tsdf import pack_view
+from tofuse.kernels.tsdf import draw_to_planes, mark_jumps, pack_view
 from tofuse.maps.surface_map import (
     Projection,
     SurfaceMap,
     SurfaceOptions,
     surface_map,
-    with_noisy_planes,
+    with_more_planes,
 )
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 
@@ -85,20 +85,25 @@ class RangeView:
 
         A pixel's weight is one over the variance of the distance from its plane: that of its depth
         times the squared cosine of the incidence. It is 0 next to jumps in depth, where light of
-        both sides mixes. Its depth is drawn towards the plane fitted around it, the more the
-        noisier it is.
+        both sides mixes, unless the pixel measured the plane of its neighbours. Its depth is drawn
+        towards its plane, the more the noisier it is.
         """
         options = options or SurfaceOptions()
         if surface is None:
             surface = surface_map(frame, options)
-        surface = with_noisy_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
+        surface = with_more_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
         shape = surface.z.shape
+        smoothed, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
+        draw_to_planes(
+            surface.z, surface.sigma, surface.planes, surface.plane_variance, _DETAIL, _ON_PLANE,
+            smoothed, variance, measured,
+        )  # fmt: skip
+        mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
         valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
-        valid |= _on_planes(surface) & _widened(valid, 1)
-        smoothed, variance = _smoothed(surface)
+        valid |= measured & _widened(valid.view(np.uint8), 1)
         z = np.where(valid, smoothed, np.float32(0))
-        jump = _jumps(surface, options)
-        good = (z > 0) & (surface.sigma > 0) & ~jump
+        good = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
         normals = np.empty((*shape, 3), np.int8)
         weight = np.empty(shape, np.float32)
         pack_view(
@@ -179,40 +184,6 @@ class RangeView:
         return CloudFrame(self.index, self.timestamp, points, color=color, amplitude=amplitude)
 
 
-def _smoothed(surface: SurfaceMap) -> tuple[Float32, Float32]:
-    """Depth (H, W) in m and its variance in m^2.
-
-    It is that of the plane around the pixel, and of the rest what exceeds the noise (Wiener's
-    gain).
-    """
-    z, on_plane = surface.z, surface.planes[..., 3]
-    fitted = on_plane > 0
-    plane = np.divide(1, on_plane, out=z.copy(), where=fitted)
-    noise = np.square(surface.sigma)
-    detail = np.square(np.float32(_DETAIL) * z)
-    gain = np.where(fitted, detail / np.maximum(detail + noise, np.float32(1e-12)), np.float32(1))
-    # d z = z^2 d(1/z)
-    said = surface.plane_variance if surface.pixel_variance is None else surface.pixel_variance
-    of_plane = np.where(fitted, said * np.square(plane * plane), np.float32(0))
-    variance = np.square(gain) * noise + np.square(1 - gain) * of_plane
-    # What is left of the relief is not known either.
-    variance += np.square(1 - gain) * np.minimum(detail, noise)
-    return np.asarray(plane + gain * (z - plane), np.float32), np.asarray(variance, np.float32)
-
-
-def _jumps(surface: SurfaceMap, options: SurfaceOptions) -> NDArray[np.bool_]:
-    """Both sides of jumps in depth: by a share of it, and by more than the noise makes."""
-    z, variance = surface.z, np.square(surface.sigma)
-    jump = np.zeros(z.shape, bool)
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        step = np.abs(z[a] - z[b])
-        across = (z[a] > 0) & (z[b] > 0) & (step > options.edge_jump * np.minimum(z[a], z[b]))
-        across &= step * step > _JUMP_SIGMAS**2 * (variance[a] + variance[b])
-        jump[a] |= across
-        jump[b] |= across
-    return jump
-
-
 def _typical_sigma(variance: Float32, good: NDArray[np.bool_]) -> float:
     """Of every fourth pixel, or of all if none of these is good."""
     for step in (2, 1):
@@ -222,16 +193,9 @@ def _typical_sigma(variance: Float32, good: NDArray[np.bool_]) -> float:
     return 0.0
 
 
-def _on_planes(surface: SurfaceMap) -> NDArray[np.bool_]:
-    """Pixels that measured the plane around them, as far as their noise tells."""
-    on_plane = surface.planes[..., 3]
-    off = np.abs(surface.z * on_plane - np.float32(1)) * surface.z
-    return (on_plane > 0) & (surface.z > 0) & (off <= np.float32(_ON_PLANE) * surface.sigma)
-
-
-def _widened(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
+def _widened(mask: NDArray[np.uint8], margin: int) -> NDArray[np.bool_]:
     size = 2 * margin + 1
-    return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    return cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0
 
 
 def without_camera_errors(

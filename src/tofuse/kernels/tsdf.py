@@ -80,6 +80,90 @@ def near_cubes(
 
 
 @kernel
+def draw_to_planes(
+    z: Float32,
+    sigma: Float32,
+    planes: Float32,
+    plane_variance: Float32,
+    detail: float,
+    sigmas: float,
+    smooth: Float32,
+    variance: Float32,
+    measured: NDArray[np.bool_],
+) -> None:
+    """Draw depths towards the planes around them, the more the noisier they are.
+
+    What is added to the plane is the share of what deviates that exceeds the noise (Wiener's gain).
+
+    Parameters
+    ----------
+    z, sigma
+        (H, W) depth in m, 0 where there is none, and its standard deviation.
+    planes, plane_variance
+        (H, W, 4) of `fit_planes`, and (H, W) the variance of 1/z on them.
+    detail
+        Size of the relief that surfaces have, as a share of the depth.
+    sigmas
+        A pixel measured the plane if it is no farther off than so many standard deviations.
+    smooth, variance, measured
+        (H, W) get the depth in m, its variance in m^2, and whether the pixel measured a plane.
+    """
+    rows, columns = z.shape
+    one = np.float32(1)
+    share, most = np.float32(detail), np.float32(sigmas)
+    for r in range(rows):
+        for c in range(columns):
+            depth = z[r, c]
+            noise = sigma[r, c] * sigma[r, c]
+            on_plane = planes[r, c, 3]
+            measured[r, c] = False
+            smooth[r, c] = depth
+            variance[r, c] = noise
+            if not on_plane > 0:
+                continue
+            plane = one / on_plane
+            relief = (share * depth) * (share * depth)
+            gain = relief / max(relief + noise, np.float32(1e-12))
+            rest = (one - gain) * (one - gain)
+            # d z = z^2 d(1/z); and what is left of the relief is not known either.
+            of_plane = plane_variance[r, c] * (plane * plane) * (plane * plane)
+            smooth[r, c] = plane + gain * (depth - plane)
+            variance[r, c] = gain * gain * noise + rest * (of_plane + min(relief, noise))
+            off = abs(depth * on_plane - one) * depth
+            measured[r, c] = depth > 0 and off <= most * sigma[r, c]
+
+
+@kernel
+def mark_jumps(
+    z: Float32, sigma: Float32, share: float, sigmas: float, jump: NDArray[np.uint8]
+) -> None:
+    """Mark both sides of jumps in depth: by this share of it, and by more than the noise makes.
+
+    `z` and `sigma` (H, W) are the depth in m, 0 where there is none, and its standard deviation;
+    `jump` (H, W), all 0 before, gets 1 beside a jump by so many `sigmas` of both.
+    """
+    rows, columns = z.shape
+    part, limit = np.float32(share), np.float32(sigmas * sigmas)
+    for r in range(rows):
+        for c in range(columns):
+            a = z[r, c]
+            if not a > 0:
+                continue
+            noise = sigma[r, c] * sigma[r, c]
+            for k in range(2):
+                i, j = r + k, c + 1 - k
+                if i >= rows or j >= columns:
+                    continue
+                b = z[i, j]
+                step = abs(a - b)
+                if not (b > 0 and step > part * min(a, b)):
+                    continue
+                if step * step > limit * (noise + sigma[i, j] * sigma[i, j]):
+                    jump[r, c] = 1
+                    jump[i, j] = 1
+
+
+@kernel
 def pack_view(
     planes: Float32,
     rays: Float32,

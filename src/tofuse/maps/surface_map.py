@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels.alignment import make_target
 from tofuse.kernels.middle import median
+from tofuse.kernels.outlines import carry_planes
 from tofuse.kernels.surface import (
     albedo_image,
     fit_planes,
@@ -45,6 +46,8 @@ _SHARE_ERROR = 100.0
 # The typical noise does not stand for pixels with so many times as much; to fit planes to them is
 # worth its time where they are this share of a view.
 _NOISIER, _WORTH_FITTING = 2.0, 0.02
+# A pixel within so many standard deviations of a plane has measured it.
+_ON_PLANE = 3.0
 # Of the absolute values of a normal distribution, in standard deviations.
 _MEDIAN_OF_NORMAL = 0.6745
 
@@ -413,30 +416,45 @@ def _no_photo(rows: int, columns: int) -> Float32:
     return np.full((rows, columns, 3), np.nan, np.float32)
 
 
-def with_noisy_planes(
-    surface: SurfaceMap, frame: RangeFrame, options: SurfaceOptions
-) -> SurfaceMap:
-    """Return the view of `frame` with planes also where it is noisier than its typical pixel.
+def with_more_planes(surface: SurfaceMap, frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
+    """Return the view of `frame` with planes where the tracker does well to have none.
 
-    `surface_map` takes what differs by more than the typical noise for a jump in depth: a tracker
-    does well to leave out what is so uncertain. Here a jump is what differs by more than the noise
-    of the pixels beside it, as long as one of these is not much noisier than the other. Planes that
-    were fitted before stay. Returns `surface` itself where hardly any pixel is noisier than others.
+    Where pixels are noisier than the typical one, and at outlines. Planes that were fitted before
+    stay; variances are those of `SurfaceMap.once`.
     """
-    z, known = surface.z, (surface.z > 0) & (surface.sigma > 0)
+    surface = surface.once()
+    known = (surface.z > 0) & (surface.sigma > 0)
     if not known.any():
         return surface
-    w = _inverse(z, known)
+    w = _inverse(surface.z, known)
     noise = np.where(known, surface.sigma * w, np.float32(0))
     typical = median(noise[known])
-    missing = known & (surface.planes[..., 3] == 0)
-    if np.count_nonzero(missing & (noise > _NOISIER * typical)) < _WORTH_FITTING * z.size:
-        return surface
     options = options.for_noise(float(np.sqrt(2) * typical))
+    missing = known & (surface.planes[..., 3] == 0)
+    if np.count_nonzero(missing & (noise > _NOISIER * typical)) >= _WORTH_FITTING * known.size:
+        surface = _with_noisy_planes(surface, frame, w, noise, missing, options)
+        missing = known & (surface.planes[..., 3] == 0)
+    return _with_carried_planes(surface, w, noise, missing, options)
+
+
+def _with_noisy_planes(
+    surface: SurfaceMap,
+    frame: RangeFrame,
+    w: Float32,
+    noise: Float32,
+    missing: NDArray[np.bool_],
+    options: SurfaceOptions,
+) -> SurfaceMap:
+    """Return the view with planes where it is noisier than its typical pixel.
+
+    `surface_map` takes what differs by more than the typical noise for a jump in depth. Here a jump
+    is what differs by more than the noise of the pixels beside it, as long as one of these is not
+    much noisier than the other. `noise` (H, W) is a share of the depth.
+    """
     edge = _noisy_edges(w, noise, options)
-    missing &= ~edge
-    weight = _inverse((noise * w) ** 2, known & ~edge)
-    limit = options.misfit * max(1.0, _scale_at(options.flatness, z, surface.sigma))
+    missing = missing & ~edge
+    weight = _inverse((noise * w) ** 2, (w > 0) & ~edge)
+    limit = options.misfit * max(1.0, _scale_at(options.flatness, surface.z, surface.sigma))
     planes, quality = _fitted(w, surface.rays, weight, missing, limit, options)
     new = missing & (planes[..., 3] > 0)
     shared = _shared_sigma(frame, surface.projection.lengths2)
@@ -444,11 +462,44 @@ def with_noisy_planes(
     return replace(
         surface,
         planes=np.where(new[..., None], planes, surface.planes),
-        plane_variance=np.where(new, variance, surface.plane_variance),
-        pixel_variance=None
-        if own is None or surface.pixel_variance is None
-        else np.where(new, own, surface.pixel_variance),
+        plane_variance=np.where(new, variance if own is None else own, surface.plane_variance),
     )
+
+
+def _with_carried_planes(
+    surface: SurfaceMap,
+    w: Float32,
+    noise: Float32,
+    missing: NDArray[np.bool_],
+    options: SurfaceOptions,
+) -> SurfaceMap:
+    """Return the view with the planes of their neighbours at pixels that have measured these.
+
+    No window fits next to an outline. But a surface goes on up to there, and a pixel that mixes its
+    light with that of another one is on neither plane.
+    """
+    steps, growth = _steps(options.radii[0])
+    planes, variance = surface.planes.copy(), surface.plane_variance.copy()
+    carry_planes(
+        w, noise * w, surface.rays, missing, surface.planes, surface.plane_variance, steps, growth,
+        _ON_PLANE, options.edge_jump, planes, variance,
+    )  # fmt: skip
+    return replace(surface, planes=planes, plane_variance=variance)
+
+
+@lru_cache(maxsize=8)
+def _steps(radius: int) -> tuple[NDArray[np.int32], Float32]:
+    """Steps to the pixels near one, the nearest first, and the growth of variance on the way.
+
+    That of a plane fitted to a window of this radius: with the squared distance over the window's
+    mean square. They go one pixel beyond the window's radius, as edges are left out on either side.
+    """
+    reach = radius + 2
+    around = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
+    squares = (around**2).sum(1)
+    order = np.argsort(squares, kind="stable")[1:]
+    growth = 1 + squares[order] / (radius * (radius + 1) / 3)
+    return around[order].astype(np.int32), growth.astype(np.float32)
 
 
 def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> NDArray[np.bool_]:

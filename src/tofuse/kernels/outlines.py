@@ -1,0 +1,75 @@
+"""Planes for the pixels that no window fits one to, from the pixels beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.jit import kernel
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+
+
+@kernel
+def carry_planes(
+    w: Float32,
+    sigma: Float32,
+    rays: Float32,
+    wanted: NDArray[np.bool_],
+    planes: Float32,
+    variance: Float32,
+    steps: Int32,
+    growth: Float32,
+    sigmas: float,
+    jump: float,
+    found: Float32,
+    varied: Float32,
+) -> None:
+    """Give each `wanted` pixel the plane of the nearest pixel whose plane it has measured.
+
+    Parameters
+    ----------
+    w, sigma
+        (H, W) measured 1/z and its standard deviation, 1/m.
+    rays
+        (H, W, 2) x/z and y/z.
+    planes, variance
+        (H, W, 4) of `fit_planes`, 0 where there is none, and (H, W) the variance of 1/z on them.
+    steps, growth
+        (K, 2) rows and columns to the pixels that are asked, in this order, and (K,) how many times
+        larger the variance of their planes is here.
+    sigmas, jump
+        The pixel is on a plane if 1/z differs by at most so many standard deviations, and the plane
+        is no further off, here from there, than by this share.
+    found, varied
+        (H, W, 4) and (H, W) get the planes and their variances here, where there is one.
+    """
+    rows, columns = w.shape
+    limit = np.float32(sigmas * sigmas)
+    share = np.float32(jump)
+    for i in range(rows):
+        for j in range(columns):
+            if not wanted[i, j]:
+                continue
+            x = rays[i, j, 0]
+            y = rays[i, j, 1]
+            here = w[i, j]
+            own = sigma[i, j] * sigma[i, j]
+            for k in range(len(steps)):
+                p = i + steps[k, 0]
+                q = j + steps[k, 1]
+                if p < 0 or q < 0 or p >= rows or q >= columns or not planes[p, q, 3] > 0:
+                    continue
+                value = planes[p, q, 0] * x + planes[p, q, 1] * y + planes[p, q, 2]
+                if not abs(value - planes[p, q, 3]) <= share * value:
+                    continue
+                off = here - value
+                grown = growth[k] * variance[p, q]
+                if off * off > limit * (own + grown):
+                    continue
+                varied[i, j] = grown
+                for c in range(3):
+                    found[i, j, c] = planes[p, q, c]
+                found[i, j, 3] = value
+                break
