@@ -60,7 +60,7 @@ def small_room(scripts, tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("script", ["tracking", "scaling", "end_to_end"])
+@pytest.mark.parametrize("script", ["tracking", "scaling", "end_to_end", "offline_system"])
 def test_script_says_how_it_is_used(script):
     command = [sys.executable, str(BENCHMARKS / f"{script}.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

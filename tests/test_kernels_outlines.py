@@ -24,7 +24,12 @@ def carried_twin(w, sigma, rays, wanted, planes, variance, jump=JUMP):
             value = planes[p, q, :3].astype(float) @ [*rays[i, j], 1]
             near = abs(value - planes[p, q, 3]) <= jump * value
             grown = growth * variance[p, q]
-            if near and abs(w[i, j] - value) <= SIGMAS * np.sqrt(sigma[i, j] ** 2 + grown):
+            quiet = sigma[i, j] <= 2 * sigma[p, q]
+            if (
+                quiet
+                and near
+                and abs(w[i, j] - value) <= SIGMAS * np.sqrt(sigma[i, j] ** 2 + grown)
+            ):
                 found[i, j], varied[i, j] = [*planes[p, q, :3], value], grown
                 break
     return found, varied

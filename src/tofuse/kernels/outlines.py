@@ -40,8 +40,9 @@ def carry_planes(
         (K, 2) rows and columns to the pixels that are asked, in this order, and (K,) how many times
         larger the variance of their planes is here.
     sigmas, jump
-        The pixel is on a plane if 1/z differs by at most so many standard deviations, and the plane
-        is no further off, here from there, than by this share.
+        The pixel is on a plane if 1/z differs by at most so many standard deviations, the plane is
+        no further off, here from there, than by this share, and the pixel is not more than twice
+        as noisy as the one there: quiet surfaces end where noisy ones begin.
     found, varied
         (H, W, 4) and (H, W) get the planes and their variances here, where there is one.
     """
@@ -66,7 +67,8 @@ def carry_planes(
                     continue
                 off = here - value
                 grown = growth[k] * variance[p, q]
-                if off * off > limit * (own + grown):
+                quiet = np.float32(4) * sigma[p, q] * sigma[p, q]
+                if own > quiet or off * off > limit * (own + grown):
                     continue
                 varied[i, j] = grown
                 for c in range(3):

@@ -431,10 +431,11 @@ def with_more_planes(surface: SurfaceMap, frame: RangeFrame, options: SurfaceOpt
     typical = median(noise[known])
     options = options.for_noise(float(np.sqrt(2) * typical))
     missing = known & (surface.planes[..., 3] == 0)
+    quiet = surface.planes
     if np.count_nonzero(missing & (noise > _NOISIER * typical)) >= _WORTH_FITTING * known.size:
         surface = _with_noisy_planes(surface, frame, w, noise, missing, options)
         missing = known & (surface.planes[..., 3] == 0)
-    return _with_carried_planes(surface, w, noise, missing, options)
+    return _with_carried_planes(surface, quiet, w, noise, missing, options)
 
 
 def _with_noisy_planes(
@@ -468,6 +469,7 @@ def _with_noisy_planes(
 
 def _with_carried_planes(
     surface: SurfaceMap,
+    quiet: Float32,
     w: Float32,
     noise: Float32,
     missing: NDArray[np.bool_],
@@ -476,12 +478,14 @@ def _with_carried_planes(
     """Return the view with the planes of their neighbours at pixels that have measured these.
 
     No window fits next to an outline. But a surface goes on up to there, and a pixel that mixes its
-    light with that of another one is on neither plane.
+    light with that of another one is on neither plane. Only planes (H, W, 4) of the `quiet` part of
+    the view are carried: of what is dark much of the light comes by other ways, so that it is wrong
+    by more than its noise tells.
     """
     steps, growth = _steps(options.radii[0])
     planes, variance = surface.planes.copy(), surface.plane_variance.copy()
     carry_planes(
-        w, noise * w, surface.rays, missing, surface.planes, surface.plane_variance, steps, growth,
+        w, noise * w, surface.rays, missing, quiet, surface.plane_variance, steps, growth,
         _ON_PLANE, options.edge_jump, planes, variance,
     )  # fmt: skip
     return replace(surface, planes=planes, plane_variance=variance)

@@ -1,0 +1,114 @@
+"""A whole `tofuse run` beside Open3D's offline reconstruction system: seconds and ATE, once.
+
+Both read the same frames of a recording and end with a mesh in a file. What Open3D's system does
+and which options it has is said in `peers/o3d_offline.py`; it works in as many processes as tofuse
+has threads. tofuse runs with nothing but its defaults, once before to compile (not counted), and
+its time is that of the process, start and report included; Open3D's counts from its first frame.
+
+    python benchmarks/offline_system.py [--input kitchen] [--end 1000] [--every 1] [--threads 2]
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from end_to_end import DATA, located, measured
+
+TARGET = 25  # times faster
+
+
+def ours(source: Path, chosen: Sequence[str], threads: int, out: Path) -> tuple[float, float]:
+    """Run tofuse into a folder: seconds and peak MB."""
+    command = [sys.executable, "-m", "tofuse", "run", str(source), "--out", str(out), *chosen]
+    wall, _, peak = measured([*command, "--overwrite", "--threads", str(threads)], (0, 3))
+    return wall, peak
+
+
+def ate(times: Sequence[float], poses: object, recording: object) -> str:
+    """Of a trajectory, in words."""
+    import numpy as np
+
+    from tofuse.evaluation.trajectory import evaluate_trajectory
+    from tofuse.recordings.recording import Recording
+
+    assert isinstance(recording, Recording)
+    if recording.reference is None:
+        return "no reference"
+    known = np.isfinite(recording.reference[:, 0, 0])
+    found = evaluate_trajectory(
+        np.asarray(times), poses, recording.timestamps[known], recording.reference[known]
+    )
+    share = len(times) / max(1, len(recording))
+    return (
+        f"ATE {1e3 * found.ate_rms_m:.1f} mm, {np.degrees(found.rotation_rms_rad):.2f} deg, "
+        f"{share:.0%} posed"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--input", default="kitchen", help="or any recording")
+    parser.add_argument("--data", type=Path, default=DATA, help="where recorded sequences are")
+    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--end", type=int)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--fragment", type=int, default=100, help="frames in each, of Open3D's")
+    parser.add_argument("--no-first", action="store_true", help="count the first run as well")
+    options = parser.parse_args(arguments)
+    source = located(options.input, options.data)
+    if not source.exists():
+        parser.error(f"{source} is not there")
+    if hasattr(os, "sched_setaffinity"):  # for both
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, cores[: options.threads])
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    chosen = ["--start", str(options.start), "--every", str(options.every)]
+    if options.end is not None:
+        chosen += ["--end", str(options.end)]
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
+        f"{options.threads} threads{load}",
+        flush=True,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "result"
+        if not options.no_first:
+            ours(source, chosen, options.threads, out)
+        seconds, peak = ours(source, chosen, options.threads, out)
+        from tofuse.files.trajectory import read_tum
+        from tofuse.recordings.open import open_recording
+
+        recording = open_recording(source).select(options.start, options.end, options.every)
+        times, poses = read_tum(out / "trajectory.txt")
+        print(f"tofuse run: {len(recording)} frames in {seconds:.1f} s, {peak:.0f} MB")
+        print(f"  {ate(times, poses, recording)}", flush=True)
+        if importlib.util.find_spec("open3d") is None:
+            print("Open3D is not installed")
+            return
+        from peers.o3d_offline import Selected, System, reconstruct
+
+        system = System(frames_per_fragment=options.fragment)
+        selected = Selected(str(source), options.start, options.end, options.every)
+        made = reconstruct(system, selected, Path(folder) / "mesh.ply", options.threads)
+        total = sum(made.seconds.values())
+        print(
+            f"Open3D's offline system: {len(made.poses)} frames in {total:.1f} s; "
+            f"{made.fragments} fragments, {made.loops} loops between them, "
+            f"{made.triangles:,} triangles"
+        )
+        for name, spent in made.seconds.items():
+            print(f"  {name:<14}{spent:>8.1f} s")
+        print(f"  {ate(recording.timestamps[: len(made.poses)].tolist(), made.poses, recording)}")
+        print(f"tofuse is {total / seconds:.1f} times faster (wanted: {TARGET})")
+
+
+if __name__ == "__main__":
+    main()
