@@ -157,7 +157,7 @@ class Refined:
         Support at the poses to start from and at those found, with the same sigmas.
     measured, information
         (M, 4, 4) T_i_j that each pair would have if it were alone, and (M, 6, 6) of its right
-        perturbation, as far as the noise of the views tells.
+        perturbation, as far as the noise of the views and what their patches share tell.
     """
 
     poses: Float64
@@ -262,6 +262,8 @@ def refine(
     pairs = np.stack([state.target[:half], state.source[:half]], 1)
     last = options.rounds[-1]
     after = _support(views, poses, errors, known, state, last, options)
+    if not calibrate:
+        _allow_for_shared(views, poses, state, options)
     measured = _alone(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
     return Refined(poses, errors, pairs, tuple(moved), before, after, *measured)
