@@ -529,10 +529,13 @@ def test_a_search_is_believed_only_with_a_lead_and_without_contradiction():
     shaded = Agreement(0.6, 0.55, 0.0, 0.01, 0.01, 1000, 0.05)
     unlike = Match((Candidate(np.eye(4), shaded),), "full")
     assert recovery.believes(match(0.5, 0.4, 0.0))
-    assert not recovery.believes(match(0.2, 0.0, 0.0))
+    assert not recovery.believes(match(0.2, 0.15, 0.0))
     assert not recovery.believes(unlike)
     assert not recovery.believes(match(0.5, 0.49, 0.0))
     assert not recovery.believes(match(0.5, 0.4, 0.1))
+    # What leads clearly may be a small part of what both see.
+    assert recovery.believes(match(0.2, 0.05, 0.0))
+    assert not recovery.believes(match(0.14, 0.0, 0.0))
     # A camera that was lost may stand anywhere, and rooms look alike.
     assert not recovery.believes(match(0.5, 0.4, 0.0), lost=True)
     assert recovery.believes(match(0.5, 0.2, 0.0), lost=True)

@@ -138,9 +138,11 @@ class Recovery:
     patience
         After so many frames in a row that the search did not find, only every so many-th is
         searched for; at the end, lost frames are searched for until it fails so many times.
-    support, score
-        Least share of both views' points that support the pose, and least score: the same, by how
-        alike they reflect, less those that contradict it.
+    support, clear_support
+        Least share of both views' points that support the pose; the second where it leads by
+        `lost_margin`.
+    score
+        Least score: the same share, by how alike they reflect, less those that contradict it.
     margin, lost_margin
         Least lead in score before the best other pose; the second after a frame was lost, when
         the keyframe may show another place that looks alike.
@@ -159,6 +161,7 @@ class Recovery:
     keyframes: int = 1
     patience: int = 10
     support: float = 0.25
+    clear_support: float = 0.15
     score: float = 0.1
     margin: float = 0.025
     lost_margin: float = 0.1
@@ -195,8 +198,9 @@ class Recovery:
         margin = self.margin
         if lost:
             margin = max(margin, self.lost_margin * (0.5 if said_before else 1))
+        clear = match.margin >= self.lost_margin
         return (
-            match.agreement.support >= self.support
+            match.agreement.support >= (self.clear_support if clear else self.support)
             and match.score >= self.score
             and match.margin >= margin
             and match.agreement.contradiction <= self.contradiction

@@ -410,11 +410,14 @@ def _not_believed(match: Match | None, recovery: Recovery) -> str:
     """Why what a search found is no loop, in words."""
     if match is None:
         return "there is too little to search with"
-    if match.agreement.support < recovery.support:
-        return f"a search finds nothing that {recovery.support:.0%} of the points support"
+    if match.agreement.support < recovery.clear_support:
+        return f"a search finds nothing that {recovery.clear_support:.0%} of the points support"
     if match.score < recovery.score:
         return "what a search finds lies where the surfaces are, but they reflect otherwise"
     if match.margin < recovery.margin:
         return f"what a search finds leads its best rival by {match.margin:.1%} of the points only"
+    share = match.agreement.support
+    if share < recovery.support and match.margin < recovery.lost_margin:
+        return f"what a search finds is supported by {share:.0%} of the points, and leads by few"
     share = match.agreement.contradiction
     return f"{share:.0%} of what meets under the pose that a search finds contradicts it"
