@@ -38,6 +38,14 @@ def turn():
     return frames, [path.T_world_camera(k / FRAME_RATE_HZ, 0.0) for k in at]
 
 
+@pytest.fixture(scope="module")
+def hand():
+    """A frame that shows nothing of the room."""
+    scene, path = build("rail")
+    model = camera_model("sr4000")
+    return render(scene, path, model, 0, effects=Effects.none(shot_noise=True)).frame
+
+
 def in_order(turn, order):
     frames, poses = turn
     numbered = [replace(frames[k], index=10 * n) for n, k in enumerate(order)]
@@ -100,20 +108,51 @@ def test_a_run_gives_late_views_their_place(turn):
     assert np.isfinite([np.linalg.det(r.covariance) for r in result.diagnostics.frames[1:]]).all()
 
 
-def test_a_view_of_another_place_stays_lost(turn):
-    scene, path = build("rail")
-    model = camera_model("sr4000")
-    other = render(scene, path, model, 0, effects=Effects.none(shot_noise=True)).frame
+def test_a_view_of_another_place_stays_lost(turn, hand):
     frames, _ = in_order(turn, [0, 1])
     tracker = Keyframes().start(0)
     steps = [
         tracker.push(replace(frame, index=k))
-        for k, frame in enumerate([frames[0], other, frames[1]])
+        for k, frame in enumerate([frames[0], hand, frames[1]])
     ]
     assert [step.status for step in steps] == ["tracked", "lost", "tracked"]
     assert steps[2].earlier == ()
     assert tracker.finish() == ()
     assert set(tracker.waiting) == {1}
+
+
+@pytest.mark.parametrize("after", [4, 14])
+def test_a_start_that_nothing_follows_is_given_up(hand, after):
+    """While frames arrive, or once the last one is in; the first frame alone stays lost."""
+    scene, path = build("room")
+    effects = Effects.none(shot_noise=True)
+    at = range(0, 3 * after, 3)
+    frames = [render(scene, path, camera_model("sr4000"), k, effects=effects).frame for k in at]
+    mapper = Mapper("default")
+    pushed = [mapper.push(replace(f, index=k)) for k, f in enumerate([hand, *frames])]
+    assert pushed[0] is not None
+    assert (pushed[-1] is None) == (after < 10)
+    result = mapper.finish()
+    assert result.has_pose.tolist() == [False] + [True] * after
+    first, *others = result.diagnostics.frames
+    assert first.status == "lost"
+    assert "hang together" in first.reason
+    assert {record.status for record in others} == {"tracked"}
+    start = se3.inverse(path.T_world_camera(0.0, 0.0))
+    for k, T in zip(at, result.trajectory[1:], strict=True):
+        assert_near(T, start @ path.T_world_camera(k / FRAME_RATE_HZ, 0.0))
+    assert result.graph.ids.tolist() == list(range(1, after + 1))
+    assert "lost_frames" in [reason.code for reason in result.diagnostics.reasons]
+
+
+def test_a_start_stays_where_no_more_frames_hang_together(hand, turn):
+    frames, true = in_order(turn, [0, 1])
+    mapper = Mapper("default")
+    for k, frame in enumerate([*frames, hand, hand]):
+        mapper.push(replace(frame, index=k))
+    result = mapper.finish()
+    assert result.has_pose.tolist() == [True, True, False, False]
+    assert_near(result.trajectory[1], true[1])
 
 
 def test_waiting_views_take_a_fixed_memory():

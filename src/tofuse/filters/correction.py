@@ -48,6 +48,10 @@ class Corrector(Protocol):
         """
         return
 
+    def forget(self) -> None:
+        """Hear that poses are in another frame from here on: where surfaces were is not known."""
+        return
+
 
 class Correction(Protocol):
     """One way of making measurements better.

@@ -137,6 +137,10 @@ class MultipathCorrector(Corrector):
         self._last = frame.index, found
         return _corrected(frame, image, found, self._options.doubt)
 
+    def forget(self) -> None:
+        """See `Corrector.forget`."""
+        self._map, self._last = LightMap(), None
+
     def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """See `Corrector.placed`."""
         if self._last is None or not isinstance(frame, RangeFrame) or frame.index != self._last[0]:

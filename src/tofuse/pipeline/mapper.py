@@ -45,15 +45,19 @@ T = TypeVar("T")
 Float64 = NDArray[np.float64]
 
 _KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
+# So few poses, and so many lost frames after them, may be a start that shows nothing of the scene.
+_STARTED, _NOT_FOLLOWED = 3, 10
+_FALSE_START = "the frames after it hang together, but not with it: they are the start"
 _CHECKED_IMAGES = 60  # how many images are compared with each other in the end
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """A frame, corrected and filtered for tracking, and cleaned for the model, and its number."""
+    """A frame as corrected, as filtered for tracking, and as cleaned for the model; its number."""
 
     position: int
     frame: Frame
+    filtered: Frame
     clean: Frame
 
 
@@ -163,17 +167,14 @@ class Mapper:
         self._begin()
         self._records: list[FrameRecord] = []
         self._steps: list[Step | None] = []  # None where a frame could not be read
-        self._posed = 0
-        self._checks = _EvenSample(_CHECKED_IMAGES)
         self._samples = FrameSamples()
-        self._depths: list[float] = []  # typical ranges of the frames with a pose, m
         self._ambiguity_m: float | None = None
         self._before: RangeFrame | None = None  # as the camera gave it
         self._repeated: list[int] = []
         self._lost: dict[int, _Place] = {}  # that may yet get a pose
+        self._not_followed = _NOT_FOLLOWED  # lost frames at which another start is tried
         self._interruptions: list[int] = []
         self._sensed: dict[int, tuple[Float64 | None, Float64 | None]] = {}
-        self._knows_errors = False
         self._seen: dict[str, int] = {}
         self._removed: dict[str, int] = {}
         self._ended = self._finished = False
@@ -181,14 +182,22 @@ class Mapper:
     def _begin(self) -> None:
         self._correctors = [correction.start() for correction in self.config.corrections]
         self._tracker = self.config.odometry.start(self.seed)
+        self._behind = Behind()
+        self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
+        self._begin_map()
+
+    def _begin_map(self) -> None:
+        """Begin with what is made of frames that have a pose."""
         self._loops = self.config.loops.start(self.seed, self._given_loops)
         self._live = LiveLoops(self._loops)
         self._T_map_tracked = np.eye(4)  # what loops that closed on the way have moved
         self._refiner = self.config.refinement.start()
         self._motion = Motion()
         self._model = ModelBuilder(self.config.fusion)
-        self._behind = Behind()
-        self._history: deque[Frame] = deque(maxlen=self.config.window - 1)
+        self._checks = _EvenSample(_CHECKED_IMAGES)
+        self._depths: list[float] = []  # typical ranges, m
+        self._posed = 0
+        self._knows_errors = False
 
     def push(
         self,
@@ -251,7 +260,7 @@ class Mapper:
                 step = replace(step, status="predicted", reason=reason)
             self._follow(filtered, step)
             self._take_lost(step.earlier)
-            place = _Place(len(self._records), frame, clean)
+            place = _Place(len(self._records), frame, filtered, clean)
             self._records.append(FrameRecord(frame.index, frame.timestamp, "lost"))
             self._steps.append(None)
             self._take(place, replace(step, earlier=()))
@@ -263,6 +272,10 @@ class Mapper:
                         self._follow_loops()
             waiting = self._tracker.waiting
             self._lost = {index: p for index, p in self._lost.items() if index in waiting}
+            if self._posed <= _STARTED and len(self._lost) >= self._not_followed:
+                self._not_followed *= 2
+                if self._start_later(last=False):
+                    step = self._steps[-1] or step
             if (
                 isinstance(frame, RangeFrame)
                 and isinstance(filtered, RangeFrame)
@@ -405,6 +418,49 @@ class Mapper:
         for index, step in found:
             self._take(self._lost.pop(index), step)
 
+    def _start_later(self, *, last: bool) -> bool:
+        """Start with the first lost frame, if more of them hang together than have a pose so far.
+
+        The first frames may show a hand, or the table from which the camera was lifted, and nothing
+        of the scene. `last` says that no frame follows.
+        """
+        tracker = self.config.odometry.start(self.seed)
+        places = list(self._lost.values())
+        parts = np.searchsorted(self._interruptions, [p.position for p in places], side="right")
+        steps: dict[int, Step] = {}
+        with self.watch.timing("tracking"):
+            for k, place in enumerate(places):
+                if k and parts[k] != parts[k - 1]:
+                    tracker.interrupt()
+                step = tracker.push(place.filtered, self._sensed[place.frame.index][0])
+                steps |= {**dict(step.earlier), place.frame.index: replace(step, earlier=())}
+            if last:
+                steps |= dict(tracker.finish())
+        if sum(step.T_world_camera is not None for step in steps.values()) <= self._posed:
+            return False
+        for position, before in enumerate(self._steps):
+            if before is not None and before.T_world_camera is not None:
+                record = self._records[position]
+                gone = FrameRecord(record.index, record.timestamp, "lost", _FALSE_START)
+                self._records[position] = replace(gone, valid_share=record.valid_share)
+                self._steps[position] = Step("lost", _FALSE_START, None)
+        self._live.finish()
+        self._behind.wait()
+        self._begin_map()
+        self._tracker = tracker
+        for corrector in self._correctors:
+            corrector.forget()
+        for place in places:
+            step = steps[place.frame.index]
+            self._take(place, step)
+            if step.T_world_camera is None:
+                self._motion.miss()
+            else:
+                self._motion.follow(step.T_world_camera)
+        waiting = tracker.waiting
+        self._lost = {p.frame.index: p for p in places if p.frame.index in waiting}
+        return True
+
     def _take(self, place: _Place, step: Step) -> None:
         """Take what became of a frame, or what it turns out later to have been."""
         frame, clean, registration = place.frame, place.clean, step.registration
@@ -468,6 +524,10 @@ class Mapper:
                 found = self._tracker.finish()
             with threads(self.threads):
                 self._take_lost(found)
+                waiting = self._tracker.waiting
+                self._lost = {i: place for i, place in self._lost.items() if i in waiting}
+                if len(self._lost) > self._posed:
+                    self._start_later(last=True)
             del self._tracker, self._correctors, self._history
             self._before = None
             self._lost.clear()
