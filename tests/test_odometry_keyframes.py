@@ -20,7 +20,7 @@ from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.projective import Target, align
-from tofuse.registration.search import Candidate, Match
+from tofuse.registration.search import Candidate, Match, search
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
@@ -541,12 +541,21 @@ def test_a_search_is_believed_only_with_a_lead_and_without_contradiction():
     assert recovery.believes(match(0.5, 0.2, 0.0), lost=True)
 
 
-def test_a_box_that_turns_by_half_a_corner_is_told_from_its_other_sides():
+def test_a_box_that_turns_by_half_a_corner_is_told_from_its_other_sides(monkeypatch):
     """At 46 degrees an alignment from where it was may as well end a quarter of a turn off."""
     scene = Sequence("box", range(0, 4 * 72, 72))
     first = se3.inverse(scene.poses[0])
+    pairs = []
+
+    def counted(source, target, options):
+        pairs.append((source.index, target.index))
+        return search(source, target, options)
+
+    monkeypatch.setattr(module, "search", counted)
     for step, true in zip(run([f.keep(f.z < 1.8) for f in scene.frames]), scene.poses, strict=True):
         assert_near(step, first @ true)
+    assert pairs
+    assert len(set(pairs)) == len(pairs)  # a search takes long: none is made twice
 
 
 def turned_box(albedos):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.odometry.keyframes import Keyframes
+from tofuse.odometry import keyframes
+from tofuse.odometry.keyframes import Keyframes, Recovery
 from tofuse.odometry.waiting import Waiting
 from tofuse.pipeline.mapper import Mapper
 from tofuse.posegraph.views import Spacing, ViewStore
@@ -75,6 +76,17 @@ def test_what_is_found_shows_where_the_views_before_it_were(turn):
     assert (found[20].reference, found[10].reference) == (30, 20)
     relative = se3.inverse(found[20].T_world_camera) @ found[10].T_world_camera
     np.testing.assert_allclose(relative, found[10].registration.T_target_source, atol=1e-9)
+
+
+def test_without_a_search_lost_views_stay_lost(turn, monkeypatch):
+    def refused(*_):
+        raise AssertionError("0 keyframes are to be searched")
+
+    monkeypatch.setattr(keyframes, "search", refused)
+    frames, _ = in_order(turn, [0, 1, 3])
+    tracker = Keyframes(recovery=Recovery(keyframes=0)).start(0)
+    assert [tracker.push(frame).status for frame in frames] == ["tracked", "lost", "lost"]
+    assert tracker.finish() == ()
 
 
 def test_views_in_no_order_are_found_in_the_end(turn):

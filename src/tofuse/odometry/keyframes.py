@@ -178,6 +178,7 @@ class Recovery:
             raise ValueError(f"patience is {self.patience}, not 1 or more")
         for name in (
             "support",
+            "clear_support",
             "score",
             "margin",
             "lost_margin",
@@ -315,6 +316,7 @@ class _KeyframeTracker(Tracker):
         self._lost = False
         self._depth = 0.0  # median of the last frame with a pose, m
         self._waiting: Waiting[SurfaceMap] = Waiting()
+        self._matched: tuple[tuple[int, int], Match | None] | None = None  # the last search
         self._tried: set[tuple[int, int]] = set()  # lost frames, and keyframes they are not in
         self._searched = 0  # frames in a row that only a search could find, or not even that
         self._frame: RangeFrame | None = None  # the last one where it was expected, and its depths
@@ -435,7 +437,9 @@ class _KeyframeTracker(Tracker):
             fit = self._searched_in(view, keyframe, lost=True)
             in_vain += 1
             if fit is not None:
-                found += self._place(view, fit)
+                step, _ = self._place(view, fit)
+                beside = self._found_beside(_keyframe(view, fit.aligned.T_world_source))
+                found += [(lost, step), *beside]
                 in_vain = 0
         return tuple(sorted(found))
 
@@ -453,14 +457,20 @@ class _KeyframeTracker(Tracker):
                     (view.index, k.view.index): float(f) for k, f in zip(new, far, strict=True)
                 }
 
-    def _place(self, view: SurfaceMap, found: _Found) -> list[tuple[int, Step]]:
-        """Take the pose of a view that waited, and look for others beside it."""
+    def _place(self, view: SurfaceMap, found: _Found) -> tuple[Step, _Keyframe | None]:
+        """Take the pose of a view that waited; returns the keyframe as well that it makes, if any.
+
+        The newest keyframes, which are tracked against, stay so.
+        """
         self._waiting.remove(view.index)
         step = self._step(view, found, lit=view.has_photo)
-        keyframe = _keyframe(view, found.aligned.T_world_source)
-        if self._is_new(keyframe.T_world_camera, found.reference):
-            self._keep_older(keyframe)
-        return [(view.index, step), *self._found_beside(keyframe)]
+        T = found.aligned.T_world_source
+        if not self._is_new(T, found.reference):
+            return step, None
+        at = max(len(self._keyframes) - self._options.targets, 0)
+        self._keyframes.insert(at, _keyframe(view.bare(), T))
+        self._drop_dispensable()
+        return step, _keyframe(view, T)
 
     def _found_beside(self, keyframe: _Keyframe) -> list[tuple[int, Step]]:
         """Find lost views just before and after one that was found, as far as they hang together.
@@ -474,12 +484,9 @@ class _KeyframeTracker(Tracker):
                 fit = self._beside(view, reference)
                 if fit is None:
                     break
-                self._waiting.remove(view.index)
-                found.append((view.index, self._step(view, fit, lit=view.has_photo)))
-                T = fit.aligned.T_world_source
-                if self._is_new(T, reference):
-                    reference = _keyframe(view, T)
-                    self._keep_older(reference)
+                step, new = self._place(view, fit)
+                found.append((view.index, step))
+                reference = new or reference
         return found
 
     def _beside(self, view: SurfaceMap, keyframe: _Keyframe) -> _Found | None:
@@ -680,12 +687,11 @@ class _KeyframeTracker(Tracker):
 
         Returns it if the search finds nothing better, else what that finds, if it is believed.
         """
-        search_options = self._options.recovery.search
-        match = search(view, found.reference.view, search_options)
+        match = self._match(view, found.reference)
         if match is None:
             return found
         T = found.reference.T_world_camera @ match.T_target_source
-        if not search_options.differ(T, found.aligned.T_world_source):
+        if not self._options.recovery.search.differ(T, found.aligned.T_world_source):
             return found
         return self._searched_in(view, found.reference, lost=self._lost)
 
@@ -792,6 +798,15 @@ class _KeyframeTracker(Tracker):
         order = np.lexsort((-np.arange(len(far)), far))
         return [self._keyframes[k] for k in order[:most]]
 
+    def _match(self, view: SurfaceMap, keyframe: _Keyframe) -> Match | None:
+        """Search a keyframe, unless that was the last thing done; None where none is to be made."""
+        recovery, pair = self._options.recovery, (view.index, keyframe.view.index)
+        if not recovery.keyframes:
+            return None
+        if self._matched is None or self._matched[0] != pair:
+            self._matched = pair, search(view, keyframe.view, recovery.search)
+        return self._matched[1]
+
     def _searched_in(self, view: SurfaceMap, keyframe: _Keyframe, *, lost: bool) -> _Found | None:
         """Search a keyframe exhaustively; `lost` if it may show another place."""
         options = self._options
@@ -799,7 +814,7 @@ class _KeyframeTracker(Tracker):
         self._tried.add((view.index, keyframe.view.index))
         if not _is_comparable(view.depth, keyframe.depth):
             return None
-        match = search(view, keyframe.view, recovery.search)
+        match = self._match(view, keyframe)
         if match is None:
             return None
         T = keyframe.T_world_camera @ match.T_target_source
@@ -831,13 +846,9 @@ class _KeyframeTracker(Tracker):
         if before >= 0:  # only lost views are held against it from here on
             keyframe = self._keyframes[before]
             self._keyframes[before] = replace(keyframe, view=keyframe.view.bare())
-        if len(self._keyframes) > _REMEMBERED:
-            del self._keyframes[self._dispensable()]
+        self._drop_dispensable()
 
-    def _keep_older(self, keyframe: _Keyframe) -> None:
-        """Keep a view that is found late; the newest ones, which are tracked against, stay so."""
-        at = max(len(self._keyframes) - self._options.targets, 0)
-        self._keyframes.insert(at, replace(keyframe, view=keyframe.view.bare()))
+    def _drop_dispensable(self) -> None:
         if len(self._keyframes) > _REMEMBERED:
             del self._keyframes[self._dispensable()]
 

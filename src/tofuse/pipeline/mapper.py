@@ -270,8 +270,7 @@ class Mapper:
                 with self.watch.timing("loops"):
                     if self._live.step():
                         self._follow_loops()
-            waiting = self._tracker.waiting
-            self._lost = {index: p for index, p in self._lost.items() if index in waiting}
+            self._keep_waiting()
             if self._posed <= _STARTED and len(self._lost) >= self._not_followed:
                 self._not_followed *= 2
                 if self._start_later(last=False):
@@ -457,9 +456,13 @@ class Mapper:
                 self._motion.miss()
             else:
                 self._motion.follow(step.T_world_camera)
-        waiting = tracker.waiting
-        self._lost = {p.frame.index: p for p in places if p.frame.index in waiting}
+        self._keep_waiting()
         return True
+
+    def _keep_waiting(self) -> None:
+        """Keep no lost frame that can't be found any more."""
+        waiting = self._tracker.waiting
+        self._lost = {index: place for index, place in self._lost.items() if index in waiting}
 
     def _take(self, place: _Place, step: Step) -> None:
         """Take what became of a frame, or what it turns out later to have been."""
@@ -520,12 +523,11 @@ class Mapper:
     def end(self) -> None:
         """Say that no frame follows: what only they would ask for need not be kept any longer."""
         if not self._ended:
-            with threads(self.threads), self.watch.timing("tracking"):
-                found = self._tracker.finish()
             with threads(self.threads):
+                with self.watch.timing("tracking"):
+                    found = self._tracker.finish()
                 self._take_lost(found)
-                waiting = self._tracker.waiting
-                self._lost = {i: place for i, place in self._lost.items() if i in waiting}
+                self._keep_waiting()
                 if len(self._lost) > self._posed:
                     self._start_later(last=True)
             del self._tracker, self._correctors, self._history
