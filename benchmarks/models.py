@@ -48,6 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--seeds", type=int, default=1, help="recordings of each case")
+    parser.add_argument("--every", type=int, default=1, help="take every N-th frame alone")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--no-thesis", action="store_true", help="only the default method")
     parser.add_argument("--no-correction", action="store_true", help="no factory correction")
@@ -67,6 +68,7 @@ def main() -> None:
 def _case(name: str, seed: int, args: argparse.Namespace) -> None:
     scene, options = CASES[name]
     recording = simulate_recording(scene, seed=seed, correction=not args.no_correction, **options)
+    recording = recording.select(every=args.every)
     start = time.perf_counter()
     result = reconstruct(recording, _config(scene, "default", args), threads=args.threads)
     seconds = time.perf_counter() - start
@@ -74,7 +76,7 @@ def _case(name: str, seed: int, args: argparse.Namespace) -> None:
     final = _errors(result.trajectory, recording)
     thesis = (np.nan, np.nan)
     if not args.no_thesis:
-        # The simulator's stride is that of the thesis.
+        # The simulator's stride is that of the thesis, unless others are left out.
         other = reconstruct(recording, _config(scene, "thesis", args), threads=args.threads)
         thesis = _errors(other.trajectory, recording)
     accepted = sum(loop.accepted for loop in result.diagnostics.loops)
