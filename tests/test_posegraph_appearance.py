@@ -12,7 +12,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Recovery
-from tofuse.odometry.likeness import look_of, mutual_unlikeness
+from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing

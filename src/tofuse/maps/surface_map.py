@@ -330,8 +330,18 @@ class SurfaceMap:
         photo = np.ascontiguousarray(self.photo[kept]) if self.has_photo else _no_photo(*z.shape)
         projection = self.projection.thinned(step)
         rays = projection.rays
+        own = self.pixel_variance
         self._thinned[step] = SurfaceMap(
-            self.index, rays, z, sigma, planes, variance, photo, projection, self.has_photo
+            self.index,
+            rays,
+            z,
+            sigma,
+            planes,
+            variance,
+            photo,
+            projection,
+            self.has_photo,
+            pixel_variance=None if own is None else np.ascontiguousarray(own[kept]),
         )
         return self._thinned[step]
 

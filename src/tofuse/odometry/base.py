@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
@@ -10,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.motion import Moment
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
+from tofuse.registration.verification import Link
 
 Float64 = NDArray[np.float64]
 
@@ -25,34 +26,43 @@ class Step:
     Attributes
     ----------
     status
-        "tracked"; "predicted" where the data held none of it; "lost" without a pose.
+        "tracked"; "predicted" where no direction was observable; "lost" without a pose.
     reason
         Why it is not tracked, or what was out of the ordinary in tracking it; may be empty.
-    T_world_camera
-        (4, 4), or None where lost.
+    T_component_camera
+        (4, 4) pose in the frame of its component; None where lost.
     reference
-        Index (`Frame.index`) of the frame it was registered to; None for the first.
+        Index (`Frame.index`) of the frame it was registered to; None for the first of a component.
     registration
-        T_reference_frame and how well it is known; None for the first frame.
+        T_reference_frame and how well it is known; None for the first of a component.
     surface
-        The view as it was made ready for tracking; None where the method makes none, and for
+        The view as it was prepared for tracking; None where the method makes none, and for
         frames without a pose.
-    earlier
-        Steps of frames that were lost when they came, by `Frame.index` and in its order, and that
-        are found from this frame.
+    component
+        Number of the component: what is tracked without a break. A frame that can't be connected
+        begins a new one, in a frame of its own.
+    links
+        Registrations of this frame to frames of other components, that may join them.
+    doubtful
+        Whether it fits worse than views of this camera usually do.
+    moving
+        (H, W) mask of the frame's pixels that moved by themselves; None where none did.
     """
 
     status: Status
     reason: str
-    T_world_camera: Float64 | None
+    T_component_camera: Float64 | None
     reference: int | None = None
     registration: Registration | None = None
     surface: SurfaceMap | None = None
-    earlier: tuple[tuple[int, Step], ...] = ()
+    component: int = 0
+    links: tuple[Link, ...] = ()
+    doubtful: bool = False
+    moving: NDArray[np.bool_] | None = None
 
 
 class Tracker(Protocol):
-    """Odometry at work: holds what it needs of the frames so far."""
+    """Odometry at work: keeps what it needs of the frames so far."""
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
@@ -75,14 +85,9 @@ class Tracker(Protocol):
         """
         return None
 
-    @property
-    def waiting(self) -> Collection[int]:
-        """Indices of the lost frames that may yet be found; what others are needed for no more."""
-        return ()
-
-    def finish(self) -> tuple[tuple[int, Step], ...]:
-        """Hear that no frame follows; returns steps as `Step.earlier` has them."""
-        return ()
+    def expected(self, now: Moment) -> Float64 | None:
+        """Pose (4, 4) in the frame of the present component that the motion leads to, if known."""
+        return None
 
     def interrupt(self) -> None:
         """Hear that the next frame begins another recording: the motion need not go on."""

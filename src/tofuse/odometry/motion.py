@@ -1,8 +1,9 @@
 """How a camera moves: where it is expected next, and which motions are surprises.
 
 A camera that is carried or turned changes its velocity little from one frame to the next. A frame
-that fits well at a place where it can hardly be (a mirrored image, another scale of depth, another
-place that looks alike) is given away by that.
+that fits well at a place where it can hardly be (another place that looks alike, say) is given away
+by that. Time is what the timestamps say, or the frames' indices where they say nothing: frames
+that are missing make the next motion longer, not stranger.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _SECONDS, _FARTHEST = 0.2, 10.0
 _TIMES, _RECENT = 2.0, 4
 # Share of the newest motion in the running mean.
 _NEWEST = 0.3
-# After so many frames without a pose the camera can be anywhere.
+# After so many frames without a pose, of which no time is known, the camera can be anywhere.
 _FORGOTTEN = 3
 
 
@@ -38,122 +39,107 @@ class Moment:
     index: int
     timestamp: float
 
-    def seconds_since(self, before: Moment | None) -> float | None:
-        """Time since another frame; None where only frames were counted."""
-        if before is None or (before.timestamp, self.timestamp) == (before.index, self.index):
-            return None
-        return self.timestamp - before.timestamp
+    @property
+    def is_timed(self) -> bool:
+        """Whether the timestamp says more than the index."""
+        return self.timestamp != self.index
+
+    def since(self, before: Moment) -> float:
+        """Time since another frame, in s, or in frames where only these were counted; above 0."""
+        if (self.is_timed or before.is_timed) and self.timestamp > before.timestamp:
+            return self.timestamp - before.timestamp
+        return float(max(self.index - before.index, 1))
+
+    def seconds_since(self, before: Moment) -> float | None:
+        """Time since another frame in s; None where only frames were counted."""
+        timed = (self.is_timed or before.is_timed) and self.timestamp > before.timestamp
+        return self.timestamp - before.timestamp if timed else None
 
 
 class Motion:
-    """The motion of a camera so far."""
+    """The motion of a camera so far; poses are (4, 4) T_world_camera."""
 
     def __init__(self) -> None:
         self._T: Float64 | None = None  # of the last frame with a pose
-        self._per_frame: Float64 | None = None  # (6,) the motion of a frame, while it is known
+        self._when: Moment | None = None
+        self._velocity: Float64 | None = None  # (6,) by the unit of time, while it is known
         self._steady: Float64 | None = None  # (6,) the same as a running mean, with less noise
-        self._missed = 0  # frames since
-        self._elsewhere: Float64 | None = None  # the last surprise, and frames since
-        self._waited = 0
+        self._interval = 1.0  # between the last two frames with a pose
         self._differences: deque[Float64] = deque(maxlen=_RECENT)
 
-    @property
-    def expected(self) -> Float64 | None:
-        """T_world_camera (4, 4) if the last motion goes on; None if it is not known."""
-        if self._T is None or self._per_frame is None:
-            return None
-        return _onward(self._T, self._per_frame, self._missed + 1)
+    def expected(self, now: Moment) -> Float64 | None:
+        """Pose if the last motion goes on; None if it is not known."""
+        return self._onward(self._velocity, now)
 
-    @property
-    def steadily(self) -> Float64 | None:
-        """T_world_camera (4, 4) if the mean motion of some frames goes on; None if not known.
+    def steadily(self, now: Moment) -> Float64 | None:
+        """Pose if the mean motion of some frames goes on; None if it is not known.
 
-        Where the data does not hold a direction for many frames, the camera goes on there by what
-        is expected, and the noise of one motion would add up.
+        Where a direction is degenerate for many frames, the camera goes on there by what is
+        expected, and the noise of one motion would add up.
         """
-        if self._T is None or self._steady is None:
-            return None
-        return _onward(self._T, self._steady, self._missed + 1)
+        return self._onward(self._steady, now)
 
-    def surprise(self, T: Float64, expected: Float64 | None, seconds: float | None = None) -> str:
-        """Return in words how a pose differs from what was expected, or nothing if it is believed.
+    def allowed(self, now: Moment) -> Float64:
+        """What a pose may differ from the expected one, m and rad; infinite if none is expected."""
+        if self._T is None or self._when is None or self._velocity is None:
+            return np.full(2, np.inf)
+        elapsed = now.since(self._when) / self._interval
+        usual = (
+            np.max(self._differences, axis=0)
+            if self._differences
+            else _apart(self._T, moved(self._T, self._velocity * self._interval))
+        )
+        seconds = now.seconds_since(self._when)
+        if seconds is None:
+            if elapsed > _FORGOTTEN:
+                return np.full(2, np.inf)
+            floor = FLOOR * max(elapsed, 1.0)
+        else:
+            floor = FLOOR * min(max((seconds / _SECONDS) ** 2, 1.0), _FARTHEST)
+        return np.asarray(floor + _TIMES * usual * max(elapsed, 1.0), np.float64)
 
-        `seconds` is the time since the last frame with a pose, where it is known.
-
-        A surprise is believed if the frame before it was one too and the camera went on from there
-        as it moved before: a jump of the camera, or of the recording, does not change how it moves,
-        but a mirrored image does.
-        """
-        if expected is None or self._missed >= _FORGOTTEN:
+    def surprise(self, T: Float64, now: Moment) -> str:
+        """How a pose differs from what was expected, in words; empty if that is nothing unusual."""
+        expected = self.expected(now)
+        if expected is None:
             return ""
         difference = _apart(expected, T)
-        allowed = self._allowed(expected, seconds)
-        if (difference <= allowed * (self._missed + 1)).all():
-            self._differences.append(difference / (self._missed + 1))
-            self._elsewhere = None
+        if (difference <= self.allowed(now)).all():
             return ""
-        if self._elsewhere is not None and self._per_frame is not None:
-            onward = _onward(self._elsewhere, self._per_frame, self._waited + 1)
-            if (_apart(onward, T) <= allowed * (self._waited + 1)).all():
-                return ""
-        self._elsewhere, self._waited = T, -1  # the call of `miss` follows
         return (
-            f"that is {difference[0]:.2f} m and {np.degrees(difference[1]):.0f} degrees from where "
-            "the motion leads"
+            f"{difference[0]:.2f} m and {np.degrees(difference[1]):.0f} degrees from the predicted "
+            "pose"
         )
 
-    def _allowed(self, expected: Float64, seconds: float | None) -> Float64:
-        """What a motion may differ from the expected one for each frame, m and rad."""
-        if self._T is None:
-            return np.full(2, np.inf)
-        if self._differences:
-            usual = np.max(self._differences, axis=0)
-        else:
-            usual = _apart(self._T, expected)
-        return np.asarray(_reach(seconds, self._missed + 1) + _TIMES * usual, np.float64)
-
-    def is_surprising(
-        self, T: Float64, expected: Float64 | None, seconds: float | None = None
-    ) -> bool:
-        """Whether a pose differs much from what was expected, without taking note of it."""
-        if expected is None or self._missed >= _FORGOTTEN:
-            return False
-        allowed = self._allowed(expected, seconds) * (self._missed + 1)
-        return bool((_apart(expected, T) > allowed).any())
-
-    def follow(self, T: Float64) -> bool:
-        """Take the pose of the next frame; returns whether the camera jumped to get there."""
-        before, frames = self._T, self._missed + 1
-        jumped = self._elsewhere is not None
-        if jumped:
-            before, frames = self._elsewhere, self._waited + 1
-        if before is None or frames > _FORGOTTEN:
-            self._per_frame = self._steady = None
-        elif frames > 0:  # at the place of a surprise itself the motion is taken to go on
-            self._per_frame = now = twist_between(before, T) / frames
-            mean = now if self._steady is None else self._steady
-            off = now - mean
-            # A jump hardly counts: the camera does not go on jumping.
-            far = max(np.linalg.norm(off[:3]) / FLOOR[0], np.linalg.norm(off[3:]) / FLOOR[1], 1.0)
-            self._steady = mean + _NEWEST / far * off
-        self._T, self._missed, self._elsewhere = T, 0, None
-        return jumped
-
-    def dismiss(self) -> None:
-        """Say that the last surprise told nothing of the camera."""
-        self._elsewhere = None
+    def follow(self, T: Float64, now: Moment) -> None:
+        """Take the pose of the next frame."""
+        if self._T is None or self._when is None:
+            self._T, self._when = T, now
+            return
+        elapsed = now.since(self._when)
+        expected = self.expected(now)
+        if expected is not None:
+            difference = _apart(expected, T)
+            if (difference <= self.allowed(now)).all():
+                self._differences.append(difference * min(self._interval / elapsed, 1.0))
+        velocity = twist_between(self._T, T) / elapsed
+        mean = velocity if self._steady is None else self._steady
+        off = (velocity - mean) * elapsed
+        # A jump hardly counts: the camera does not go on jumping.
+        far = max(np.linalg.norm(off[:3]) / FLOOR[0], np.linalg.norm(off[3:]) / FLOOR[1], 1.0)
+        self._steady = mean + _NEWEST / far * (velocity - mean)
+        self._velocity, self._interval = velocity, elapsed
+        self._T, self._when = T, now
 
     def interrupt(self) -> None:
         """Say that the camera may be anywhere by the next frame."""
-        self._missed = _FORGOTTEN
-        self._per_frame = self._steady = self._elsewhere = None
+        self._velocity = self._steady = self._T = self._when = None
+        self._differences.clear()
 
-    def miss(self) -> None:
-        """Say that the next frame has no pose."""
-        self._missed += 1
-        self._waited += 1
-        if self._missed >= _FORGOTTEN:
-            self._per_frame = self._steady = self._elsewhere = None
+    def _onward(self, velocity: Float64 | None, now: Moment) -> Float64 | None:
+        if self._T is None or self._when is None or velocity is None:
+            return None
+        return moved(self._T, velocity * now.since(self._when))
 
 
 def is_small(T: Float64) -> bool:
@@ -163,42 +149,27 @@ def is_small(T: Float64) -> bool:
 
 def jumps(
     poses: Sequence[Float64 | None],
+    moments: Sequence[Moment],
     interruptions: Collection[int] = (),
-    moments: Sequence[Moment] = (),
 ) -> list[tuple[int, str]]:
     """Positions of poses (4, 4) that the motion before does not lead to, and how far off they are.
 
-    None is a frame without a pose; `interruptions` are positions at which a recording begins;
-    `moments` say when each was taken.
+    None is a frame without a pose; `moments` say when each was taken; `interruptions` are positions
+    at which a recording or a component begins.
     """
     motion = Motion()
     found = []
-    before = None
-    for k, T in enumerate(poses):
+    for k, (T, now) in enumerate(zip(poses, moments, strict=True)):
         if k in interruptions:
             motion.interrupt()
         if T is None:
-            motion.miss()
             continue
-        seconds = moments[k].seconds_since(before) if moments else None
-        words = motion.surprise(T, motion.expected, seconds)
+        words = motion.surprise(T, now)
         if words:
             found.append((k, words))
-        motion.follow(T)
-        before = moments[k] if moments else None
+            motion.interrupt()  # from here the camera goes on as it will
+        motion.follow(T, now)
     return found
-
-
-def _reach(seconds: float | None, frames: int) -> Float64:
-    """What a motion may differ from the expected one for each of so many frames, m and rad."""
-    if seconds is None or not seconds > 0:
-        return FLOOR
-    return FLOOR * min(max((seconds / frames / _SECONDS) ** 2, 1.0), _FARTHEST)
-
-
-def _onward(T: Float64, per_frame: Float64, frames: int) -> Float64:
-    """Pose (4, 4) after so many frames of a motion (6,)."""
-    return moved(T, per_frame * frames)
 
 
 def _apart(A: Float64, B: Float64) -> Float64:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.odometry.likeness import mutual_unlikeness
+from tofuse.registration.likeness import mutual_unlikeness
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

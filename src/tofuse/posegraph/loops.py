@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tofuse.errors import RegistrationError
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1
@@ -77,19 +78,18 @@ def in_order(closed: Mapping[tuple[int, int], ClosedLoop]) -> list[ClosedLoop]:
 
 
 class Loops(Protocol):
-    """Loop detection at work: holds what it needs of the frames so far.
+    """Loop detection at work.
 
     Attributes
     ----------
     points
-        Whether it looks at the points of views that have a surface, and keeps them; if not, it
-        keeps no view.
+        Whether it looks at the points of frames and keeps them; if not, prepared views are enough.
     """
 
     points: ClassVar[bool] = True
 
-    def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
-        """Add the next frame that has a pose, and its surface if the tracker made one."""
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """Add the next frame that has a pose."""
         ...
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
@@ -99,8 +99,15 @@ class Loops(Protocol):
         """
         ...
 
-    def finish(self) -> list[ClosedLoop]:
-        """Return every candidate and given loop with its decision, in the order of j, then i."""
+    def finish(self, poses: Mapping[int, Float64]) -> list[ClosedLoop]:
+        """Return every candidate and given loop with its decision, in the order of j, then i.
+
+        Parameters
+        ----------
+        poses
+            (4, 4) in one frame, by index of the frames that are looked at: components may have
+            been joined since they were added.
+        """
         ...
 
 
@@ -109,8 +116,18 @@ class LoopDetector(Protocol):
 
     part_kind: ClassVar[str] = "loops"
 
-    def start(self, seed: int, given: Sequence[GivenLoop] = ()) -> Loops:
-        """Begin a new recording, of which a person may have given some loops."""
+    def start(
+        self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
+    ) -> Loops:
+        """Begin a new recording.
+
+        Parameters
+        ----------
+        given
+            Loops that a person gave.
+        views
+            Prepared views of frames with a pose; each is there before its frame is pushed.
+        """
         ...
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +20,7 @@ from tofuse.posegraph.loops import (
     given_loop,
     in_order,
 )
+from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
 
 Float64 = NDArray[np.float64]
@@ -62,7 +63,9 @@ class Nearby(LoopDetector):
         if self.per_frame < 0:
             raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
 
-    def start(self, seed: int, given: Sequence[GivenLoop] = ()) -> Loops:
+    def start(
+        self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
+    ) -> Loops:
         """See `LoopDetector.start`. What a person gives takes the place of what is found."""
         return _NearbyLoops(self, seed, given)
 
@@ -90,10 +93,10 @@ class _NearbyLoops(Loops):
         self._poses: dict[int, Float64] = {}
         self._closed: dict[tuple[int, int], ClosedLoop] = {}
 
-    def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Loops.push`."""
         self._views[view.index] = view
-        self._poses[view.index] = T_world_camera
+        self._poses[view.index] = T_component_camera
         frames = list(self._poses)
         for k in self._options.candidates(np.stack(list(self._poses.values()))):
             self._closed[frames[k], view.index] = self._confirm(frames[k], view.index)
@@ -104,7 +107,7 @@ class _NearbyLoops(Loops):
         found = [loop for (_, j), loop in self._closed.items() if j == newest]
         return (lambda: found) if found else None
 
-    def finish(self) -> list[ClosedLoop]:
+    def finish(self, poses: Mapping[int, Float64]) -> list[ClosedLoop]:
         """See `Loops.finish`."""
         for loop in self._given_loops:
             self._closed[loop.i, loop.j] = given_loop(loop, self._poses, self._confirm)

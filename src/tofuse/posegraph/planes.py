@@ -59,7 +59,7 @@ class Planes(Refining):
         if not 0 <= self.loss <= 1:
             raise ValueError(f"loss is {self.loss}, not 0 to 1")
 
-    def start(self) -> Refiner:
+    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
         """See `Refining.start`."""
         return _Planes(self)
 
@@ -78,19 +78,19 @@ class _Planes(Refiner):
         self._options = options
         self._store: ViewStore[_Kept] = ViewStore(options.spacing)
 
-    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
         stride = max(1, -(-len(view) // self._options.points))
         points = view.points[::stride].astype(np.float64)
         depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-        self._store.push(_Kept(view.index, depth, points), T_world_camera)
+        self._store.push(_Kept(view.index, depth, points), T_component_camera)
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
-        views = self._store.views
+        row = {int(index): k for k, index in enumerate(ids)}
+        views = [posed.view for posed in self._store.of(row)]
         if len(views) < 2:
             return Refinement(poses, views=len(views))
-        row = {int(index): k for k, index in enumerate(ids)}
         at = np.array([row[view.index] for view in views], np.intp)
         before = poses[at]
         found = refine_clouds([view.points for view in views], before, self._options.refine)

@@ -17,15 +17,13 @@ from tofuse.posegraph.build import Measured
 from tofuse.posegraph.outside import Told
 from tofuse.posegraph.refine import Beside, Refined, RefineOptions, refine
 from tofuse.posegraph.suspicion import Suspicion, loop_gap, suspicion
-from tofuse.posegraph.views import KeptView, Spacing, ViewStore
+from tofuse.posegraph.views import KeptView, ViewStore
 from tofuse.recordings.frames import Frame
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 CameraError = Literal["offset", "scale", "focal"]
 
-# Images as targets: more pixels would not say more.
-_COLUMNS = 200
 # Neighbouring pixels share their noise: so many count as one.
 _SHARED_NOISE = 5.0
 _ERRORS: dict[CameraError, int] = {
@@ -74,18 +72,18 @@ class Refinement:
 
 
 class Refiner(Protocol):
-    """Refinement at work on one recording: holds what it needs of the views so far.
+    """Refinement at work on one recording.
 
     Attributes
     ----------
     points
-        Whether it looks at the points of views that have a surface.
+        Whether it looks at the points of frames, and not only at prepared views.
     """
 
     points: ClassVar[bool] = True
 
-    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
-        """Add the next view that has a pose, with its surface where the tracker prepared one."""
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """Add the next frame that has a pose, if it looks at points."""
         ...
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
@@ -101,8 +99,8 @@ class Refining(Protocol):
 
     part_kind: ClassVar[str] = "refinement"
 
-    def start(self) -> Refiner:
-        """Begin a new recording."""
+    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+        """Begin a new recording; prepared views are added to `views` as they come."""
         ...
 
 
@@ -111,7 +109,7 @@ class Refining(Protocol):
 class NoRefinement(Refining):
     """Leaves the poses as the optimiser found them."""
 
-    def start(self) -> Refiner:
+    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
         """See `Refining.start`."""
         return _Idle()
 
@@ -119,7 +117,7 @@ class NoRefinement(Refining):
 class _Idle(Refiner):
     points: ClassVar[bool] = False
 
-    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
         """Keep nothing."""
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
@@ -132,14 +130,12 @@ class _Idle(Refiner):
 class Joint(Refining):
     """Moves all views until each agrees with all that it overlaps with (eq 2.8), see `refine`.
 
-    Views are kept by the motion of the camera; frames in between follow them. The outcome is
+    Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The outcome is
     believed only if the views support each other at least as well as before, and views that lose
     support stay where their neighbours had them.
 
     Attributes
     ----------
-    spacing
-        Which views take part.
     refine
         How they are refined.
     calibrate
@@ -148,7 +144,6 @@ class Joint(Refining):
         A view has lost support if it fell by more.
     """
 
-    spacing: Spacing = Spacing()  # noqa: RUF009 - immutable
     refine: RefineOptions = RefineOptions()  # noqa: RUF009 - immutable
     calibrate: tuple[CameraError, ...] = ()
     loss: float = 0.03
@@ -157,28 +152,28 @@ class Joint(Refining):
         if not 0 <= self.loss <= 1:
             raise ValueError(f"loss is {self.loss}, not 0 to 1")
 
-    def start(self) -> Refiner:
+    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
         """See `Refining.start`."""
-        return _Joint(self)
+        return _Joint(self, views)
 
 
 class _Joint(Refiner):
     points: ClassVar[bool] = False
 
-    def __init__(self, options: Joint) -> None:
+    def __init__(self, options: Joint, views: ViewStore[SurfaceMap]) -> None:
         self._options = options
-        self._store: ViewStore[SurfaceMap] = ViewStore(options.spacing)
+        self._store = views
 
-    def push(self, view: Frame, surface: SurfaceMap | None, T_world_camera: Float64) -> None:
-        """See `Refiner.push`."""
-        if surface is not None:
-            self._store.push(surface.once().thinned(_COLUMNS), T_world_camera)
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """See `Refiner.push`. The views are in the store."""
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
         options = self._options
         row = {int(index): k for k, index in enumerate(ids)}
-        views = [KeptView.of(s, options.refine.points) for s in self._store.views]
+        views = [
+            KeptView.of(posed.view.once(), options.refine.points) for posed in self._store.of(row)
+        ]
         at = np.array([row[v.surface.index] for v in views], np.intp)
         if len(views) < 2:
             return Refinement(poses, views=len(views))

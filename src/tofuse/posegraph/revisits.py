@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -12,8 +13,7 @@ from numpy.typing import NDArray
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.odometry.keyframes import Acceptance, Recovery
-from tofuse.odometry.likeness import look_of
+from tofuse.registration.likeness import look_of
 from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
 from tofuse.posegraph.graph import LoopRecord
@@ -25,16 +25,16 @@ from tofuse.posegraph.loops import (
     given_loop,
     in_order,
 )
-from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
+from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import Frame
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import Match, search
 from tofuse.registration.uncertainty import covariance
+from tofuse.registration.verification import Belief, UsualFit
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
-_COLUMNS = 200
 _POINTS = 600
 # The trajectory has drifted when a loop closes: little, or much. Neighbouring pixels share their
 # noise, so that all of them would say hardly more than every second one.
@@ -44,8 +44,12 @@ _ALIGNMENT = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 # Sigma, in units of 1 cm and 1 degree, above which a direction keeps the prediction: never.
 _NOT_HELD = 1e6
 _TOO_FAR = "looks alike, but the trajectory can't have drifted so far"
-_RECOVERY = Recovery()
-_ACCEPTANCE = Acceptance(0.8, 0.3, 0.05, 200, 0.02, 0.6)
+# Of an alignment: a loop's views show each other more than by chance.
+_LEAST_OVERLAP = 0.3
+# Pairs of neighbouring views from which is learnt how views of this camera fit.
+_LEARN = 40
+# A search leaves errors of about this size, m and rad.
+_AFTER_SEARCH = 0.03
 
 
 @part("loops", "revisits")
@@ -72,8 +76,9 @@ class Revisits(LoopDetector):
         How two views are aligned, apart from the levels.
     near, far
         Levels to try, and those where they fail; at least two each.
-    acceptance
-        When an alignment is believed.
+    unusual
+        A loop must fit as neighbouring views of this camera do: no statistic of the alignment may
+        be so many standard deviations above its median (`registration.verification`).
     weak
         Most directions that a loop may leave open: there its covariance says that it knows nothing.
     both_ways_m, both_ways_rad
@@ -81,7 +86,7 @@ class Revisits(LoopDetector):
     searches
         At most so many of the candidates that did not fit are searched, those of the largest
         overlap.
-    recovery
+    belief
         How, and what is believed of what is found.
     same_m, same_rad
         How far apart two loops may put a camera that say the same.
@@ -97,12 +102,12 @@ class Revisits(LoopDetector):
     alignment: ProjectiveOptions = _ALIGNMENT
     near: tuple[Level, ...] = _NEAR
     far: tuple[Level, ...] = _FAR
-    acceptance: Acceptance = _ACCEPTANCE
+    unusual: float = 3.0
     both_ways_m: float = 0.03
     both_ways_rad: float = 0.03
     weak: int = 2
     searches: int = 6
-    recovery: Recovery = _RECOVERY
+    belief: Belief = Belief()  # noqa: RUF009 - immutable
     same_m: float = 0.15
     same_rad: float = 0.1
     appearance: Appearance = Appearance()  # noqa: RUF009 - immutable
@@ -115,12 +120,16 @@ class Revisits(LoopDetector):
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
         if not 0 <= self.weak <= 5:
             raise ValueError(f"weak is {self.weak}, not 0 to 5")
+        if not 0.5 <= self.unusual <= 100:
+            raise ValueError(f"unusual is {self.unusual}, not 0.5 to 100")
         if not (self.both_ways_m > 0 and self.both_ways_rad > 0):
             raise ValueError("both_ways_m and both_ways_rad must be above 0")
 
-    def start(self, seed: int, given: Sequence[GivenLoop] = ()) -> Loops:
+    def start(
+        self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
+    ) -> Loops:
         """See `LoopDetector.start`. There is nothing random in it."""
-        return _RevisitLoops(self, given)
+        return _RevisitLoops(self, given, views)
 
     def candidates(
         self, views: Sequence[KeptView], poses: Float64, *, first: int = 0
@@ -147,48 +156,52 @@ class Revisits(LoopDetector):
 class _RevisitLoops(Loops):
     points: ClassVar[bool] = False
 
-    def __init__(self, options: Revisits, given: Sequence[GivenLoop]) -> None:
+    def __init__(
+        self, options: Revisits, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
+    ) -> None:
         self._options = options
-        self._store: ViewStore[SurfaceMap] = ViewStore(options.spacing)
+        self._store = views
+        self._chosen: ViewStore[SurfaceMap] = ViewStore(options.spacing)
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
-        self._asked = {frame for loop in given for frame in (loop.i, loop.j)}
-        self._given_surfaces: dict[int, SurfaceMap] = {}
         self._kept: dict[int, KeptView] = {}
         self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
+        self._usual = UsualFit(options.unusual)
+        self._learnt: set[tuple[int, int]] = set()
 
-    def push(self, view: Frame, T_world_camera: Float64, surface: SurfaceMap | None = None) -> None:
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Loops.push`."""
-        self._poses[view.index] = T_world_camera
-        if surface is None:
-            return
-        thin = surface.thinned(_COLUMNS)
-        self._store.push(thin, T_world_camera)
-        if view.index in self._asked:
-            self._given_surfaces[view.index] = thin
+        self._poses[view.index] = T_component_camera
+        newest = self._store.views[-1] if self._store.views else None
+        if newest is not None and newest.index == view.index:
+            self._chosen.push(newest.view, T_component_camera, newest.component)
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
-        """See `Loops.look`."""
-        surfaces = self._store.views
-        if not surfaces or surfaces[-1].index != next(reversed(self._poses)):
+        """See `Loops.look`. Only in the present component are poses comparable so far."""
+        posed = self._chosen.views
+        if not posed or posed[-1].index != next(reversed(self._poses)):
             return None
-        newest = len(surfaces) - 1
-        pairs = self._options.candidates(self._views(), self._poses_of(surfaces), first=newest)
-        ends = [(surfaces[i], surfaces[j]) for i, j in pairs]
-        return (lambda: [self._confirm(*pair) for pair in ends]) if ends else None
+        posed = [p for p in posed if p.component == posed[-1].component]
+        poses = np.stack([p.T_component_camera for p in posed])
+        pairs = self._options.candidates(self._views(posed), poses, first=len(posed) - 1)
+        ends = [(posed[i].view, posed[j].view) for i, j in pairs]
+        if not ends:
+            return None
 
-    def _views(self) -> list[KeptView]:
-        surfaces = self._store.views
-        self._kept = {s.index: self._kept.get(s.index) or KeptView.of(s, _POINTS) for s in surfaces}
-        return list(self._kept.values())
+        def work() -> list[ClosedLoop]:
+            self._learn(posed)
+            return [self._confirm(*pair) for pair in ends]
 
-    def _poses_of(self, surfaces: Sequence[SurfaceMap]) -> Float64:
-        return np.array([self._poses[s.index] for s in surfaces]).reshape(-1, 4, 4)
+        return work
 
-    def finish(self) -> list[ClosedLoop]:
+    def finish(self, poses: Mapping[int, Float64]) -> list[ClosedLoop]:
         """See `Loops.finish`. What a person gives takes the place of what was found."""
-        surfaces = self._store.views
-        pairs = self._options.candidates(self._views(), self._poses_of(surfaces))
+        self._poses = dict(poses)
+        posed = self._chosen.of(poses)
+        self._learn(posed)
+        surfaces = [p.view for p in posed]
+        at = np.array([poses[s.index] for s in surfaces]).reshape(-1, 4, 4)
+        pairs = self._options.candidates(self._views(posed), at)
         found = run_chunks(
             lambda a, _: self._confirm(*(surfaces[k] for k in pairs[a])), len(pairs), len(pairs)
         )
@@ -198,16 +211,36 @@ class _RevisitLoops(Loops):
             (pair for pair, loop in closed.items() if not loop.record.accepted),
             key=lambda pair: -(closed[pair].record.overlap or 0.0),
         )
-        alike, impossible = self._alike(closed)
+        alike, impossible = self._alike(surfaces, closed)
         closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
         asked = [*refused[: self._options.searches], *alike]
         closed.update(self._searched(asked, by_index, closed, alike))
-        known = self._given_surfaces
+        known = {p.index: p.view for p in self._store.of(poses)}
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
                 loop, known, lambda i, j: self._confirm(known[i], known[j])
             )
         return in_order(closed)
+
+    def _views(self, posed: Sequence[PosedView[SurfaceMap]]) -> list[KeptView]:
+        """The same views as `overlaps` takes them, made once."""
+        known = self._kept
+        self._kept = {
+            p.index: known.get(p.index) or KeptView.of(p.view, _POINTS) for p in posed
+        }
+        return list(self._kept.values())
+
+    def _learn(self, posed: Sequence[PosedView[SurfaceMap]]) -> None:
+        """Learn how neighbouring views of this camera fit."""
+        for a, b in itertools.pairwise(posed):
+            pair = a.index, b.index
+            if a.component != b.component or pair in self._learnt or len(self._learnt) >= _LEARN:
+                continue
+            self._learnt.add(pair)
+            guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
+            aligned = self._freely(a.view.bare(), b.view.bare(), guess, self._options.near)
+            if aligned.overlap >= _LEAST_OVERLAP:
+                self._usual.learn(aligned, b.view.depth)
 
     def _confirm(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
         """Align the later view with the earlier one, and back; once for each pair."""
@@ -230,10 +263,9 @@ class _RevisitLoops(Loops):
         return self._decided(target, source, there, objection)
 
     def _alike(
-        self, closed: Mapping[tuple[int, int], ClosedLoop]
+        self, surfaces: Sequence[SurfaceMap], closed: Mapping[tuple[int, int], ClosedLoop]
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Frames (i, j) that look alike and are no candidates yet: possible ones, and others."""
-        surfaces = self._store.views
         place = {s.index: k for k, s in enumerate(surfaces)}
         known = [(place[i], place[j]) for (i, j), loop in closed.items() if loop.record.accepted]
         both = self._options.appearance.candidates(
@@ -258,15 +290,17 @@ class _RevisitLoops(Loops):
 
         Returns what is found and believed, and of the others why not.
         """
-        recovery = self._options.recovery
+        belief = self._options.belief
         found, margins = {}, {}
         refused = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
         for i, j in pairs:
-            match = search(surfaces[j], surfaces[i], recovery.search)
+            match = search(surfaces[j], surfaces[i], belief.search)
+            objection = "there are too few surfaces to search with"
             if match is not None:
                 margins[i, j] = match.margin
-            if match is None or not recovery.believes(match):
-                refused[i, j] += f"; {_not_believed(match, recovery)}"
+                objection = belief.objection(match, alone=False)
+            if match is None or objection:
+                refused[i, j] += f"; by exhaustive search {objection}"
                 continue
             if (i, j) in alike and not self._plausible(
                 surfaces[i], surfaces[j], match.T_target_source
@@ -279,14 +313,12 @@ class _RevisitLoops(Loops):
         believed = {}
         for (i, j), match in found.items():
             alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
-            if alone and not recovery.believes(match, lost=True):
-                refused[i, j] += (
-                    f"; the pose that a search finds leads by {match.margin:.0%} of the points "
-                    "only, and no other loop says the same"
-                )
+            doubt = belief.objection(match, alone=True)
+            if alone and doubt:
+                refused[i, j] += f"; by exhaustive search {doubt}, and no other loop agrees"
                 continue
-            lead = f"found by a search, leading by {match.margin:.0%} of the points"
-            how = lead if alone else f"{lead}; another loop says the same"
+            lead = f"found by exhaustive search, margin {match.margin:.0%}"
+            how = lead if alone else f"{lead}; another loop agrees"
             if (i, j) in alike:
                 how = f"looks alike, {how}"
             believed[i, j] = self._measured(surfaces[i], surfaces[j], match, how)
@@ -323,12 +355,11 @@ class _RevisitLoops(Loops):
     def _measured(
         self, target: SurfaceMap, source: SurfaceMap, match: Match, how: str
     ) -> ClosedLoop:
-        recovery = self._options.recovery
         options = replace(
             self._options.alignment,
             levels=self._options.near,
-            prior_m=recovery.prior_m,
-            prior_rad=recovery.prior_rad,
+            prior_m=_AFTER_SEARCH,
+            prior_rad=_AFTER_SEARCH,
         )
         there = align(source, [Target(target, np.eye(4))], match.T_target_source, options)
         record = LoopRecord(
@@ -352,7 +383,7 @@ class _RevisitLoops(Loops):
         T = there.T_world_source
         if not objection:
             back = self._freely(source, target, se3.inverse(T), options.near)
-            objection = options.acceptance.objection(back)
+            objection = self._misfit(back)
             gap = T @ back.T_world_source
             if not objection and (
                 np.linalg.norm(gap[:3, 3]) > options.both_ways_m
@@ -378,10 +409,16 @@ class _RevisitLoops(Loops):
     ) -> Aligned:
         """Align with nothing held at the guess, which has drifted; then see what is held."""
         freely = self._freely(target, source, guess, levels)
-        if self._options.acceptance.objection(freely):
+        if self._misfit(freely):
             return freely
         options = replace(self._options.alignment, levels=levels[-2:])
-        return align(source, [Target(target, np.eye(4))], freely.T_world_source, options)
+        return align(
+            source,
+            [Target(target, np.eye(4))],
+            freely.T_world_source,
+            options,
+            usual_scale=self._usual.noise_scale,
+        )
 
     def _freely(
         self, target: SurfaceMap, source: SurfaceMap, guess: Float64, levels: tuple[Level, ...]
@@ -393,31 +430,25 @@ class _RevisitLoops(Loops):
             common_tilt=0.0,
             common_slope=0.0,
         )
-        return align(source, [Target(target, np.eye(4))], guess, options)
+        return align(
+            source,
+            [Target(target, np.eye(4))],
+            guess,
+            options,
+            usual_scale=self._usual.noise_scale,
+        )
+
+    def _misfit(self, aligned: Aligned) -> str:
+        if aligned.overlap < _LEAST_OVERLAP:
+            return f"only {aligned.overlap:.0%} of the points land in the other view"
+        return self._usual.assess(aligned).reason
 
     def _objection(self, aligned: Aligned) -> str:
-        found = self._options.acceptance.objection(aligned)
+        found = self._misfit(aligned)
         if found:
             return found
         if not aligned.converged:
-            return "the alignment does not settle"
+            return "the alignment did not converge"
         if len(aligned.unobservable) > self._options.weak:
-            return f"what both see leaves {len(aligned.unobservable)} directions open"
+            return f"{len(aligned.unobservable)} directions are degenerate"
         return ""
-
-
-def _not_believed(match: Match | None, recovery: Recovery) -> str:
-    """Why what a search found is no loop, in words."""
-    if match is None:
-        return "there is too little to search with"
-    if match.agreement.support < recovery.clear_support:
-        return f"a search finds nothing that {recovery.clear_support:.0%} of the points support"
-    if match.score < recovery.score:
-        return "what a search finds lies where the surfaces are, but they reflect otherwise"
-    if match.margin < recovery.margin:
-        return f"what a search finds leads its best rival by {match.margin:.1%} of the points only"
-    share = match.agreement.support
-    if share < recovery.support and match.margin < recovery.lost_margin:
-        return f"what a search finds is supported by {share:.0%} of the points, and leads by few"
-    share = match.agreement.contradiction
-    return f"{share:.0%} of what meets under the pose that a search finds contradicts it"

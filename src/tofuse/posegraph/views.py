@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic, Protocol, TypeVar
@@ -85,7 +84,7 @@ class Spacing:
             raise ValueError(f"most is {self.most}, not 2 to 100000")
 
 
-class Placed(Protocol):
+class Storable(Protocol):
     """What is kept of a view."""
 
     @property
@@ -99,43 +98,82 @@ class Placed(Protocol):
         ...
 
 
-V = TypeVar("V", bound=Placed)
+V = TypeVar("V", bound=Storable)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedView(Generic[V]):
+    """A view with its (4, 4) pose in the frame of its component."""
+
+    view: V
+    T_component_camera: Float64
+    component: int = 0
+
+    @property
+    def index(self) -> int:
+        """Of the frame in its recording."""
+        return self.view.index
 
 
 class ViewStore(Generic[V]):
-    """Keeps views spaced by the motion of the camera, and never more than a fixed number.
+    """The views that global stages work on: spaced by motion, and never more than so many.
+
+    Parameters
+    ----------
+    spacing
+        Which views are kept.
+    always
+        Frames that are kept in any case.
 
     Attributes
     ----------
     views
-        The kept views in the order of their indices; the first of them stays.
+        In the order of their frames. The first of each component stays.
     """
 
-    def __init__(self, spacing: Spacing) -> None:
-        self.views: list[V] = []
-        self._poses: list[Float64] = []
-        self._spacing = spacing
+    def __init__(self, spacing: Spacing, always: Collection[int] = ()) -> None:
+        self.views: list[PosedView[V]] = []
+        self._spacing, self._always = spacing, frozenset(always)
         self._stretch = 1.0
 
-    def push(self, view: V, T_world_camera: Float64) -> None:
-        """Add a view that has a pose; mostly the next one, but lost ones may be found late."""
-        at = bisect(self.views, view.index, key=lambda kept: kept.index)
-        beside = self._poses[max(at - 1, 0) : at + 1]
-        if not all(self._far(view, T, T_world_camera) for T in beside):
-            return
-        self.views.insert(at, view)
-        self._poses.insert(at, T_world_camera)
-        if len(self.views) > self._spacing.most:
-            self.views, self._poses = self.views[::2], self._poses[::2]
-            self._stretch *= 2
-
-    def _far(self, view: V, T_before: Float64, T: Float64) -> bool:
-        motion = se3.inverse(T_before) @ T
+    def wants(
+        self, index: int, depth: float, T_component_camera: Float64, component: int = 0
+    ) -> bool:
+        """Whether the next view is to be kept: the camera has moved enough, or it is asked for."""
+        if not self.views or self.views[-1].component != component or index in self._always:
+            return True
+        motion = se3.inverse(self.views[-1].T_component_camera) @ T_component_camera
         s = self._spacing
         return bool(
             se3.angle(motion) >= s.angle * self._stretch
-            or np.linalg.norm(motion[:3, 3]) >= s.distance * self._stretch * view.depth
+            or np.linalg.norm(motion[:3, 3]) >= s.distance * self._stretch * depth
         )
+
+    def push(self, view: V, T_component_camera: Float64, component: int = 0) -> bool:
+        """Add the next view if it is wanted; returns whether it is."""
+        if not self.wants(view.index, view.depth, T_component_camera, component):
+            return False
+        self.views.append(PosedView(view, T_component_camera, component))
+        if len(self.views) > self._spacing.most:
+            self._drop_every_other()
+            self._stretch *= 2
+        return True
+
+    def of(self, frames: Collection[int]) -> list[PosedView[V]]:
+        """Views of some frames."""
+        return [view for view in self.views if view.index in frames]
+
+    def _drop_every_other(self) -> None:
+        kept: list[PosedView[V]] = []
+        count = 0
+        for view in self.views:
+            if not kept or kept[-1].component != view.component:
+                count = 0
+            if count % 2 == 0 or view.index in self._always:
+                kept.append(view)
+            count += 1
+        # Where nearly every view is a component of its own, some of these have to go.
+        self.views = kept if len(kept) < self._spacing.most else self.views[::2]
 
 
 def overlaps(

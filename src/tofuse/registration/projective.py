@@ -26,6 +26,8 @@ Float64 = NDArray[np.float64]
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 # What is nearer than this is looked at as through a magnifying glass: slack shrinks with it.
 _NEAR_M = 1.0
+# Noise scales of one camera's views differ by less than this factor.
+_LARGER = 3.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,9 @@ class Aligned:
     rms_m
         Of the inliers' distances.
     scale
-        Rms of the inliers' residuals in sigmas.
+        Noise scale of the residuals, in the sigmas that the views claim, as far as it was let grow.
+    noise_scale
+        The same without a limit: from the median of all compared points, outliers included.
     photo_scale
         The same of the log albedo's, as a standard deviation.
     exposure
@@ -180,6 +184,7 @@ class Aligned:
     score: float
     exposure: float = 0.0
     photometric: bool = False
+    noise_scale: float = 1.0
 
     @cached_property
     def inlier_share(self) -> float:
@@ -200,6 +205,7 @@ def align(
     *,
     start: Float64 | None = None,
     exposure: float | None = None,
+    usual_scale: float = 0.0,
 ) -> Aligned:
     """Align a view with one or more others.
 
@@ -211,6 +217,9 @@ def align(
         (4, 4) where the iterations begin; the prediction unless given.
     exposure
         Log albedo of the targets minus the source's to begin with; seen at the start unless given.
+    usual_scale
+        Noise scale that alignments of this camera usually have, if it is known: sigmas may become
+        three times as large as that, also where this exceeds `most_sigma_m`.
     """
     T_world_predicted = np.ascontiguousarray(T_world_predicted)
     T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
@@ -227,7 +236,7 @@ def align(
     most = 10.0  # times the sigmas that the views claim
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
-        most = max(3.0, options.most_sigma_m / median(sigma))
+        most = max(3.0, options.most_sigma_m / median(sigma), _LARGER * usual_scale)
     near = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
     views = tuple(t.view.target for t in targets)
     lookups = tuple(t.view.projection.lookup for t in targets)
@@ -263,6 +272,7 @@ def align(
         )
         iterations += done
     inliers = total[kernels.INLIERS]
+    noise_scale = steps.scale_of_distances(total[kernels.HISTOGRAM :])
     return Aligned(
         T_world_source=T,
         converged=size < options.settled,
@@ -280,6 +290,7 @@ def align(
         photo_scale=float(guessed[steps.SCALE_P]),
         exposure=float(guessed[steps.EXPOSURE]),
         photometric=photometric and bool(total[kernels.COUNT_P] > 0),
+        noise_scale=float(noise_scale) if np.isfinite(noise_scale) else np.inf,
         score=float(
             (total[kernels.WEIGHT_G] + total[kernels.WEIGHT_P] - 2 * total[kernels.IN_FRONT])
             / max(len(points) * len(targets), 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.odometry.likeness import look_of, mutual_unlikeness, unlikeness
+from tofuse.registration.likeness import look_of, mutual_unlikeness, unlikeness
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render

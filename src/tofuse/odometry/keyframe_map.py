@@ -1,0 +1,114 @@
+"""The keyframes of all components: what views are aligned with, and searched for in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.likeness import look_of, unlikeness
+from tofuse.registration.projective import Target
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Keyframes that are kept, so that memory stays flat.
+CAPACITY = 40
+# By which fraction of its width an image may be shifted against another that it looks like.
+_SHIFT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A view with its pose in the frame of its component."""
+
+    view: SurfaceMap
+    T_component_camera: Float64
+    component: int
+
+    @property
+    def depth(self) -> float:
+        """Median, m."""
+        return self.view.depth
+
+    @cached_property
+    def look(self) -> Float32:
+        """See `look_of`."""
+        return look_of(self.view)
+
+    @cached_property
+    def target(self) -> Target:
+        """What views are aligned with."""
+        return Target(self.view, se3.inverse(self.T_component_camera))
+
+
+class KeyframeMap:
+    """At most `CAPACITY` keyframes, oldest first.
+
+    Parameters
+    ----------
+    angle, distance
+        Motion after which a view becomes a keyframe: rad, and as a fraction of the median depth.
+    """
+
+    def __init__(self, angle: float, distance: float) -> None:
+        self._angle, self._distance = angle, distance
+        self._keyframes: list[Keyframe] = []
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    @property
+    def newest(self) -> Keyframe:
+        """The one that is tracked against."""
+        return self._keyframes[-1]
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Add the newest keyframe; where there are too many, the most dispensable one goes."""
+        if self._keyframes:  # only lost views are compared with it from here on
+            before = self._keyframes[-1]
+            self._keyframes[-1] = replace(before, view=before.view.bare())
+        self._keyframes.append(keyframe)
+        if len(self._keyframes) > CAPACITY:
+            del self._keyframes[self._dispensable()]
+
+    def is_far(self, T_component_camera: Float64, keyframe: Keyframe) -> bool:
+        """Whether a view with this pose is to become a keyframe, seen from another one."""
+        between = se3.inverse(keyframe.T_component_camera) @ T_component_camera
+        return bool(
+            se3.angle(between) > self._angle
+            or np.linalg.norm(between[:3, 3]) > self._distance * keyframe.depth
+        )
+
+    def alike(self, view: SurfaceMap, component: int) -> Keyframe | None:
+        """The keyframe outside of a component that looks most like a view, of equals the newest."""
+        others = [k for k in self._keyframes if k.component != component]
+        if not others:
+            return None
+        far = unlikeness(look_of(view), np.stack([k.look for k in others]), _SHIFT)
+        return others[int(np.flatnonzero(far == far.min())[-1])]
+
+    def _dispensable(self) -> int:
+        """Which keyframe is missed least: the later one of the two that are nearest in pose.
+
+        The earlier one has drifted less. The newest one, which is tracked against, stays, and so
+        does the last one of each component.
+        """
+        old = self._keyframes[:-1]
+        T = np.stack([k.T_component_camera for k in old])
+        component = np.array([k.component for k in old])
+        reach = self._distance * np.array([k.depth for k in old])
+        place = T[:, :3, 3]
+        apart = np.linalg.norm(place[:, None] - place, axis=-1) / np.minimum(reach[:, None], reach)
+        turned = np.einsum("aij,bij->ab", T[:, :3, :3], T[:, :3, :3])
+        angle = np.arccos(np.clip((turned - 1) / 2, -1, 1)) / self._angle
+        away = np.hypot(apart, angle)
+        away[np.triu_indices(len(old))] = np.inf
+        away[component[:, None] != component] = np.inf
+        if np.isinf(away).all():  # nothing but components of one keyframe: the oldest is missed least
+            return 0
+        return int(np.argmin(away.min(1)))

@@ -1,0 +1,51 @@
+"""Finding a lost camera again among earlier keyframes, within a budget of searches."""
+
+from __future__ import annotations
+
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
+from tofuse.registration.verification import Belief, Link, searched_link
+
+# A search costs about as much as tracking so many frames. With one search for so many frames, being
+# lost costs no more than tracking does; some are free, as short recordings may be all large steps.
+_FRAMES_PER_SEARCH, _FREE = 40, 24
+
+
+class Relocalizer:
+    """Searches a view in the newest keyframe and in the one that looks most like it.
+
+    The budget counts frames, not seconds, so that every machine makes the same searches.
+
+    Parameters
+    ----------
+    belief
+        What is believed of a search; None never searches.
+    """
+
+    def __init__(self, belief: Belief | None) -> None:
+        self._belief = belief
+        self._left = float(_FREE)
+
+    def count_frame(self) -> None:
+        """Say that a frame was processed, which adds to the budget."""
+        self._left += 1 / _FRAMES_PER_SEARCH
+
+    def links(self, view: SurfaceMap, keyframes: KeyframeMap, component: int) -> tuple[Link, ...]:
+        """Register a view of a component to keyframes of others; stops at a link that is certain."""
+        candidates: list[Keyframe] = []
+        if len(keyframes) and keyframes.newest.component != component:
+            candidates.append(keyframes.newest)
+        alike = keyframes.alike(view, component)
+        if alike is not None and alike not in candidates:
+            candidates.append(alike)
+        found = []
+        for keyframe in candidates:
+            if self._belief is None or self._left < 1:
+                break
+            self._left -= 1
+            link, _ = searched_link(view, keyframe.view, self._belief)
+            if link is not None:
+                found.append(link)
+                if link.certain:
+                    break
+        return tuple(found)

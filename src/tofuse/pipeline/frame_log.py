@@ -1,0 +1,151 @@
+"""What became of every frame, in the order in which they came."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.odometry.base import Step
+from tofuse.posegraph.joining import Stretch
+from tofuse.posegraph.outside import Sensed
+from tofuse.posegraph.views import ViewStore
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.verification import Link
+from tofuse.results.types import FrameRecord
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One frame.
+
+    Attributes
+    ----------
+    step
+        None where it could not be read.
+    recording
+        Number of the recording that it is of, where several are joined.
+    T_odometry, gravity
+        What the recording knows of it beside the image.
+    moving
+        Fraction of its pixels that moved by themselves.
+    """
+
+    record: FrameRecord
+    step: Step | None
+    recording: int
+    T_odometry: Float64 | None = None
+    gravity: Float64 | None = None
+    moving: float = 0.0
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether it has a pose in its component."""
+        return self.step is not None and self.step.T_component_camera is not None
+
+
+@dataclass(eq=False)
+class FrameLog:
+    """All frames so far.
+
+    Attributes
+    ----------
+    interruptions
+        Positions at which another recording begins.
+    repeated
+        Indices of the frames whose image is the one before, to the last pixel.
+    """
+
+    entries: list[Entry] = field(default_factory=list)
+    interruptions: list[int] = field(default_factory=list)
+    repeated: list[int] = field(default_factory=list)
+
+    def add(
+        self,
+        record: FrameRecord,
+        step: Step | None,
+        T_odometry: Float64 | None = None,
+        gravity: Float64 | None = None,
+    ) -> None:
+        """Add the next frame; its prepared view is not kept here."""
+        moving = 0.0
+        if step is not None:
+            moving = 0.0 if step.moving is None else float(step.moving.mean())
+            step = replace(step, surface=None, moving=None)
+        number = len(self.interruptions)
+        self.entries.append(Entry(record, step, number, T_odometry, gravity, moving))
+
+    @property
+    def posed(self) -> list[Entry]:
+        """Frames with a pose in any component."""
+        return [entry for entry in self.entries if entry.has_pose]
+
+    @property
+    def links(self) -> list[Link]:
+        """All that were found on the way."""
+        return [link for e in self.posed if e.step is not None for link in e.step.links]
+
+    def of(self, frames: Sequence[int] | set[int]) -> FrameLog:
+        """The part of the log with these frames."""
+        kept = set(frames)
+        rows = [k for k, e in enumerate(self.entries) if e.record.index in kept]
+        starts = [int(np.searchsorted(rows, at)) for at in self.interruptions]
+        return FrameLog(
+            [self.entries[k] for k in rows],
+            sorted({at for at in starts if 0 < at < len(rows)}),
+            [index for index in self.repeated if index in kept],
+        )
+
+    def stretches(self, views: ViewStore[SurfaceMap]) -> list[Stretch]:
+        """The components as they were tracked, in the order in which they began."""
+        members: dict[int, list[Entry]] = {}
+        for entry in self.posed:
+            assert entry.step is not None
+            members.setdefault(entry.step.component, []).append(entry)
+        found = []
+        for component, entries in members.items():
+            poses = [e.step.T_component_camera for e in entries if e.step is not None]
+            found.append(
+                Stretch(
+                    component,
+                    np.array([e.record.index for e in entries], np.intp),
+                    np.array([e.record.timestamp for e in entries]),
+                    np.array(poses),
+                    tuple(v for v in views.views if v.component == component),
+                    entries[0].recording,
+                )
+            )
+        return found
+
+    def sensed(self, ids: Sequence[int]) -> Sensed:
+        """What the recording knows of some frames beside their images."""
+        by_index = {e.record.index: e for e in self.entries}
+        odometry, gravity = np.full((len(ids), 4, 4), np.nan), np.full((len(ids), 4), np.nan)
+        for k, index in enumerate(ids):
+            entry = by_index[index]
+            if entry.T_odometry is not None:
+                odometry[k] = entry.T_odometry
+            if entry.gravity is not None:
+                gravity[k] = entry.gravity
+        parts = np.array([by_index[index].recording for index in ids], np.intp)
+        return Sensed(np.array(ids, np.intp), odometry, gravity, parts)
+
+
+def poses_in_world(log: FrameLog, T_world_component: dict[int, Float64]) -> dict[int, Float64]:
+    """(4, 4) T_world_camera by index, the first of them the identity, of the given components."""
+    found: dict[int, Float64] = {}
+    T_first: Float64 | None = None
+    for entry in log.posed:
+        assert entry.step is not None
+        if entry.step.component not in T_world_component:
+            continue
+        T = T_world_component[entry.step.component] @ entry.step.T_component_camera
+        if T_first is None:
+            T_first = se3.inverse(T)
+        found[entry.record.index] = np.asarray(T_first @ T, np.float64)
+    return found

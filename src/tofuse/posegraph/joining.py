@@ -1,0 +1,524 @@
+"""Joins components: parts of a recording that were tracked apart, each in a frame of its own.
+
+Links, registrations of single views across components, come from relocalization on the way, and
+from candidates that look alike in the end. No link decides by itself whether two components are
+joined. Those between the same two components are reduced to the largest set that agrees pairwise
+(Mangelson 2018); what this set says is verified with several views of both sides, as to support and
+to free space; it must have no rival, and the camera must have been able to get there. All this is
+decided when everything was seen: best first, each join with what was joined before. A component
+that nothing joins stays one of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels.motion import moved, twist_between
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
+from tofuse.posegraph.views import PosedView
+from tofuse.registration.agreement import Agreement, agreement
+from tofuse.registration.likeness import look_of, mutual_unlikeness
+from tofuse.registration.projective import ProjectiveOptions, Target, align
+from tofuse.registration.verification import (
+    PATIENT,
+    Belief,
+    Link,
+    UsualFit,
+    aligned_link,
+    searched_link,
+    self_scaled,
+)
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+How = Literal["links", "motion"]
+View = PosedView[SurfaceMap]
+
+# Pairs of neighbouring views from which is learnt how views of this camera fit.
+_LEARN = 16
+# View pairs that verify a join, beside those of the links; and the least overlap that says anything.
+_VERIFY, _OVERLAP = 8, 0.2
+# Contradiction is unusual beyond so many standard deviations above the median of neighbours.
+_SIGMAS, _LEAST_SPREAD = 3.0, 0.02
+# Lengths and turns of the path on either side of a gap say how fast the camera is: it may go on
+# three times as fast, and is somewhere near where it was in any case (a fraction of the depth, rad).
+_AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
+# A gap may be bridged by motion alone where its standard deviation is at most this: fraction of the
+# depth, and rad.
+_BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
+# Links that say something else than those that are believed must weigh less than this.
+_RIVAL = 0.5
+# How many alignments from the identity are tried for each component, beside the searches.
+_ALIGNMENTS = 6
+_SHIFT = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A component as the tracker leaves it.
+
+    Attributes
+    ----------
+    component
+        Its number.
+    frames
+        (N,) indices, ascending.
+    times
+        (N,) s.
+    poses
+        (N, 4, 4) in its frame.
+    views
+        Those that are kept, at least one.
+    recording
+        Which of several joined recordings it is of: between these, no motion is known.
+    """
+
+    component: int
+    frames: NDArray[np.intp]
+    times: Float64
+    poses: Float64
+    views: tuple[View, ...]
+    recording: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """An edge that joins components.
+
+    Attributes
+    ----------
+    link
+        The measurement T_i_j between frames i and j.
+    how
+        "links", or "motion" where the motion over a gap was extrapolated.
+    needed
+        Whether the component hangs on it; else it is one more that says the same.
+    """
+
+    link: Link
+    how: How
+    needed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Components in one frame, that of the one whose first frame is earliest.
+
+    Attributes
+    ----------
+    T_group_component
+        (4, 4) by component.
+    joins
+        What joins them.
+    frames
+        How many frames they have.
+    """
+
+    T_group_component: Mapping[int, Float64]
+    joins: tuple[Join, ...]
+    frames: int
+
+
+@dataclass(frozen=True)
+class Joining:
+    """How components are joined.
+
+    Attributes
+    ----------
+    belief
+        What is believed of an exhaustive search.
+    searches, searches_per_frame
+        How many searches are made at most: so many, plus one for each component, plus this for
+        each frame.
+    bridge
+        Whether short gaps may be bridged by motion alone.
+    """
+
+    belief: Belief = Belief()  # noqa: RUF009 - immutable
+    searches: int = 24
+    searches_per_frame: float = 0.02
+    bridge: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.searches <= 1_000_000:
+            raise ValueError(f"searches is {self.searches}, not 0 or more")
+        if not 0 <= self.searches_per_frame <= 100:
+            raise ValueError(f"searches_per_frame is {self.searches_per_frame}, not 0 or more")
+
+    def join(self, stretches: Sequence[Stretch], links: Sequence[Link]) -> list[Group]:
+        """Join what can be joined; largest group first.
+
+        Parameters
+        ----------
+        links
+            Found on the way, between frames of different components.
+        """
+        if len(stretches) == 1:
+            only = stretches[0]
+            return [Group({only.component: np.eye(4)}, (), len(only.frames))]
+        joiner = _Joiner(self, stretches)
+        for link in sorted(links, key=lambda link: (not link.certain, -(link.margin or 0.0))):
+            joiner.add(link)
+        joiner.decide()
+        joiner.look_for_more()
+        if self.bridge:
+            joiner.bridge_gaps()
+        return joiner.groups()
+
+
+@dataclass(eq=False)
+class _Island:
+    """Components that are joined so far: each with T_island_component."""
+
+    T: dict[int, Float64]
+    joins: list[Join] = field(default_factory=list)
+
+
+class _Joiner:
+    def __init__(self, options: Joining, stretches: Sequence[Stretch]) -> None:
+        self._options = options
+        self._stretches = {s.component: s for s in stretches}
+        self._component_of = {int(f): s.component for s in stretches for f in s.frames}
+        self._views = {v.index: v for s in stretches for v in s.views}
+        self._poses = {
+            int(f): T for s in stretches for f, T in zip(s.frames, s.poses, strict=True)
+        }
+        self._islands = [_Island({s.component: np.eye(4)}) for s in stretches]
+        self._links: list[Link] = []
+        self._refused: set[tuple[int, ...]] = set()
+        total = sum(len(s.frames) for s in stretches)
+        self._searches = (
+            options.searches + len(stretches) + int(options.searches_per_frame * total)
+        )
+        self._alignments = _ALIGNMENTS * len(stretches)
+        self._usual = UsualFit()
+        self._contradiction = options.belief.contradiction
+        self._learn_from_neighbours()
+
+    def add(self, link: Link) -> None:
+        """Take note of a link."""
+        if {link.i, link.j} <= self._poses.keys():
+            self._links.append(link)
+
+    def decide(self) -> None:
+        """Join islands while links say so, those with the most support first."""
+        while True:
+            proposals = []
+            for (a, b), links in self._links_between().items():
+                found = self._proposal(self._islands[a], self._islands[b], links)
+                if found is not None:
+                    weight, chosen = found
+                    proposals.append((-weight, a, b, chosen))
+            for _, a, b, chosen in sorted(proposals, key=lambda p: p[:3]):
+                if self._join(self._islands[a], self._islands[b], chosen):
+                    break
+            else:
+                return
+
+    def _links_between(self) -> dict[tuple[int, int], list[Link]]:
+        """Links by the positions (a, b), a < b, of the islands that they are between."""
+        place = {c: k for k, island in enumerate(self._islands) for c in island.T}
+        found: dict[tuple[int, int], list[Link]] = {}
+        for link in self._links:
+            a, b = sorted(place[self._component_of[f]] for f in (link.i, link.j))
+            if a != b:
+                found.setdefault((a, b), []).append(link)
+        return found
+
+    def look_for_more(self) -> None:
+        """Look for links between islands where views look most alike, within the budget."""
+        views = sorted(self._views.values(), key=lambda v: v.index)
+        if len(self._islands) < 2 or len(views) < 2:
+            return
+        far = mutual_unlikeness([look_of(v.view) for v in views], _SHIFT)
+        component = np.array([self._component_of[v.index] for v in views])
+        i, j = np.nonzero(np.triu(component[:, None] != component))
+        order = np.lexsort((j, i, far[i, j]))
+        tried = {(link.i, link.j) for link in self._links}
+        for k in order.tolist():
+            if self._searches < 1 or len(self._islands) < 2:
+                return
+            first, second = views[i[k]], views[j[k]]
+            if (first.index, second.index) in tried or self._is_joined(first, second):
+                continue
+            tried.add((first.index, second.index))
+            link = self._registered(first, second)
+            if link is not None:
+                self._links.append(link)
+                self.decide()
+
+    def bridge_gaps(self) -> None:
+        """Connect what comes right after a short gap by the motion before and after it."""
+        ordered = sorted(self._stretches.values(), key=lambda s: int(s.frames[0]))
+        for before, after in zip(ordered, ordered[1:], strict=False):
+            a, b = self._island_of(before.component), self._island_of(after.component)
+            if a is b or before.recording != after.recording:
+                continue
+            link = _bridged(before, after)
+            if link is not None and not self._contradicts(a, b, self._T_a_b(a, b, link)):
+                self._merge(a, b, link, [Join(link, "motion", True)])
+
+    def groups(self) -> list[Group]:
+        """What is joined, largest first."""
+        found = []
+        for island in self._islands:
+            first = min(island.T, key=lambda c: int(self._stretches[c].frames[0]))
+            to_first = se3.inverse(island.T[first])
+            frames = sum(len(self._stretches[c].frames) for c in island.T)
+            T = {c: to_first @ island.T[c] for c in sorted(island.T)}
+            found.append((-frames, int(self._stretches[first].frames[0]), T, island.joins))
+        found.sort(key=lambda f: f[:2])
+        return [Group(T, tuple(joins), -frames) for frames, _, T, joins in found]
+
+    def _learn_from_neighbours(self) -> None:
+        """How do neighbouring views of one component fit, and contradict each other?"""
+        pairs = [
+            (a, b) for s in self._stretches.values() for a, b in zip(s.views, s.views[1:], strict=False)
+        ]
+        some = np.linspace(0, len(pairs) - 1, min(len(pairs), _LEARN)).round().astype(int)
+        options = ProjectiveOptions(levels=PATIENT)
+        seen = []
+        for k in some:
+            a, b = pairs[k]
+            T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
+            aligned = align(b.view, [Target(a.view, np.eye(4))], T_a_b, options)
+            if aligned.overlap >= _OVERLAP:
+                self._usual.learn(aligned, b.view.depth)
+                found = agreement(b.view, a.view, T_a_b, self_scaled(self._usual))
+                seen.append(found.contradiction)
+        if len(seen) > 3:
+            middle = float(np.median(seen))
+            spread = 1.48 * float(np.median(np.abs(np.array(seen) - middle)))
+            limit = middle + _SIGMAS * max(spread, _LEAST_SPREAD)
+            self._contradiction = max(self._contradiction, limit)
+
+    def _registered(self, first: View, second: View) -> Link | None:
+        """Register two views that look alike: from the identity if that does, else by a search."""
+        if self._alignments > 0:
+            self._alignments -= 1
+            link = aligned_link(second.view, first.view, np.eye(4), self._usual)
+            if link is not None:
+                return link
+        self._searches -= 1
+        return searched_link(second.view, first.view, self._options.belief)[0]
+
+    def _island_of(self, component: int) -> _Island:
+        return next(island for island in self._islands if component in island.T)
+
+    def _is_joined(self, a: View, b: View) -> bool:
+        return self._component_of[b.index] in self._island_of(self._component_of[a.index]).T
+
+    def _T_island(self, island: _Island, frame: int) -> Float64:
+        T = island.T[self._component_of[frame]] @ self._poses[frame]
+        return np.asarray(T, np.float64)
+
+    def _T_a_b(self, a: _Island, b: _Island, link: Link) -> Float64:
+        """T_a_b that a link between two islands implies, whichever way it goes."""
+        i, j, T = link.i, link.j, link.T_i_j
+        if self._component_of[i] not in a.T:
+            i, j, T = j, i, se3.inverse(T)
+        return np.asarray(
+            self._T_island(a, i) @ T @ se3.inverse(self._T_island(b, j)), np.float64
+        )
+
+    def _proposal(
+        self, a: _Island, b: _Island, between: list[Link]
+    ) -> tuple[float, list[Link]] | None:
+        """The links to believe between two islands, and their weight; None if there are none."""
+        if _key(a, b, between) in self._refused:
+            return None
+        T = [self._T_a_b(a, b, link) for link in between]
+        n = len(between)
+        agree = np.ones((n, n), bool)
+        for p in range(n):
+            for q in range(p + 1, n):
+                agree[p, q] = agree[q, p] = self._say_the_same(b, between[p], T[p], T[q])
+        weights = [_weight(link) for link in between]
+        chosen = maximum_consistent_set(agree, weights)
+        weight = sum(weights[k] for k in chosen)
+        rest = [k for k in range(n) if not agree[k, chosen].all()]
+        rivals = maximum_consistent_set(agree[np.ix_(rest, rest)], [weights[k] for k in rest])
+        if sum(weights[rest[k]] for k in rivals) > _RIVAL * weight:
+            self._refused.add(_key(a, b, between))
+            return None
+        return weight, [between[k] for k in chosen]
+
+    def _say_the_same(self, b: _Island, link: Link, T: Float64, other: Float64) -> bool:
+        """Whether two T_a_b put the view of a link at the same place, but for drift."""
+        frame = link.j if self._component_of[link.j] in b.T else link.i
+        at = self._T_island(b, frame)
+        return not self._options.belief.search.differ(T @ at, other @ at)
+
+    def _join(self, a: _Island, b: _Island, links: list[Link]) -> bool:
+        """Join two islands if what links say is verified."""
+        best = max(links, key=lambda link: (link.certain, _weight(link)))
+        T_a_b = self._T_a_b(a, b, best)
+        extra = self._confirming(a, b, T_a_b, links)
+        certain = any(link.certain for link in links)
+        if (
+            not (certain or len(links) + len(extra) > 1)
+            or self._contradicts(a, b, T_a_b)
+            or not self._reachable(a, b, T_a_b)
+        ):
+            between = self._links_between()[self._positions(a, b)]
+            self._refused.add(_key(a, b, between))
+            return False
+        joins = [Join(link, "links", link is best) for link in [*links, *extra]]
+        self._merge(a, b, best, joins)
+        return True
+
+    def _positions(self, a: _Island, b: _Island) -> tuple[int, int]:
+        first, second = sorted((self._islands.index(a), self._islands.index(b)))
+        return first, second
+
+    def _merge(self, a: _Island, b: _Island, link: Link, joins: list[Join]) -> None:
+        T_a_b = self._T_a_b(a, b, link)
+        a.T.update({c: T_a_b @ T for c, T in b.T.items()})
+        a.joins += [*b.joins, *joins]
+        self._islands.remove(b)
+
+    def _overlapping(
+        self, a: _Island, b: _Island, T_a_b: Float64
+    ) -> list[tuple[View, View, Float64, Agreement]]:
+        """View pairs of both sides that overlap most under T_a_b, with T_i_j and their agreement."""
+        compare = self_scaled(self._usual)
+        ours = [self._views[i] for i in self._views if self._component_of[i] in a.T]
+        theirs = [self._views[i] for i in self._views if self._component_of[i] in b.T]
+        near = []
+        Ta = np.stack([self._T_island(a, v.index) for v in ours])
+        Tb = np.stack([T_a_b @ self._T_island(b, v.index) for v in theirs])
+        for p, v in enumerate(ours):
+            between = se3.inverse(Ta[p]) @ Tb
+            apart = np.linalg.norm(between[:, :3, 3], axis=1) / v.view.depth
+            away = apart + np.asarray(se3.angle(between))
+            near += [(float(away[q]), p, q) for q in np.flatnonzero(away < 1.2)]
+        found = []
+        for _, p, q in sorted(near)[: 3 * _VERIFY]:
+            T = se3.inverse(Ta[p]) @ Tb[q]
+            seen = agreement(theirs[q].view, ours[p].view, T, compare)
+            if seen.overlap >= _OVERLAP:
+                found.append((ours[p], theirs[q], T, seen))
+            if len(found) >= _VERIFY:
+                break
+        return found
+
+    def _contradicts(self, a: _Island, b: _Island, T_a_b: Float64) -> bool:
+        """Whether views of both sides contradict each other more than neighbours do."""
+        pairs = self._overlapping(a, b, T_a_b)
+        overlap = sum(seen.overlap for *_, seen in pairs)
+        against = sum(seen.violation + seen.clash for *_, seen in pairs)
+        return overlap > 0 and against / overlap > self._contradiction
+
+    def _confirming(
+        self, a: _Island, b: _Island, T_a_b: Float64, known: list[Link]
+    ) -> list[Link]:
+        """Registrations of other view pairs that say the same as T_a_b."""
+        seen = {frozenset((link.i, link.j)) for link in known}
+        found = []
+        for first, second, T, _ in self._overlapping(a, b, T_a_b)[:4]:
+            if frozenset((first.index, second.index)) in seen:
+                continue
+            link = aligned_link(second.view, first.view, T, self._usual)
+            if link is not None and not self._options.belief.search.differ(link.T_i_j, T):
+                found.append(link)
+        return found
+
+    def _reachable(self, a: _Island, b: _Island, T_a_b: Float64) -> bool:
+        """Whether the camera can have got from the one side to the other in the time it had."""
+        for c in a.T:
+            for d in b.T:
+                first, second = self._stretches[c], self._stretches[d]
+                if first.recording != second.recording:
+                    continue
+                T_c, T_d = a.T[c], T_a_b @ b.T[d]
+                if first.frames[0] > second.frames[0]:
+                    first, second, T_c, T_d = second, first, T_d, T_c
+                between = se3.inverse(T_c @ first.poses[-1]) @ T_d @ second.poses[0]
+                reach = _reach(first, second)
+                depth = first.views[-1].view.depth
+                if (
+                    np.linalg.norm(between[:3, 3]) > reach[0] + _NEAR * depth
+                    or float(se3.angle(between)) > reach[1] + _NEAR
+                ):
+                    return False
+        return True
+
+
+def _key(a: _Island, b: _Island, between: Sequence[Link]) -> tuple[int, ...]:
+    """What was decided about: two islands, and how many links were known between them."""
+    return (*sorted(a.T), -1, *sorted(b.T), -1, len(between))
+
+
+def _weight(link: Link) -> float:
+    """A certain link counts for two that are not."""
+    return (2.0 if link.certain else 1.0) * (0.5 + link.agreement.support)
+
+
+def _speeds(stretch: Stretch, *, end: bool) -> Float64:
+    """(n, 2) m and rad by the unit of time of the motions next to one end."""
+    some = slice(-_AROUND, None) if end else slice(None, _AROUND)
+    poses, times = stretch.poses[some], stretch.times[some]
+    if len(poses) < 2:
+        return np.zeros((0, 2))
+    steps = se3.inverse(poses[:-1]) @ poses[1:]
+    elapsed = np.maximum(np.diff(times), 1e-9)
+    far = np.linalg.norm(steps[:, :3, 3], axis=1), np.asarray(se3.angle(steps))
+    return np.stack(far, 1) / elapsed[:, None]
+
+
+def _reach(before: Stretch, after: Stretch) -> Float64:
+    """(2,) m and rad that the camera may have moved over a gap; infinite where it is not known."""
+    speeds = np.concatenate([_speeds(before, end=True), _speeds(after, end=False)])
+    if len(speeds) < _AROUND // 4:
+        return np.full(2, np.inf)
+    elapsed = max(float(after.times[0] - before.times[-1]), 0.0)
+    return np.asarray(_FASTER * speeds.max(0) * elapsed)
+
+
+def _bridged(before: Stretch, after: Stretch) -> Link | None:
+    """The motion over a gap, extrapolated from both sides; None where it is too uncertain."""
+    elapsed = float(after.times[0] - before.times[-1])
+    n = 5
+    if min(len(before.frames), len(after.frames)) < n or elapsed <= 0:
+        return None
+
+    def velocities(stretch: Stretch, some: slice) -> Float64:
+        poses, times = stretch.poses[some], stretch.times[some]
+        return np.stack(
+            [
+                twist_between(poses[k], poses[k + 1]) / max(float(times[k + 1] - times[k]), 1e-9)
+                for k in range(len(poses) - 1)
+            ]
+        )
+
+    v, w = velocities(before, slice(-n, None)), velocities(after, slice(None, n))
+    interval = float(np.median(np.diff(np.concatenate([before.times[-n:], after.times[:n]]))))
+    change = np.concatenate([np.diff(v, axis=0), np.diff(w, axis=0)])
+    # A random walk of the velocity, observed at both ends.
+    wander = np.sqrt((change**2).mean(0)) * np.sqrt(max(elapsed / max(interval, 1e-9), 1.0))
+    apart = np.abs(v[-2:].mean(0) - w[:2].mean(0))
+    sigma = np.hypot(0.5 * wander, 0.5 * apart) * elapsed
+    depth = before.views[-1].view.depth
+    limit = np.repeat([_BRIDGE_M * depth, _BRIDGE_RAD], 3)
+    if (sigma > limit).any():
+        return None
+    T = moved(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
+    sigma = np.maximum(sigma, 0.1 * limit)
+    nothing = Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0)
+    return Link(
+        int(before.frames[-1]),
+        int(after.frames[0]),
+        T,
+        np.diag(1 / sigma**2),
+        nothing,
+        None,
+        False,
+        "bridged by the motion before and after the gap",
+    )

@@ -1,0 +1,346 @@
+"""Whether an alignment is right: by how views of this camera usually fit, and by its rivals.
+
+How well two images fit at the right pose depends on the camera: of a smoothing phone 92 % of the
+compared pixels are inliers, of a stereo camera two thirds. So no fixed limit decides. `UsualFit`
+learns the distribution of a few statistics from the alignments that were accepted, beginning with a
+wide prior. What deviates from it by more than `Unusual.sigmas` is not refused, but doubted: it then
+has to beat its rivals. What was found without a prediction is verified by both images
+(`registration.agreement`), and by its lead over the other poses that an exhaustive search found.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
+from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.registration.search import Match, SearchOptions, search
+from tofuse.registration.uncertainty import UncertaintyOptions, covariance
+
+Float64 = NDArray[np.float64]
+
+# Statistics of an alignment, all logarithms: odds of an outlier, odds of a point in free space, the
+# noise scale, and the standard deviation of the log albedo.
+_NAMES = ("outliers", "free-space violations", "noise", "albedo differences")
+# Fractions below these are never evidence: mixed pixels at edges, and quantisation.
+_ODDS_FLOOR = np.array([0.02, 0.01])
+# What is expected of a camera that is not known yet: mean and standard deviation of the statistics
+# (15 % outliers, 2 % in free space, four times the stated sigmas, 5 % of the albedo), and how many
+# alignments this counts for.
+_PRIOR_MEAN = np.array([np.log(0.17 / 0.87), np.log(0.03 / 0.98), np.log(4.0), np.log(0.05)])
+_PRIOR_SIGMA = np.array([0.6, 0.9, 1.5, 0.7])
+_PRIOR_COUNT = 5.0
+# However alike the views of a recording, the next one may be of another kind.
+_LEAST_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
+_WINDOW = 200
+_MEDIAN_OF_NORMAL = 0.6745
+# Six unknowns, and neighbouring pixels that share their noise.
+_LEAST_INLIERS = 40
+# Registrations without a prediction need more iterations than tracking does.
+PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """How an alignment compares with those of this camera.
+
+    Attributes
+    ----------
+    usual
+        Whether all statistics are within the usual range.
+    excess
+        Sum of the logarithms by which statistics exceed their usual value; 0 for a usual fit.
+    reason
+        Which statistic is out of range, and what is usual; empty for a usual fit.
+    """
+
+    usual: bool
+    excess: float
+    reason: str
+
+
+class UsualFit:
+    """How well views of this camera fit where they were aligned correctly.
+
+    Location and spread of each statistic are the median and the scaled median absolute deviation
+    over the last alignments, shrunk to the prior while there are few.
+
+    Parameters
+    ----------
+    sigmas
+        Statistics within so many standard deviations above the median are usual.
+    """
+
+    def __init__(self, sigmas: float = 3.0) -> None:
+        self._sigmas = sigmas
+        self._seen: deque[Float64] = deque(maxlen=_WINDOW)
+        self._mean, self._sigma = _PRIOR_MEAN, _PRIOR_SIGMA
+        self._rms: deque[float] = deque(maxlen=_WINDOW)
+
+    @property
+    def noise_scale(self) -> float:
+        """Usual noise scale, in the sigmas that views claim; 0 while it is not known."""
+        return float(np.exp(self._mean[2])) if len(self._seen) >= _PRIOR_COUNT else 0.0
+
+    @property
+    def rms_share(self) -> float:
+        """Usual rms distance of inliers from the surface, as a fraction of the depth."""
+        return float(np.median(self._rms)) if self._rms else 0.0
+
+    def learn(self, aligned: Aligned, depth: float) -> None:
+        """Take note of an alignment that was accepted, of a view with this median depth in m."""
+        self._seen.append(_statistics(aligned))
+        if np.isfinite(aligned.rms_m) and depth > 0:
+            self._rms.append(aligned.rms_m / depth)
+        seen = np.stack(self._seen)
+        mean, sigma = _PRIOR_MEAN.copy(), _PRIOR_SIGMA.copy()
+        for k in range(len(_NAMES)):
+            known = seen[np.isfinite(seen[:, k]), k]
+            n = len(known)
+            if n:
+                middle = float(np.median(known))
+                spread = float(np.median(np.abs(known - middle))) / _MEDIAN_OF_NORMAL
+                weight = n / (n + _PRIOR_COUNT)
+                mean[k] += weight * (middle - mean[k])
+                sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])
+        self._mean, self._sigma = mean, np.maximum(sigma, _LEAST_SIGMA)
+
+    def assess(self, aligned: Aligned) -> Assessment:
+        """Compare an alignment with what is usual."""
+        if aligned.inliers < _LEAST_INLIERS:
+            words = f"{aligned.inliers} inliers are too few to determine a pose"
+            return Assessment(False, np.inf, words)
+        found = _statistics(aligned)
+        over = np.where(np.isfinite(found), found - self._mean, 0.0)
+        worst = int(np.argmax(over / self._sigma))
+        if over[worst] <= self._sigmas * self._sigma[worst]:
+            return Assessment(True, 0.0, "")
+        excess = float(np.maximum(over, 0).sum())
+        words = _in_words(worst, float(found[worst]), float(self._mean[worst]))
+        return Assessment(False, excess, words)
+
+
+def _statistics(a: Aligned) -> Float64:
+    n = max(a.compared, 1)
+    shares = np.array([1 - a.inliers / n, a.in_front / n])
+    odds = np.log((shares + _ODDS_FLOOR) / (1 - shares + _ODDS_FLOOR))
+    noise = np.log(a.noise_scale) if 0 < a.noise_scale < np.inf else np.nan
+    albedo = np.log(a.photo_scale) if a.photometric and a.photo_scale > 0 else np.nan
+    return np.array([*odds, noise, albedo])
+
+
+def _in_words(k: int, found: float, usual: float) -> str:
+    if k < 2:
+        shares = [1 / (1 + np.exp(-x)) for x in (found, usual)]
+        return f"{shares[0]:.0%} {_NAMES[k]}, usually {shares[1]:.0%}"
+    return f"{_NAMES[k]} {np.exp(found - usual):.1f} times as large as usual"
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of a pose that an exhaustive search found.
+
+    Attributes
+    ----------
+    support, clear_support
+        Least fraction of both views' points that support the pose; the second where it leads by
+        `clear_margin`.
+    score
+        Least score: the same fraction, by how alike they reflect, less those that contradict it.
+    margin, clear_margin
+        Least lead in score over the best other pose: where other evidence agrees, and by itself.
+        Fractions of the points.
+    contradiction
+        Largest fraction of what lands on a surface that lies in the other view's free space, or
+        reflects otherwise.
+    search
+        How far and how finely is searched.
+    """
+
+    support: float = 0.25
+    clear_support: float = 0.15
+    score: float = 0.1
+    margin: float = 0.025
+    clear_margin: float = 0.1
+    contradiction: float = 0.08
+    search: SearchOptions = field(default_factory=lambda: SearchOptions(mode="both"))
+
+    def __post_init__(self) -> None:
+        for name in ("support", "clear_support", "score", "margin", "clear_margin"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
+        if not 0 <= self.contradiction <= 1:
+            raise ValueError(f"contradiction is {self.contradiction}, not 0 to 1")
+
+    def objection(self, match: Match, *, alone: bool) -> str:
+        """Why the best pose of a search is not believed; empty if it is.
+
+        Parameters
+        ----------
+        alone
+            Whether nothing else speaks for the pose: it must then lead by `clear_margin`.
+        """
+        found, margin = match.agreement, match.margin
+        clear = margin >= self.clear_margin
+        if found.support < self.clear_support:
+            return f"no pose has the support of {self.clear_support:.0%} of the points"
+        if match.score < self.score:
+            return "the best pose is contradicted by albedo or free space"
+        if margin < (self.clear_margin if alone else self.margin):
+            return f"the best pose leads its runner-up by {max(margin, 0):.1%} of the points only"
+        if found.support < self.support and not clear:
+            return f"the best pose has the support of {found.support:.0%} of the points only"
+        if found.contradiction > self.contradiction:
+            return f"{found.contradiction:.0%} of the overlap contradicts the best pose"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A registration of two views that may be far apart.
+
+    Attributes
+    ----------
+    i, j
+        Frame indices of target and source.
+    T_i_j
+        (4, 4).
+    information
+        (6, 6) of the right perturbation.
+    agreement
+        What both images say of it.
+    margin
+        Lead over the runner-up, as a fraction of the points; None where no search was made.
+    certain
+        Whether it is believed by itself. Else it needs other links that say the same.
+    how
+        In words.
+    """
+
+    i: int
+    j: int
+    T_i_j: Float64
+    information: Float64
+    agreement: Agreement
+    margin: float | None
+    certain: bool
+    how: str
+
+
+_ALIGNMENT = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
+# A search leaves errors of about this size, m and rad.
+_AFTER_SEARCH = replace(_ALIGNMENT, prior_m=0.03, prior_rad=0.03)
+_COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
+
+
+def searched_link(
+    source: SurfaceMap, target: SurfaceMap, belief: Belief
+) -> tuple[Link | None, str]:
+    """Register two views by an exhaustive search.
+
+    Returns
+    -------
+    The link, certain or not, and why it is not believed, if so. Without a link where the search
+    finds no pose that is worth keeping.
+    """
+    if not comparable(source.depth, target.depth):
+        return None, "the views are of different scale"
+    match = search(source, target, belief.search)
+    if match is None:
+        return None, "there are too few surfaces to search with"
+    objection = belief.objection(match, alone=False)
+    if objection:
+        return None, objection
+    at = [Target(target, np.eye(4))]
+    aligned = align(source, at, match.T_target_source, _AFTER_SEARCH)
+    doubt = belief.objection(match, alone=True)
+    C = covariance(source, at, aligned, _AFTER_SEARCH, UncertaintyOptions())
+    how = f"found by exhaustive search, margin {match.margin:.0%}"
+    return (
+        Link(
+            target.index,
+            source.index,
+            aligned.T_world_source,
+            np.asarray(np.linalg.inv(C), np.float64),
+            match.agreement,
+            match.margin,
+            not doubt,
+            how,
+        ),
+        doubt,
+    )
+
+
+def aligned_link(
+    source: SurfaceMap,
+    target: SurfaceMap,
+    T_guess: Float64,
+    usual: UsualFit,
+    tolerance: tuple[float, float] = (0.03, 0.03),
+) -> Link | None:
+    """Register two views from a guess, both ways; None where they don't fit as usual.
+
+    The link is not certain: nothing was compared with it.
+
+    Parameters
+    ----------
+    T_guess
+        (4, 4) T_target_source.
+    tolerance
+        How far apart both ways may end, as a fraction of the depth and in rad.
+    """
+    if not comparable(source.depth, target.depth):
+        return None
+    at = [Target(target, np.eye(4))]
+    coarse = align(source, at, T_guess, replace(_ALIGNMENT, levels=_COARSE))
+    there = align(source, at, coarse.T_world_source, _ALIGNMENT, usual_scale=usual.noise_scale)
+    if not there.converged or len(there.unobservable) or not usual.assess(there).usual:
+        return None
+    T = there.T_world_source
+    back = align(
+        target, [Target(source, np.eye(4))], se3.inverse(T), _ALIGNMENT,
+        usual_scale=usual.noise_scale,
+    )  # fmt: skip
+    gap = T @ back.T_world_source
+    far_m, far_rad = tolerance
+    if (
+        not usual.assess(back).usual
+        or np.linalg.norm(gap[:3, 3]) > far_m * source.depth
+        or se3.angle(gap) > far_rad
+    ):
+        return None
+    found = agreement(source, target, T, self_scaled(usual))
+    if found.score <= 0:
+        return None
+    C = covariance(source, at, there, _ALIGNMENT, UncertaintyOptions())
+    return Link(
+        target.index,
+        source.index,
+        T,
+        np.asarray(np.linalg.inv(C), np.float64),
+        found,
+        None,
+        False,
+        "aligned both ways",
+    )
+
+
+def self_scaled(usual: UsualFit) -> AgreementOptions:
+    """How images of this camera are compared: distances that it usually errs by are no conflict."""
+    plain = AgreementOptions()
+    return replace(plain, floor_share=max(plain.floor_share, 2 * usual.rms_share))
+
+
+# From one place no view is so many times deeper than another of the same scene.
+_RESCALED = 4.0
+
+
+def comparable(depth: float, other: float) -> bool:
+    """Whether two views of such median depths can show the same from near the same place."""
+    return 1 / _RESCALED < depth / other < _RESCALED
