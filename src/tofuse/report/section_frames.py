@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tofuse.report import plots, words
+from tofuse.report.section_components import color
 from tofuse.report.subject import ROWS, Figure, Subject, Values
-from tofuse.results.types import FrameRecord
+from tofuse.results.types import Component, FrameRecord, in_main_model
 
 _STRIP = 600  # cells in the strip of frames
 
@@ -24,6 +27,9 @@ def frames(s: Subject) -> Values:
     }
     if not records:
         return out | {"strip_label": "", "strip_hint": ""}
+    components = s.result.components
+    if len(components) > 1:
+        out["lanes"].append("component")
     # With more frames than cells, a cell stands for several and shows the worst of them.
     size = -(-len(records) // _STRIP)
     for start in range(0, len(records), size):
@@ -31,7 +37,15 @@ def frames(s: Subject) -> Values:
         worst = max(group, key=lambda r: (1, 2, 3, 0)[words.STATUSES.index(r.status)])
         lane = words.STATUSES.index(worst.status)
         out["strip"].append(
-            {"status": worst.status, "lane": lane, "title": told(worst), "index": worst.index}
+            {
+                "status": worst.status,
+                "lane": lane,
+                "title": _told_with_component(worst, components),
+                "index": worst.index,
+                "color": None
+                if worst.component is None or len(components) < 2
+                else color(worst.component),
+            }
         )
     counts = [f"{sum(r.status == name for r in records)} {name}" for name in words.STATUSES]
     out["strip_label"] = "Status of each frame: " + ", ".join(counts)
@@ -77,6 +91,14 @@ def told(record: FrameRecord) -> str:
     if len(record.unobservable):
         parts.append(f"{len(record.unobservable)} of 6 directions not held by the data")
     return ", ".join(parts)
+
+
+def _told_with_component(record: FrameRecord, components: Sequence[Component]) -> str:
+    text = told(record)
+    if record.component is None or len(components) < 2:
+        return text
+    apart = "" if in_main_model(record, components) else ", not connected to the main one"
+    return f"{text}, component {record.component}{apart}"
 
 
 def loops(s: Subject) -> Values:
