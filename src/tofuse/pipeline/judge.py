@@ -407,7 +407,10 @@ def _doubt(e: Evidence, sigma: Float64, turn: Float64, doubtful: NDArray[np.bool
     graph = e.optimisation.graph
     ids = graph.ids.tolist()
     apart = doubtful & ~np.isfinite(sigma)
-    free = doubtful & ~apart & (turn >= np.pi)  # no two rotations are further apart
+    free = np.zeros(len(ids), bool)
+    for first, last in runs(ids, (doubtful & ~apart).tolist()):
+        here = (graph.ids >= first) & (graph.ids <= last)
+        free |= here & (turn[here] >= np.pi).any()  # no two rotations are further apart
     loose = doubtful & ~apart & ~free
     out = []
     where = runs(ids, loose.tolist())

@@ -40,7 +40,7 @@ def frames(s: Subject) -> Values:
             {
                 "status": worst.status,
                 "lane": lane,
-                "title": _told_with_component(worst, components),
+                "title": told(worst, components),
                 "index": worst.index,
                 "color": None
                 if worst.component is None or len(components) < 2
@@ -79,8 +79,8 @@ def frames(s: Subject) -> Values:
     return out
 
 
-def told(record: FrameRecord) -> str:
-    """Say what became of a frame."""
+def told(record: FrameRecord, components: Sequence[Component] = ()) -> str:
+    """Say what became of a frame; of components only where there are several."""
     parts = [f"Frame {record.index}: {record.status}"]
     if record.reason:
         parts[0] += f" – {record.reason}"
@@ -89,16 +89,11 @@ def told(record: FrameRecord) -> str:
     if record.rms_m is not None:
         parts.append(f"rms {words.length(record.rms_m)}")
     if len(record.unobservable):
-        parts.append(f"{len(record.unobservable)} of 6 directions not held by the data")
+        parts.append(f"{len(record.unobservable)} of 6 directions unobservable")
+    if record.component is not None and len(components) > 1:
+        apart = "" if in_main_model(record, components) else " (not connected to the main one)"
+        parts.append(f"component {record.component}{apart}")
     return ", ".join(parts)
-
-
-def _told_with_component(record: FrameRecord, components: Sequence[Component]) -> str:
-    text = told(record)
-    if record.component is None or len(components) < 2:
-        return text
-    apart = "" if in_main_model(record, components) else ", not connected to the main one"
-    return f"{text}, component {record.component}{apart}"
 
 
 def loops(s: Subject) -> Values:

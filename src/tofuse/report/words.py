@@ -135,16 +135,8 @@ def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
     grave = [f for f in found if f.level == d.verdict]
     if d.verdict == "good":
         return f"Good: {have}, and no check found fault with the result."
-    first = look = ""
-    if grave:
-        first = f" {grave[0].text}"
-        ranges = grave[0].ranges
-        longest = max(ranges, key=lambda r: r[1] - r[0])
-        # Frames that are most of the recording, or those just named, are no place to look at.
-        named = in_words(ranges) in first or str(longest[1]) in first
-        if 2 * size(ranges) <= len(d.frames) and not named:
-            look = f" Look first at {frame_range(*longest)}."
+    first = f" {grave[0].text}" if grave else ""
     more = f" {count(len(grave) - 1, 'more reason')} below." if len(grave) > 1 else ""
     if d.verdict == "degraded":
-        return f"Degraded: use this model with care.{first}{look}{more}"
+        return f"Degraded: use this model with care.{first}{more}"
     return f"Failed: do not rely on this model.{first or f' {have}.'}{more}"
