@@ -419,10 +419,10 @@ def in_parts(number=20):
 
 def test_components_are_listed_with_their_own_models(tmp_path):
     got = page(tmp_path, in_parts(), ReportExtras("x"))
-    assert got.row("0, the main one")[1:] == ["0–9", "10", "–", "this one"]
-    assert got.row("1")[1:] == ["10–11", "2", "links between views", "this one"]
-    assert got.row("2")[1:] == ["12–17", "6", "not connected", "component-2/report.html"]
-    assert got.row("3")[1:] == ["18–19", "2", "not connected", "none: too few frames"]
+    assert got.row("0 (main)")[1:] == ["0–9", "this one", "–", "10"]
+    assert got.row("1")[1:] == ["10–11", "this one", "links between views", "2"]
+    assert got.row("2")[1:] == ["12–17", "component-2", "not connected", "6"]
+    assert got.row("3")[1:] == ["18–19", "none: too few frames", "not connected", "2"]
     assert "2 of them could not be connected" in " ".join(got.sections["components"].split())
     assert got.links.count("component-2/report.html") == 1
     assert "#components" in got.links

@@ -377,6 +377,25 @@ def test_a_folder_with_something_of_somebody_else_stays(tmp_path, how, when) -> 
     assert own.is_symlink() == (how in ("link", "dangling"))
 
 
+def test_a_link_in_place_of_a_file_is_put_back(tmp_path, monkeypatch) -> None:
+    out = tmp_path / "out"
+    write_result(result(), OutputFolder(out))
+    (out / "cloud.ply").rename(tmp_path / "cloud.ply")
+    (out / "cloud.ply").symlink_to("../cloud.ply")  # leads nowhere from another folder
+    folder, move = OutputFolder(out, overwrite=True), os.replace
+
+    def fails(source, target) -> None:
+        if Path(target) == out / "cloud.ply" and not Path(source).is_symlink():
+            raise OSError(errno.EIO, "gone")
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(OutputError):
+        write_result(result(seed=1), folder)
+    assert (out / "cloud.ply").is_symlink()
+    assert (out / "cloud.ply").read_bytes() == (tmp_path / "cloud.ply").read_bytes()
+
+
 def test_an_error_in_a_component_names_its_file(tmp_path, monkeypatch) -> None:
     def report(_result, folder) -> None:
         raise OutputError("can't be written", where=folder / "report.html")

@@ -47,12 +47,13 @@ def _row(number: int, component: Component, count: int) -> Values:
     if component.connected:
         model = "this one"
     elif component.result is not None:
-        link = f"{component_name(number)}/report.html"
+        model = component_name(number)
+        link = f"{model}/report.html"
     else:
         model = "none: too few frames"
     joined = _JOINED.get(component.joined or "", "–" if number == 0 else "not connected")
     return {
-        "name": f"{number}, the main one" if number == 0 else str(number),
+        "name": f"{number} (main)" if number == 0 else str(number),
         "color": color(number),
         "frames": numbers(component.frames).replace("-", "–"),
         "count": f"{count:,}",
