@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +26,17 @@ from tofuse.files.trajectory import read_tum
 from tofuse.parts import name_of
 from tofuse.pipeline import run as run_module
 from tofuse.pipeline.config import from_method
+from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.recordings.convert import convert
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import STAGING
-from tofuse.results.verdict import REASONS
+from tofuse.results.types import Component, Reason, Reconstruction
+from tofuse.results.verdict import ADVICE, REASONS
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate
+from tofuse.viewer.result import read_result
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "view.npz", "run.json"}
@@ -125,6 +129,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "filters",
         "findings",
         "warnings",
+        "components",
     }
     assert data["schema"] == 1
     assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}
@@ -132,7 +137,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
     assert data["verdict"] in ("good", "degraded", "failed")
     assert all(isinstance(s, float) and s >= 0 for s in data["seconds"].values())
     for reason in data["reasons"]:
-        assert set(reason) == {"code", "frames", "text"}
+        assert set(reason) == {"code", "frames", "ranges", "text"}
         assert reason["code"] in REASONS
         assert len(reason["frames"]) == 2
     assert [f["index"] for f in data["frames"]] == list(range(8))
@@ -147,6 +152,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
             "rms_m",
             "covariance",
             "unobservable",
+            "component",
         }
         assert frame["status"] == "tracked"
         assert 0 < frame["valid_share"] <= 1
@@ -304,7 +310,7 @@ def test_the_report_tells_of_a_bad_frame(recording, tmp_path) -> None:
     (recording / "depth/000002.png").write_bytes(b"")
     run(recording, "--out", tmp_path / "out", "--end", 4)
     report = (tmp_path / "out/report.html").read_text()
-    assert "Frame 2 has not been read." in report
+    assert "Frame 2 could not be read." in report
 
 
 def test_a_blank_frame_in_the_middle_is_lost(recording, tmp_path, capsys) -> None:
@@ -427,8 +433,69 @@ def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
     assert done.err.count("\n") == 1
     assert done.err.startswith("note: ")
     assert "colour_of_case" in done.err
-    assert len(done.out.splitlines()) <= 3 + len(run_json(tmp_path / "out")["reasons"])
+    # Each reason, and what can be done about it.
+    assert len(done.out.splitlines()) <= 3 + 2 * len(run_json(tmp_path / "out")["reasons"])
     assert "\x1b" not in done.out
+
+
+def torn_apart(recording, config, **_options) -> Reconstruction:
+    """Reconstruct the two halves of a recording, and let nothing connect them."""
+    n = len(recording)
+    main_part = reconstruct(recording.select(0, n // 2), config)
+    other = reconstruct(recording.select(n // 2), config)
+    indices = recording.indices.tolist()
+    components = (
+        Component(((indices[0], indices[n // 2 - 1]),), np.eye(4), None),
+        Component(((indices[n // 2], indices[-1]),), None, None, other),
+    )
+    d = main_part.diagnostics
+    reason = Reason("disconnected", components[1].frames, "The recording falls into 2 parts.")
+    frames = (
+        *(replace(f, component=0) for f in d.frames),
+        *(replace(f, component=1) for f in other.diagnostics.frames),
+    )
+    missing = np.full((n - n // 2, 4, 4), np.nan)
+    return replace(
+        main_part,
+        trajectory=np.concatenate([main_part.trajectory, missing]),
+        timestamps=recording.timestamps,
+        diagnostics=replace(
+            d,
+            frames=frames,
+            sequential=np.concatenate([d.sequential, missing]),
+            reasons=(*d.reasons, reason),
+            verdict="degraded",
+        ),
+        components=components,
+    )
+
+
+@pytest.mark.usefixtures("full_report")
+def test_a_part_that_nothing_connects_has_its_own_result(
+    room_recording, tmp_path, monkeypatch, capfd
+) -> None:
+    monkeypatch.setattr(run_module, "reconstruct", torn_apart)
+    out = tmp_path / "out"
+    run(room_recording, "--out", out, status=3)
+    said = capfd.readouterr().out.splitlines()
+    assert "  degraded: The recording falls into 2 parts." in said
+    at = said.index("  degraded: The recording falls into 2 parts.")
+    assert said[at + 1].strip() == ADVICE["disconnected"]
+    assert said[-1] == f"and {out / 'component-1/report.html'}, for frames 4-7"
+    assert {p.name for p in out.iterdir()} == FILES | {"component-1"}
+    assert {p.name for p in (out / "component-1").iterdir()} == FILES
+    for folder, frames in ((out, range(4)), (out / "component-1", range(4, 8))):
+        shown = read_result(folder)
+        assert list(shown.after) == list(frames)
+        np.testing.assert_allclose(shown.after[frames[0]], np.eye(4), atol=1e-12)
+    assert [f["component"] for f in run_json(out)["frames"]] == [0] * 4 + [1] * 4
+    assert [f["index"] for f in run_json(out / "component-1")["frames"]] == list(range(4, 8))
+    report = (out / "component-1/report.html").read_text()
+    assert ", component 1 –" in report
+    assert "component-1/report.html" in (out / "report.html").read_text()
+    run(room_recording, "--out", out, "--overwrite", "--json", status=3)
+    last = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert last["reasons"] == run_json(out)["reasons"]
 
 
 def test_an_earlier_result_needs_overwrite(room_recording, tmp_path, capfd) -> None:

@@ -26,6 +26,7 @@ from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, methods
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.results.output import run_json
+from tofuse.results.types import Component
 from tofuse.results.verdict import REASONS
 from tofuse.sensor.models import CAMERAS
 
@@ -225,14 +226,18 @@ def test_every_field_of_run_json_is_documented(room_recording: Path) -> None:
     result = tofuse.reconstruct(tofuse.open(room_recording))
     data = run_json(result)
     section = sections("docs/commands.md")["run.json"]
-    top, frames, loops = re.split(r"^Fields of a \w+:$", section, flags=re.MULTILINE)
+    top, frames, components, loops = re.split(
+        r"^Fields of a \w+(?:, .*)?:$", section, flags=re.MULTILINE
+    )
     assert {c for row in rows(top) for c in codes(row[0])} == set(data)
     assert {row[0].strip("`") for row in rows(frames)} == set(data["frames"][0])
+    fields = {f.name for f in dataclasses.fields(Component)} - {"result"}
+    assert {row[0].strip("`") for row in rows(components)} == fields
     record = {f.name for f in dataclasses.fields(LoopRecord)}
     assert {c for row in rows(loops) for c in codes(row[0])} == record
     meaning = {c: row[1] for row in rows(top) for c in codes(row[0])}
     assert set(data["input"]) <= codes(meaning["input"])
-    assert {"code", "frames", "text"} <= codes(meaning["reasons"])
+    assert {"code", "frames", "ranges", "text"} <= codes(meaning["reasons"])
     assert all(set(entry) <= codes(meaning["filters"]) for entry in data["filters"].values())
 
 

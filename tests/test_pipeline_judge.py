@@ -18,8 +18,8 @@ from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Gap, Suspicion
 from tofuse.posegraph.trust import pose_covariances
 from tofuse.registration.base import Registration
-from tofuse.results.types import FrameRecord, Reason
-from tofuse.results.verdict import REASONS, verdict_of
+from tofuse.results.types import Component, FrameRecord, Reason
+from tofuse.results.verdict import ADVICE, REASONS, ranked, verdict_of
 
 STEP = se3.exp(np.array([0.05, 0, 0, 0, 0.02, 0]))
 
@@ -120,6 +120,55 @@ def few_loose() -> Evidence:
     return replace(e, covariances=covariances)
 
 
+def apart(*ranges) -> Component:
+    return Component(ranges, None, None)
+
+
+def in_components(*others, frames=9, lost=()) -> Evidence:
+    """Frames of a walk, some in other components than the main one; posed are the connected."""
+    number = {
+        k: c
+        for c, other in enumerate(others, 1)
+        for first, last in other.frames
+        for k in range(first, last + 1)
+    }
+    main = [k for k in range(frames) if k not in number and k not in lost]
+    runs = np.split(main, np.flatnonzero(np.diff(main) > 1) + 1)
+    first = Component(tuple((int(r[0]), int(r[-1])) for r in runs), np.eye(4), None)
+    e = evidence(
+        ("tracked",) * frames,
+        gaps=((0, main[-1], [0.0] * 6),) if main[-1] else (),
+        images=Sightings((), ()),
+        components=(first, *others),
+    )
+    records = tuple(
+        replace(r, status="lost")
+        if r.index in lost
+        else replace(r, component=number.get(r.index, 0))
+        for r in e.records
+    )
+    kept = [
+        k for k in range(frames) if k not in lost and (k in main or others[number[k] - 1].connected)
+    ]
+    graph = build_graph(
+        kept,
+        e.sequential[kept],
+        [Measured(a, b, STEP, np.eye(6)) for a, b in pairwise(kept) if b == a + 1],
+        [
+            Measured(
+                kept[0],
+                kept[-1],
+                se3.inverse(e.sequential[kept[0]]) @ e.sequential[kept[-1]],
+                np.eye(6),
+            )
+        ]
+        if len(kept) > 1
+        else [],
+    )
+    optimisation = replace(e.optimisation, graph=graph)
+    return replace(e, records=records, sequential=e.sequential[kept], optimisation=optimisation)
+
+
 CASES = {
     "few_poses": evidence(("tracked",) + ("lost",) * 7 + ("tracked",)),
     "images_disagree": evidence(images=seen(0.2, near_share=0.9)),
@@ -146,6 +195,10 @@ CASES = {
         evidence(), outside=(OutsideRecord("odometry", 8, 0, None, "it was not used"),)
     ),
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
+    "disconnected": in_components(apart((7, 8))),
+    "bridged_gap": in_components(Component(((5, 8),), np.eye(4), "motion")),
+    "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
+    "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
 
 
@@ -185,17 +238,19 @@ def test_each_reason_comes_from_its_own_evidence(code) -> None:
 def test_frames_of_reasons() -> None:
     (lost,) = judge(CASES["lost_frames"])[1]
     assert lost.frames == (4, 5)
-    assert lost.text == "Frames 4 to 5 have no pose."
+    assert lost.text == "Frames 4-5 have no pose."
     (weak,) = judge(CASES["weak_registration"])[1]
     assert weak.frames == (4, 4)
     (skipped,) = judge(CASES["unreadable_frames"])[1]
-    assert skipped.text == "Frame 4 has not been read."
+    assert skipped.text == "Frame 4 could not be read."
 
 
-def test_each_stretch_of_lost_frames_is_told() -> None:
+def test_all_stretches_of_lost_frames_are_one_reason() -> None:
     e = evidence(("tracked", "lost", "tracked", "lost", "lost", "tracked", "tracked"))
-    assert [r.frames for r in judge(e)[1] if r.code == "lost_frames"] == [(1, 1), (3, 4)]
-    assert stretches(e.records, "skipped") == []
+    (lost,) = [r for r in judge(e)[1] if r.code == "lost_frames"]
+    assert (lost.ranges, lost.frames) == (((1, 1), (3, 4)), (1, 4))
+    assert lost.text == "Frames 1, 3-4 have no pose."
+    assert stretches(e.records, "skipped") == ()
 
 
 def test_a_loop_within_what_drift_allows_is_no_gap() -> None:
@@ -229,10 +284,12 @@ def test_typical_depths_that_tell_of_a_wrong_unit(depths, ambiguity_m, words) ->
     assert all(r.text.endswith("check the depth unit.") for r in reasons)
 
 
-def test_each_stretch_of_repeated_images_is_told() -> None:
-    reasons = judge(evidence(repeated=(2, 5, 6)))[1]
-    assert [r.frames for r in reasons] == [(2, 2), (5, 6)]
-    assert "Frames 5 to 6 are the same image" in reasons[1].text
+def test_repeated_images_are_one_line() -> None:
+    (reason,) = judge(evidence(repeated=(2, 5, 6)))[1]
+    assert reason.ranges == ((2, 2), (5, 6))
+    assert reason.text.startswith("3 images repeat the one before (frames 2, 5-6): ")
+    (reason,) = judge(evidence(repeated=(3,)))[1]
+    assert reason.text.startswith("1 image repeats the one before (frame 3): ")
 
 
 def test_a_camera_that_moves_a_little_did_not_stand_still() -> None:
@@ -248,7 +305,7 @@ def test_many_gaps_are_one_reason_that_tells_the_worst() -> None:
     (reason,) = judge(evidence(gaps=gaps))[1]
     assert reason.code == "loop_gap"
     assert reason.frames == (1, 7)
-    assert "0.300 m" in reason.text
+    assert "300 mm" in reason.text
     assert "4 of 5 loops" in reason.text
 
 
@@ -259,7 +316,8 @@ def test_a_loop_that_was_found_and_rejected_is_no_news() -> None:
 def test_images_without_inliers_disagree() -> None:
     verdict, reasons = judge(evidence(images=Sightings((0, 1), (pair(0, 1, 0.0),))))
     assert verdict == "failed"
-    assert reasons[0].text == ("Only 0% of what overlapping images say supports the poses.")
+    text = "Only 0 % of overlapping measurements are consistent with the poses."
+    assert reasons[0].text == text
 
 
 def test_images_that_do_not_overlap_say_nothing() -> None:
@@ -276,9 +334,9 @@ def test_views_that_the_others_contradict_are_named() -> None:
     said = tuple(
         pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i in range(9) for j in range(i + 1, 9)
     )
-    first, *others = judge(evidence(images=Sightings(tuple(range(0, 18, 2)), said)))[1]
-    assert (first.code, first.frames) == ("images_differ", (12, 12))
-    assert {r.code for r in others} <= {"images_differ"}
+    (reason,) = judge(evidence(images=Sightings(tuple(range(0, 18, 2)), said)))[1]
+    assert (reason.code, reason.ranges) == ("images_differ", ((12, 12),))
+    assert reason.text.startswith("Frame 12 is inconsistent with most overlapping frames.")
 
 
 def test_drift_counts_by_what_the_registrations_know() -> None:
@@ -289,8 +347,8 @@ def test_drift_counts_by_what_the_registrations_know() -> None:
     # The end is off by the square root of eight of them, and a loop halves that.
     (whole,) = judge(evidence(gaps=(), sigma=(0.008, 0.0001)))[1]
     assert whole.code == "uncertain_poses"
-    assert "off by 18 mm rms, " in whole.text
-    assert "held to 14 mm" in whole.text
+    assert "up to 18 mm rms (2σ)" in whole.text
+    assert 'the threshold for "good" is 14 mm' in whole.text
     assert codes(evidence(sigma=(0.008, 0.0001))) == []
 
 
@@ -306,11 +364,12 @@ def test_few_loose_frames_spoil_no_path() -> None:
 def test_turns_that_are_not_held_are_told() -> None:
     (reason,) = judge(evidence(gaps=(), sigma=(1e-5, np.radians(0.8))))[1]
     assert reason.code == "uncertain_poses"
-    assert "2.3 degrees" in reason.text
+    assert "2.3°" in reason.text
+    assert "No loop closure constrains them" in reason.text
     (reason,) = judge(evidence(gaps=(), sigma=(1e-5, 2.0)))[1]
     assert reason.code == "uncertain_poses"
-    assert "not held at all" in reason.text
-    assert "degrees" not in reason.text
+    assert "not constrained at all" in reason.text
+    assert "°" not in reason.text
 
 
 def test_a_part_that_nothing_joins_is_told() -> None:
@@ -326,7 +385,7 @@ def test_a_part_that_nothing_joins_is_told() -> None:
     )
     (reason,) = judge(e)[1]
     assert (reason.code, reason.frames) == ("uncertain_poses", (5, 8))
-    assert "not joined" in reason.text
+    assert "not connected" in reason.text
 
 
 def test_a_gap_within_the_known_errors_is_no_alarm() -> None:
@@ -344,13 +403,106 @@ def test_one_loop_among_many_raises_no_alarm() -> None:
 
 def test_the_gravest_reason_decides() -> None:
     def of(*names: str) -> str:
-        return verdict_of([Reason(name, (0, 1), "") for name in names])
+        return verdict_of([Reason(name, ((0, 1),), "") for name in names])
 
     assert of() == "good"
     assert of("unreadable_frames", "single_frame") == "good"
     assert of("unreadable_frames", "loop_gap") == "degraded"
     assert of("loop_gap", "few_poses", "single_frame") == "failed"
     assert {force for force, _ in REASONS.values()} == {"failed", "degraded", "note"}
+
+
+def test_reasons_are_merged_and_sorted() -> None:
+    reasons = ranked(
+        [
+            Reason("single_frame", ((0, 99),), "note."),
+            Reason("loop_gap", ((3, 5),), "small."),
+            Reason("jumped", ((9, 9), (11, 12)), "b."),
+            Reason("jumped", ((1, 8),), "a."),
+            Reason("jumped", ((1, 2),), "a."),
+            Reason("few_poses", ((4, 4),), "grave."),
+        ]
+    )
+    assert [r.code for r in reasons] == ["few_poses", "jumped", "loop_gap", "single_frame"]
+    assert reasons[1] == Reason("jumped", ((1, 9), (11, 12)), "b. a.")
+    assert reasons[1].frames == (1, 12)
+    assert set(ADVICE) <= set(REASONS)
+
+
+def test_disconnected_parts_are_named() -> None:
+    (reason,) = judge(CASES["disconnected"])[1]
+    assert reason.ranges == ((7, 8),)
+    text = "The recording falls into 2 disconnected parts: frames 0-6, 7-8; no overlap found."
+    assert reason.text == text
+    (bridged,) = judge(CASES["bridged_gap"])[1]
+    text = "Frames 5-8 are connected to the rest by extrapolated motion only."
+    assert (bridged.text, bridged.ranges) == (text, ((5, 8),))
+
+
+def test_parts_of_several_stretches_and_lost_frames() -> None:
+    linked = Component(((6, 8),), se3.exp(np.full(6, 0.1)), "links")
+    e = in_components(linked, apart((10, 11), (14, 15)), frames=20, lost=(5, 9))
+    verdict, (parts, lost) = judge(e)
+    assert verdict == "degraded"
+    assert (parts.code, parts.ranges) == ("disconnected", ((10, 11), (14, 15)))
+    # What is linked to the main part is one with it; lost frames are in none.
+    assert "frames 0-4, 6-8, 12-13, 16-19; frames 10-11, 14-15; no overlap" in parts.text
+    assert (lost.code, lost.ranges) == ("lost_frames", ((5, 5), (9, 9)))
+
+
+def test_of_many_parts_the_largest_are_named() -> None:
+    others = [apart((k, k + 1)) for k in range(10, 26, 2)]
+    reasons = judge(in_components(*others, frames=26))[1]
+    (reason,) = [r for r in reasons if r.code == "disconnected"]
+    assert "falls into 9 disconnected parts: frames 0-9, " in reason.text
+    assert "and 3 smaller; no overlap found." in reason.text
+
+
+def test_less_than_half_in_the_main_model_is_a_failure() -> None:
+    e = in_components(apart((4, 6)), apart((7, 8)), frames=9)
+    assert codes(e) == ["few_poses", "disconnected"]
+    assert judge(e)[1][0].text == "Only 4 of 9 readable frames are in the main model."
+    half = in_components(apart((5, 8)), frames=9)
+    assert codes(half) == ["disconnected"]
+
+
+def test_single_frames_that_nothing_connects_are_a_failure() -> None:
+    for n in (2, 5):
+        e = in_components(*(apart((k, k)) for k in range(1, n)), frames=n)
+        verdict, reasons = judge(e)
+        assert verdict == "failed"
+        assert [r.code for r in reasons] == ["few_poses", "disconnected"]
+    # One view alone is fine.
+    assert judge(evidence(("tracked",)))[0] == "good"
+
+
+def test_a_component_that_begins_elsewhere_is_no_jump() -> None:
+    there = Component(((5, 8),), np.eye(4), "links")
+    e = in_components(there)
+    moved = e.sequential.copy()
+    moved[5:] = se3.exp(np.array([3.0, 0, 0, 0, 1, 0])) @ moved[5:]
+    assert "jumped" not in codes(replace(e, sequential=moved))
+    same = replace(e, records=tuple(replace(r, component=0) for r in e.records))
+    assert "jumped" in codes(replace(same, sequential=moved))
+
+
+def test_moving_objects_and_doubtful_frames_are_told() -> None:
+    (moving,) = judge(CASES["moving_objects"])[1]
+    assert moving.ranges == ((3, 4),)
+    assert "up to 23 % of the image in frames 3-4; they are excluded" in moving.text
+    assert judge(CASES["moving_objects"])[0] == "good"
+    (doubtful,) = judge(CASES["doubtful_poses"])[1]
+    assert doubtful.ranges == ((2, 3), (6, 6))
+    assert doubtful.text.startswith("Frames 2-3, 6 fit worse than this camera's views")
+
+
+def test_loops_given_by_hand_are_listed_once() -> None:
+    pairs = [(0, k) for k in range(1, 9)]
+    (reason,) = judge(evidence(rejected=pairs, given=pairs))[1]
+    assert reason.text.startswith("8 loops given by hand were not used: 0-1 (only 3% ")
+    assert reason.text.endswith("and 2 more.")
+    (one,) = judge(CASES["loop_rejected"])[1]
+    assert one.ranges == ((1, 1), (7, 7))
 
 
 def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
@@ -362,7 +514,7 @@ def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
     assert verdict == "degraded"
     [alarm] = [r for r in reasons if r.code == "calibration_alarm"]
     assert alarm.frames == (2, 7)
-    for words in ("0.330 m", "11.5 degrees", "focal length 5.3% larger", "ranges 30 mm shorter"):
+    for words in ("330 mm", "11.5°", "focal length 5.3% larger", "ranges 30 mm shorter"):
         assert words in alarm.text
     # Without an alarm nothing is said.
     calm = replace(case, refinement=replace(refinement, suspicion=replace(found, alarm=False)))

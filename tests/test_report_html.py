@@ -26,7 +26,7 @@ from tofuse.report.html import write_report
 from tofuse.report.pictures import draw
 from tofuse.report.scene import MAX_FACES, make_scene, packed
 from tofuse.results.samples import FrameSample
-from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 # A room of 6.0 x 2.5 x 3.2 m around the first camera, and two blocks in it.
 ROOM = np.array([[-3.4, -1.4, -1.5], [2.6, 1.1, 1.7]])
@@ -109,8 +109,8 @@ def make_room(frames=24, width=64, height=48):
     diagnostics = Diagnostics(
         "degraded",
         (
-            Reason("lost_frames", (9, 10), "2 readable frames have no pose"),
-            Reason("unreadable_frames", (15, 15), "1 frame could not be read and was skipped"),
+            Reason("lost_frames", ((9, 10),), "2 readable frames have no pose"),
+            Reason("unreadable_frames", ((15, 15),), "1 frame could not be read and was skipped"),
         ),
         tuple(records),
         loops,
@@ -170,7 +170,7 @@ def lonely(**changes):
     )
     diagnostics = Diagnostics(
         "good",
-        (Reason("single_frame", (0, 0), ""),),
+        (Reason("single_frame", ((0, 0),), ""),),
         (FrameRecord(0, 0.0, "tracked"),),
         (),
         np.eye(4)[None],
@@ -277,7 +277,7 @@ def test_sections_come_in_order_and_the_verdict_first(shown):
     assert list(shown.sections) == [name for name in ORDER if name != "recording"]
     text = " ".join(shown.sections["verdict"].split())
     assert (
-        "Degraded: use this model with care. 2 readable frames have no pose (frames 9–10)." in text
+        "Degraded: use this model with care. 2 readable frames have no pose (frames 9-10)." in text
     )
     for name, number in (("tracked", 20), ("predicted", 1), ("lost", 2), ("skipped", 1)):
         assert f"frames {name}{number}" in text
@@ -381,12 +381,60 @@ def test_a_camera_that_hardly_moves_is_drawn_in_millimetres():
 
 
 def test_reasons_of_one_kind_are_said_together(tmp_path):
-    reasons = tuple(Reason("loop_gap", (k, 90), f"Loop {k} to 90 gaped.") for k in range(7))
+    reasons = tuple(Reason("loop_gap", ((k, 90),), f"Loop {k}-90 drifted.") for k in range(7))
+    reasons = (Reason("single_frame", ((0, 0),), "Only one."), *reasons)
     text = page(tmp_path, lonely(verdict="degraded", reasons=reasons), ReportExtras("x"))
     said = " ".join(text.sections["verdict"].split())
-    assert said.count("the path bends to fit") == 2  # in the verdict and above the seven
-    assert "4 more like these" in said
+    assert said.count("Distances across the loop may be stretched") == 1
     assert all(r.text in said for r in reasons)
+    # The gravest comes first, wherever it stands.
+    assert said.index("Only one.") > said.rindex("drifted.")
+
+
+def test_reasons_name_their_frames(tmp_path):
+    frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(90))
+    reason = Reason("images_differ", ((3, 4), (20, 34), (50, 50)), "Surfaces do not agree.")
+    result = lonely(verdict="degraded", reasons=(reason,), frames=frames)
+    said = " ".join(page(tmp_path, result, ReportExtras("x")).sections["verdict"].split())
+    assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in said
+
+
+def in_parts(number=20):
+    """Frames 0 to 9 in the main component, 10 and 11 linked to it, the rest apart."""
+    result = many(number)
+    poses = np.tile(np.eye(4), (number, 1, 1))
+    poses[:, 0, 3] = 0.01 * np.arange(number)
+    poses[12:] = np.nan
+    component = [0] * 10 + [1] * 2 + [2] * (number - 14) + [3] * 2
+    frames = tuple(FrameRecord(k, k / 10, "tracked", component=c) for k, c in enumerate(component))
+    components = (
+        Component(((0, 9),), np.eye(4), None),
+        Component(((10, 11),), np.eye(4), "links"),
+        Component(((12, number - 3),), None, None, lonely()),
+        Component(((number - 2, number - 1),), None, None),
+    )
+    diagnostics = replace(result.diagnostics, frames=frames, sequential=poses, loops=())
+    return replace(result, trajectory=poses, diagnostics=diagnostics, components=components)
+
+
+def test_components_are_listed_with_their_own_models(tmp_path):
+    got = page(tmp_path, in_parts(), ReportExtras("x"))
+    assert got.row("0 (main)")[1:] == ["0–9", "this one", "–", "10"]
+    assert got.row("1")[1:] == ["10–11", "this one", "links between views", "2"]
+    assert got.row("2")[1:] == ["12–17", "component-2", "not connected", "6"]
+    assert got.row("3")[1:] == ["18–19", "none: too few frames", "not connected", "2"]
+    assert "2 of them could not be connected" in " ".join(got.sections["components"].split())
+    assert got.links.count("component-2/report.html") == 1
+    assert "#components" in got.links
+    assert any(t.endswith("component 2 (not connected to the main one)") for t in got.titles)
+    assert any(t.endswith("component 1") for t in got.titles)
+    assert "not all of them could be connected" in got.sections["frames"]
+    one = replace(in_parts(), components=in_parts().components[:1])
+    records = tuple(replace(r, component=0) for r in one.diagnostics.frames)
+    one = replace(one, diagnostics=replace(one.diagnostics, frames=records))
+    plain = page(tmp_path, one, ReportExtras("x"))
+    assert "components" not in plain.sections
+    assert not any("component" in t for t in plain.titles)
 
 
 def test_filters_show_the_share_of_the_recording_and_of_the_frame(shown):
@@ -488,7 +536,7 @@ def test_what_comes_from_outside_is_escaped(tmp_path):
         recording={"path": bad, "format": bad, "frames": 1, "warnings": [bad]},
         diagnostics=replace(
             d,
-            reasons=(Reason("lost_frames", (1, 2), bad),),
+            reasons=(Reason("lost_frames", ((1, 2),), bad),),
             frames=(*d.frames[:-1], replace(d.frames[-1], status="lost", reason=bad)),
             loops=(replace(d.loops[0], reason=bad),),
             removed={bad: 0.5},
@@ -572,7 +620,7 @@ POOR = {
             cloud=empty_cloud(),
             frames=(FrameRecord(0, 0.0, "lost", "why"), FrameRecord(1, 1.0, "lost", "why")),
             sequential=np.full((2, 4, 4), np.nan),
-            reasons=(Reason("few_poses", (0, 1), "no frame has a pose"),),
+            reasons=(Reason("few_poses", ((0, 1),), "no frame has a pose"),),
             verdict="failed",
         ),
         ReportExtras("x", reference=np.tile(np.eye(4), (2, 1, 1))),

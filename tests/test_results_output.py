@@ -13,17 +13,20 @@ import pytest
 
 from tofuse.errors import InputError, OutputError
 from tofuse.fusion.cloud import empty_cloud
+from tofuse.pipeline.run import exit_status
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.results.output import (
     STAGING,
     OutputFolder,
+    component_number,
+    frames_in_main_model,
     is_result,
     plain,
     read_run_json,
     run_json,
     write_result,
 )
-from tofuse.results.types import Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
 
@@ -44,7 +47,7 @@ def result(seed=0) -> Reconstruction:
     )
     diagnostics = Diagnostics(
         "degraded",
-        (Reason("lost_frames", (1, 1), "Frame 1 has no pose."),),
+        (Reason("lost_frames", ((1, 1),), "Frame 1 has no pose."),),
         frames,
         (),
         trajectory,
@@ -66,8 +69,38 @@ def result(seed=0) -> Reconstruction:
     )
 
 
+def torn(seed=0, parts=2) -> Reconstruction:
+    """Four frames: one in the main model, one linked to it, one apart and one lost.
+
+    Of the components apart the first has a model of its own, if there are `parts` that do.
+    """
+    whole = result(seed)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[2:] = np.nan
+    frames = tuple(
+        FrameRecord(k, 0.1 * k, status, component=c)
+        for k, (status, c) in enumerate(
+            (("tracked", 0), ("tracked", 1), ("tracked", 2), ("lost", None))
+        )
+    )
+    T = np.eye(4)
+    T[0, 3] = 0.5
+    components = (
+        Component(((0, 0),), np.eye(4), None),
+        Component(((1, 1),), T, "links"),
+        Component(((2, 2),), None, None, result(seed) if parts > 1 else None),
+    )
+    return replace(
+        whole,
+        trajectory=poses,
+        timestamps=0.1 * np.arange(4),
+        diagnostics=replace(whole.diagnostics, frames=frames, sequential=poses),
+        components=components,
+    )
+
+
 def contents(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_a_new_folder_and_its_parents_are_made(tmp_path) -> None:
@@ -220,6 +253,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "verdict",
         "reasons",
         "frames",
+        "components",
         "loops",
         "optimiser",
         "outside",
@@ -229,8 +263,15 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
     assert data["schema"] == 1
     assert data["input"] == {"path": "/somewhere", "format": "native", "frames": 2}
     assert data["reasons"] == [
-        {"code": "lost_frames", "frames": [1, 1], "text": "Frame 1 has no pose."}
+        {
+            "code": "lost_frames",
+            "frames": [1, 1],
+            "ranges": [[1, 1]],
+            "text": "Frame 1 has no pose.",
+        }
     ]
+    assert data["components"] == []
+    assert [frame["component"] for frame in data["frames"]] == [None, None]
     assert data["frames"][0]["covariance"] == np.eye(6).ravel().tolist()
     assert data["frames"][0]["unobservable"] == [[1.0] * 6] * 2
     assert data["frames"][0]["rms_m"] == 0.25
@@ -238,6 +279,161 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
     assert (lost["inlier_share"], lost["rms_m"], lost["covariance"]) == (None, None, None)
     assert lost["unobservable"] == []
     assert data["filters"] == {"median": {"removed": 0.25}}
+
+
+BOTH = FILES | {f"component-2/{name}" for name in FILES}
+
+
+def test_components_are_in_run_json(tmp_path) -> None:
+    write_result(torn(), OutputFolder(tmp_path))
+    data = read_run_json(tmp_path / "run.json")
+    assert [c["frames"] for c in data["components"]] == [[[0, 0]], [[1, 1]], [[2, 2]]]
+    assert [c["joined"] for c in data["components"]] == [None, "links", None]
+    assert data["components"][0]["T_main_component"] == np.eye(4).tolist()
+    assert data["components"][1]["T_main_component"][0] == [1, 0, 0, 0.5]
+    assert data["components"][2]["T_main_component"] is None
+    assert all(set(c) == {"frames", "T_main_component", "joined"} for c in data["components"])
+    assert [frame["component"] for frame in data["frames"]] == [0, 1, 2, None]
+    assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1]
+    # What version 0.1 wrote knows no components.
+    del data["components"]
+    for frame in data["frames"]:
+        del frame["component"]
+    assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1, 2]
+
+
+def test_exit_status_counts_frames_outside_the_main_model() -> None:
+    r = torn()
+    d = r.diagnostics
+    assert exit_status(r) == 3
+    for kept, status in ((d.frames[:2], 0), (d.frames[:3], 3), ((d.frames[0], d.frames[3]), 3)):
+        assert exit_status(replace(r, diagnostics=replace(d, frames=kept))) == status
+    skipped = (*d.frames[:2], FrameRecord(4, 0.4, "skipped"))
+    assert exit_status(replace(r, diagnostics=replace(d, frames=skipped))) == 0
+
+
+def test_a_component_with_a_model_of_its_own_has_a_folder(tmp_path) -> None:
+    seen = []
+
+    def report(r, folder) -> None:
+        seen.append((len(r.trajectory), component_number(folder)))
+        (folder / "report.html").write_text("x")
+
+    write_result(torn(), OutputFolder(tmp_path), report)
+    assert seen == [(2, 2), (4, None)]
+    made = BOTH | {"report.html", "component-2/report.html"}
+    assert set(contents(tmp_path)) == made
+    assert is_result(tmp_path / "component-2")
+    assert (tmp_path / "component-2/run.json").read_text().count("component-2") == 0
+    # Only what is apart and has a model.
+    write_result(torn(parts=1), OutputFolder(tmp_path, overwrite=True))
+    assert set(contents(tmp_path)) == FILES
+    assert {p.name for p in tmp_path.iterdir()} == FILES
+
+
+def test_folders_of_an_earlier_result_are_replaced(tmp_path) -> None:
+    write_result(torn(seed=1), OutputFolder(tmp_path))
+    (tmp_path / "component-7").mkdir()
+    (tmp_path / "component-7/cloud.pcd").write_text("exported")
+    (tmp_path / "component-x").mkdir()
+    (tmp_path / "notes.txt").write_text("mine")
+    write_result(torn(seed=2), OutputFolder(tmp_path, overwrite=True))
+    assert set(contents(tmp_path)) == BOTH | {"notes.txt"}
+    assert (tmp_path / "component-x").is_dir()
+    assert read_run_json(tmp_path / "component-2/run.json")["seed"] == 2
+
+
+@pytest.mark.parametrize("how", ["note", "folder", "link inside", "link", "file", "dangling"])
+@pytest.mark.parametrize("when", ["before", "meanwhile"])
+def test_a_folder_with_something_of_somebody_else_stays(tmp_path, how, when) -> None:
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "cloud.ply").write_text("precious")
+    write_result(torn(), OutputFolder(out))
+    folder = OutputFolder(out, overwrite=True)
+    own = out / "component-2"
+    if how == "note":
+        (own / "note.txt").write_text("mine")
+    elif how == "folder":
+        (own / "mesh.glb").mkdir()
+    elif how == "link inside":
+        (own / "mesh.ply").symlink_to(elsewhere / "cloud.ply")
+    else:
+        for path in own.iterdir():
+            path.unlink()
+        own.rmdir()
+        if how == "file":
+            own.write_text("mine")
+        else:
+            own.symlink_to(elsewhere if how == "link" else tmp_path / "nowhere")
+    before = contents(tmp_path)
+    if when == "before":
+        folder.discard()
+    with pytest.raises(OutputError, match=r"component-2: holds something other than"):
+        write_result(
+            torn(seed=1), OutputFolder(out, overwrite=True) if when == "before" else folder
+        )
+    assert contents(tmp_path) == before
+    assert own.is_symlink() == (how in ("link", "dangling"))
+
+
+def test_a_link_in_place_of_a_file_is_put_back(tmp_path, monkeypatch) -> None:
+    out = tmp_path / "out"
+    write_result(result(), OutputFolder(out))
+    (out / "cloud.ply").rename(tmp_path / "cloud.ply")
+    (out / "cloud.ply").symlink_to("../cloud.ply")  # leads nowhere from another folder
+    folder, move = OutputFolder(out, overwrite=True), os.replace
+
+    def fails(source, target) -> None:
+        if Path(target) == out / "cloud.ply" and not Path(source).is_symlink():
+            raise OSError(errno.EIO, "gone")
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(OutputError):
+        write_result(result(seed=1), folder)
+    assert (out / "cloud.ply").is_symlink()
+    assert (out / "cloud.ply").read_bytes() == (tmp_path / "cloud.ply").read_bytes()
+
+
+def test_an_error_in_a_component_names_its_file(tmp_path, monkeypatch) -> None:
+    def report(_result, folder) -> None:
+        raise OutputError("can't be written", where=folder / "report.html")
+
+    with pytest.raises(OutputError) as caught:
+        write_result(torn(), OutputFolder(tmp_path / "out"), report)
+    assert caught.value.where == str(tmp_path / "out/component-2/report.html")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("moved", range(10))
+@pytest.mark.parametrize("undone", [True, False])
+def test_folders_are_moved_as_safely_as_files(tmp_path, monkeypatch, moved, undone) -> None:
+    write_result(torn(seed=1), OutputFolder(tmp_path))
+    before = contents(tmp_path)
+    folder = OutputFolder(tmp_path, overwrite=True)
+    moves, move = [], os.replace
+
+    def fails(source, target) -> None:
+        if tmp_path in (Path(target).parent, Path(source).parent):
+            moves.append(target)
+        if len(moves) == moved + 1 if undone else len(moves) > moved:
+            if undone:
+                moves.append(None)
+            raise OSError(errno.EIO, "gone")
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(OutputError):
+        write_result(torn(seed=2), folder)
+    monkeypatch.undo()
+    if undone:
+        assert contents(tmp_path) == before
+        return
+    OutputFolder(tmp_path, overwrite=True).discard()
+    assert set(contents(tmp_path)) == BOTH
+    for name in ("run.json", "component-2/run.json"):
+        assert read_run_json(tmp_path / name)["seed"] == 2
 
 
 def test_only_frames_with_a_pose_have_a_line(tmp_path) -> None:

@@ -26,7 +26,7 @@ from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.pipeline.demo import simulate_to
 from tofuse.pipeline.run import Options, run
-from tofuse.results.output import read_run_json
+from tofuse.results.output import frames_in_main_model, read_run_json
 
 ROOT = Path(__file__).resolve().parents[1]
 Float64 = NDArray[np.float64]
@@ -126,7 +126,7 @@ def draw(result: Path, truth: Path) -> bytes:
 def lines(exhibit: Exhibit, result: Path, truth: Path) -> Iterator[str]:
     """Markdown of one exhibit."""
     told = read_run_json(result / "run.json")
-    posed = sum(frame["status"] in ("tracked", "predicted") for frame in told["frames"])
+    posed = len(frames_in_main_model(told))
     error = evaluate_trajectory(*read_tum(result / "trajectory.txt"), *read_tum(truth))
     yield f"### {exhibit.title}\n"
     yield f"![{exhibit.title}, seen from above]({exhibit.name}.png)\n"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tofuse.pipeline.run import Options
 
 _SEVERITIES = {"severe": "red", "warning": "yellow", "note": "cyan"}
-_COLORS = {"good": "green", "degraded": "yellow", "failed": "red"}
+_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
 class _Output(Console):
@@ -148,6 +148,10 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Say in a few lines what came out."""
+    from tofuse.results.output import component_name, reasons_json
+    from tofuse.results.ranges import in_words
+    from tofuse.results.verdict import ADVICE, REASONS, ranked
+
     d = result.diagnostics
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
     skipped = sum(f.status == "skipped" for f in d.frames)
@@ -157,7 +161,7 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
                 "event": "result",
                 "out": str(out),
                 "verdict": d.verdict,
-                "reasons": [{"code": r.code, "text": r.text} for r in d.reasons],
+                "reasons": reasons_json(d.reasons),
                 "frames": {**counts, "skipped": skipped},
                 "loops": sum(p.accepted for p in d.loops),
                 "points": len(result.cloud),
@@ -167,8 +171,11 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
         return
     console = _Output(highlight=False, soft_wrap=True)
     console.print(f"[bold {_COLORS[d.verdict]}]{d.verdict}[/]")
-    for reason in d.reasons:
-        console.print(f"  {reason.text}", markup=False)
+    for reason in ranked(d.reasons):
+        level = REASONS[reason.code][0]
+        console.print(f"  [{_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
+        if reason.code in ADVICE:
+            console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []
@@ -177,6 +184,10 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     parts.append(f"{len(result.cloud):,} points")
     console.print(", ".join(parts), markup=False)
     console.print(f"see {out / 'report.html'}", markup=False)
+    for number, component in enumerate(result.components):
+        if component.result is not None and not component.connected:
+            path = out / component_name(number) / "report.html"
+            console.print(f"and {path}, for {in_words(component.frames)}", markup=False)
 
 
 def simulate(arguments: argparse.Namespace) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,11 +15,12 @@ from tofuse.odometry.motion import Moment, jumps
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import in_words
+from tofuse.posegraph.suspicion import in_words as camera_in_words
 from tofuse.posegraph.trust import expected_error, loop_errors
 from tofuse.registration.base import Registration
-from tofuse.results.types import FrameRecord, Reason, Verdict
-from tofuse.results.verdict import verdict_of
+from tofuse.results.ranges import Range, in_words, is_one, runs, size, union
+from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
+from tofuse.results.verdict import ranked, verdict_of
 
 Float64 = NDArray[np.float64]
 
@@ -48,6 +49,8 @@ PATH_POSES = 60
 MISSED = 22.46
 # Where errors aren't known, a loop may move the end by this share of the path, and these floors.
 GAP_SHARE, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
+# Disconnected parts that are named, the largest ones; and loops.
+LISTED = 6
 # Of what overlapping images say of the poses, this share has to support them, or they are wrong;
 # below that share of what neighbours reach, or above that much more rms, they differ.
 CONTRADICTED_SHARE, AGREEMENT_RATIO, RMS_RATIO = 0.5, 0.9, 1.5
@@ -61,10 +64,11 @@ class Evidence:
     ----------
     records, registrations
         Of every frame, in order; a registration is None for the first and for lost frames.
+        Registrations of frames outside the main model do not count.
     loops
         Every loop that was considered.
     sequential
-        (N, 4, 4) poses before optimisation, of the frames with a pose.
+        (N, 4, 4) poses before optimisation, of the frames in the main model.
     optimisation
         The graph after it.
     sightings
@@ -86,6 +90,12 @@ class Evidence:
         Positions among the records at which another recording begins.
     outside
         What became of sensors beside the camera.
+    components
+        As in `Reconstruction`; empty where nothing looked for them.
+    moving
+        (frame index, fraction of the image) where moving objects were found.
+    doubtful
+        Indices of the frames that fit worse than this camera's views usually do.
     """
 
     records: tuple[FrameRecord, ...]
@@ -102,73 +112,153 @@ class Evidence:
     repeated: tuple[int, ...] = ()
     interruptions: tuple[int, ...] = ()
     outside: tuple[OutsideRecord, ...] = ()
+    components: tuple[Component, ...] = ()
+    moving: tuple[tuple[int, float], ...] = ()
+    doubtful: tuple[int, ...] = ()
+
+    @property
+    def everything(self) -> tuple[Range, ...]:
+        """The whole recording."""
+        return ((self.records[0].index, self.records[-1].index),)
+
+    @property
+    def posed(self) -> tuple[Range, ...]:
+        """From the first to the last frame of the main model."""
+        ids = self.optimisation.graph.ids
+        return ((int(ids[0]), int(ids[-1])),)
+
+    @property
+    def in_main(self) -> list[bool]:
+        """For every record whether it is in the main model."""
+        return [in_main_model(record, self.components) for record in self.records]
+
+    def runs(self, marked: Sequence[bool]) -> tuple[Range, ...]:
+        """Ranges of the records that are marked."""
+        return runs([record.index for record in self.records], marked)
+
+    def runs_of(self, frames: Collection[int]) -> tuple[Range, ...]:
+        """Ranges of the records with these indices."""
+        return self.runs([record.index in frames for record in self.records])
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
-    """Return the verdict and the reasons for it, gravest first as they are listed."""
-    reasons = [
-        *_poses(evidence),
-        *_motion(evidence),
-        *_depths(evidence),
-        *_registrations(evidence),
-        *_loops(evidence),
-        *(_drift(evidence) if evidence.covariances is None else _uncertainty(evidence)),
-        *_optimiser(evidence),
-        *_outside(evidence),
-        *_images(evidence),
-    ]
-    return verdict_of(reasons), tuple(reasons)
+    """Return the verdict and the reasons for it, each code once, the gravest first."""
+    reasons = ranked(
+        [
+            *_poses(evidence),
+            *_connections(evidence),
+            *_motion(evidence),
+            *_depths(evidence),
+            *_registrations(evidence),
+            *_loops(evidence),
+            *(_drift(evidence) if evidence.covariances is None else _uncertainty(evidence)),
+            *_optimiser(evidence),
+            *_outside(evidence),
+            *_images(evidence),
+            *_scene(evidence),
+        ]
+    )
+    return verdict_of(reasons), reasons
 
 
 def _poses(e: Evidence) -> Iterator[Reason]:
     readable = [r for r in e.records if r.status != "skipped"]
-    lost = [r for r in readable if r.status == "lost"]
-    everything = (e.records[0].index, e.records[-1].index)
-    if 2 * len(lost) > len(readable):
-        text = f"{len(lost)} of {len(readable)} readable frames have no pose."
-        yield Reason("few_poses", everything, text)
-    for first, last in stretches(e.records, "lost"):
-        yield Reason("lost_frames", (first, last), f"{_frames(first, last)} no pose.")
-    for first, last in stretches(e.records, "skipped"):
-        text = f"{_frames(first, last)} not been read."
-        yield Reason("unreadable_frames", (first, last), text)
     posed = [r for r in readable if r.status != "lost"]
+    main = sum(e.in_main)
+    # Single frames that nothing connects are no model, however few there are.
+    scattered = main == 1 and len(posed) > 1
+    if 2 * main < len(readable) or scattered:
+        if main < len(posed):
+            text = f"Only {main} of {len(readable)} readable frames are in the main model."
+        else:
+            text = f"{len(readable) - main} of {len(readable)} readable frames have no pose."
+        yield Reason("few_poses", e.everything, text)
+    lost = stretches(e.records, "lost")
+    if lost:
+        text = f"{_sentence(lost)} {'has' if is_one(lost) else 'have'} no pose."
+        yield Reason("lost_frames", lost, text)
+    skipped = stretches(e.records, "skipped")
+    if skipped:
+        yield Reason("unreadable_frames", skipped, f"{_sentence(skipped)} could not be read.")
     if len(posed) == 1:
         frame = posed[0].index
-        text = f"Only frame {frame} has a pose, so there was nothing to register."
-        yield Reason("single_frame", (frame, frame), text)
+        text = f"Only frame {frame} has a pose: nothing to register, accuracy not assessed."
+        yield Reason("single_frame", ((frame, frame),), text)
+
+
+def _connections(e: Evidence) -> Iterator[Reason]:
+    """What is not connected to the main component, or by extrapolated motion only."""
+    apart = [c for c in e.components if not c.connected]
+    if apart:
+        joined = [r for c in e.components if c.connected for r in c.frames]
+        connected = e.runs([any(a <= r.index <= b for a, b in joined) for r in e.records])
+        parts = sorted([connected, *(c.frames for c in apart)])
+        yield Reason(
+            "disconnected",
+            union(r for c in apart for r in c.frames),
+            f"The recording falls into {len(parts)} disconnected parts: {_listed(parts)}; no "
+            "overlap found.",
+        )
+    bridged = union(r for c in e.components if c.joined == "motion" for r in c.frames)
+    if bridged:
+        text = (
+            f"{_sentence(bridged)} {'is' if is_one(bridged) else 'are'} connected to the rest by "
+            "extrapolated motion only."
+        )
+        yield Reason("bridged_gap", bridged, text)
+
+
+def _listed(parts: Sequence[tuple[Range, ...]]) -> str:
+    """Name the largest of several parts, in order."""
+    large = sorted(sorted(parts, key=size, reverse=True)[:LISTED])
+    if all(len(part) == 1 for part in large):
+        text = in_words([part[0] for part in large])
+    else:
+        text = "; ".join(in_words(part) for part in large)
+    more = len(parts) - len(large)
+    return f"{text} and {more} smaller" if more else text
 
 
 def _motion(e: Evidence) -> Iterator[Reason]:
     posed = iter(e.sequential)
-    has_pose = [r.status in ("tracked", "predicted") for r in e.records]
+    has_pose = e.in_main
     poses = [next(posed) if has else None for has in has_pose]
     moments = [Moment(r.index, r.timestamp) for r in e.records]
-    found = jumps(poses, e.interruptions, moments)
+    found = jumps(poses, {*e.interruptions, *_crossings(e.records, has_pose)}, moments)
+    frames = [e.records[k].index for k, _ in found]
     if len(found) > max(UNORDERED, UNORDERED_SHARE * sum(has_pose)):
-        first, last = (e.records[found[k][0]].index for k in (0, -1))
         text = (
-            f"{len(found)} of {sum(has_pose)} poses are not where the motion before leads to, as "
-            "if the views were in no order; so no motion tells whether they are right."
+            f"{len(found)} of {sum(has_pose)} poses are far from the predicted motion, as if the "
+            "views were in no order: motion does not tell whether they are right."
         )
-        yield Reason("jumped", (first, last), text)
-        found = []
-    for k, words in found:
-        frame = e.records[k].index
-        yield Reason("jumped", (frame, frame), f"Frame {frame} has a pose, but {words}.")
-    for first, last in _runs(
-        [r.index for r in e.records], [r.index in e.repeated for r in e.records]
-    ):
-        which = f"Frame {first} is" if first == last else f"Frames {first} to {last} are"
-        text = f"{which} the same image as the one before: nothing new was measured."
-        yield Reason("repeated_images", (first, last), text)
+        yield Reason("jumped", ((frames[0], frames[-1]),), text)
+    elif found:
+        jumped = e.runs_of(frames)
+        far = found[0][1].removeprefix("that is ")
+        text = (
+            f"The pose of {in_words(jumped)} jumps: {far}."
+            if is_one(jumped)
+            else f"The poses of {in_words(jumped)} jump; that of frame {frames[0]} is {far}."
+        )
+        yield Reason("jumped", jumped, text)
+    repeated = e.runs_of(e.repeated)
+    if repeated:
+        n = sum(record.index in e.repeated for record in e.records)
+        what = "1 image repeats" if n == 1 else f"{n} images repeat"
+        text = f"{what} the one before ({in_words(repeated)}): nothing new was measured."
+        yield Reason("repeated_images", repeated, text)
     T = e.optimisation.graph.poses
     moved = se3.inverse(T[:1]) @ T
     still = np.linalg.norm(moved[:, :3, 3], axis=1) < STILL_M
     if len(T) > 2 and (still & (se3.angle(moved) < STILL_RAD)).all():
-        ids = e.optimisation.graph.ids
         text = f"The camera never moved in {len(T)} frames: the model is what one view sees."
-        yield Reason("stood_still", (int(ids[0]), int(ids[-1])), text)
+        yield Reason("stood_still", e.posed, text)
+
+
+def _crossings(records: Sequence[FrameRecord], chosen: Sequence[bool]) -> list[int]:
+    """Positions at which the chosen records go on in another component."""
+    at = [k for k, has in enumerate(chosen) if has]
+    return [b for a, b in pairwise(at) if records[a].component != records[b].component]
 
 
 def _depths(e: Evidence) -> Iterator[Reason]:
@@ -184,74 +274,104 @@ def _depths(e: Evidence) -> Iterator[Reason]:
         text = f"{what}, nearer than most ToF cameras see"
     else:
         return
-    everything = (e.records[0].index, e.records[-1].index)
-    yield Reason("implausible_depth", everything, f"{text}: check the depth unit.")
+    yield Reason("implausible_depth", e.everything, f"{text}: check the depth unit.")
 
 
 def _registrations(e: Evidence) -> Iterator[Reason]:
     pairs = [
         (record.index, r)
-        for record, r in zip(e.records, e.registrations, strict=True)
-        if r is not None and record.status != "lost"
+        for record, r, main in zip(e.records, e.registrations, e.in_main, strict=True)
+        if r is not None and main
     ]
     if not pairs:
         return
-    weak = [index for index, r in pairs if r.share < WEAK_SHARE]
+    weak = e.runs_of({index for index, r in pairs if r.share < WEAK_SHARE})
     if weak:
         text = (
-            f"{len(weak)} frames have a partner for fewer than {WEAK_SHARE:.0%} of the points "
-            "that were compared."
+            f"Fewer than {_percent(WEAK_SHARE)} of the points of {in_words(weak)} have a "
+            "correspondence."
         )
-        yield Reason("weak_registration", (weak[0], weak[-1]), text)
+        yield Reason("weak_registration", weak, text)
     if e.covariances is not None:
-        return  # what was not held, or did not settle, is in them
-    unheld = [index for index, r in pairs if len(r.unobservable)]
-    if len(unheld) > UNHELD_SHARE * len(pairs):
+        return  # what was unobservable, or did not converge, is in them
+    free = {index for index, r in pairs if len(r.unobservable)}
+    if len(free) > UNHELD_SHARE * len(pairs):
         text = (
-            f"In {len(unheld)} of {len(pairs)} registrations the data does not hold the camera in "
-            "every direction; there the pose is a prediction, and drifts."
+            f"In {len(free)} of {len(pairs)} registrations the motion is unobservable in some "
+            "direction (degenerate geometry): the pose is predicted there, and drifts."
         )
-        yield Reason("unobserved_motion", (unheld[0], unheld[-1]), text)
-    unsettled = [index for index, r in pairs if not r.converged]
+        yield Reason("unobserved_motion", e.runs_of(free), text)
+    unsettled = {index for index, r in pairs if not r.converged}
     if len(unsettled) > UNSETTLED_SHARE * len(pairs):
-        text = f"{len(unsettled)} of {len(pairs)} registrations stopped before they settled."
-        yield Reason("not_converged", (unsettled[0], unsettled[-1]), text)
+        text = (
+            f"{len(unsettled)} of {len(pairs)} registrations ran out of iterations before they "
+            "converged."
+        )
+        yield Reason("not_converged", e.runs_of(unsettled), text)
 
 
 def _loops(e: Evidence) -> Iterator[Reason]:
-    for loop in e.loops:
-        if (loop.i, loop.j) in e.given and not loop.accepted:
-            text = f"The loop {loop.i} to {loop.j} given by hand was not used: {loop.reason}."
-            yield Reason("loop_rejected", (loop.i, loop.j), text)
+    rejected = [p for p in e.loops if (p.i, p.j) in e.given and not p.accepted]
+    if not rejected:
+        return
+    if len(rejected) == 1:
+        (p,) = rejected
+        text = f"Loop {p.i}-{p.j}, given by hand, was not used: {p.reason}."
+    else:
+        named = ", ".join(f"{p.i}-{p.j} ({p.reason})" for p in rejected[:LISTED])
+        more = len(rejected) - LISTED
+        named += f" and {more} more" if more > 0 else ""
+        text = f"{len(rejected)} loops given by hand were not used: {named}."
+    yield Reason("loop_rejected", union((k, k) for p in rejected for k in (p.i, p.j)), text)
 
 
 def _optimiser(e: Evidence) -> Iterator[Reason]:
     if not e.optimisation.converged:
-        text = "The optimiser ran out of iterations before it settled."
-        yield Reason("optimiser_gave_up", _all_posed(e), text)
+        text = "The optimiser ran out of iterations before it converged."
+        yield Reason("optimiser_gave_up", e.posed, text)
     tried = any(e.optimisation.objective) and not e.optimisation.improved
     if tried or any(part.before > 0 and not part.improved for part in e.optimisation.parts):
-        text = "The optimiser found nothing better than the poses that it was given."
-        yield Reason("not_improved", _all_posed(e), text)
+        text = "The optimiser did not improve on the initial poses."
+        yield Reason("not_improved", e.posed, text)
     r = e.refinement
     if r is not None and r.pairs and not r.kept:
-        text = "The refinement over all views made them agree worse, so it was not kept."
-        yield Reason("not_refined", _all_posed(e), text)
+        text = "Global refinement did not improve consistency and was discarded."
+        yield Reason("not_refined", e.posed, text)
 
 
 def _outside(e: Evidence) -> Iterator[Reason]:
     for sensor in e.outside:
         if 2 * sensor.used < sensor.measured:
             text = f"{sensor.text[0].upper()}{sensor.text[1:]}."
-            yield Reason("sensor_differs", _all_posed(e), text)
+            yield Reason("sensor_differs", e.posed, text)
+
+
+def _scene(e: Evidence) -> Iterator[Reason]:
+    """What moves in view, and which views fit badly."""
+    moving = {frame: fraction for frame, fraction in e.moving if fraction > 0}
+    where = e.runs_of(moving)
+    if where:
+        text = (
+            f"Moving objects cover up to {_percent(max(moving.values()))} of the image in "
+            f"{in_words(where)}; they are excluded from tracking and from the model."
+        )
+        yield Reason("moving_objects", where, text)
+    doubtful = e.runs_of(e.doubtful)
+    if doubtful:
+        rest = (
+            "fits worse than this camera's views usually do; its pose is uncertain."
+            if is_one(doubtful)
+            else "fit worse than this camera's views usually do; their poses are uncertain."
+        )
+        yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {rest}")
 
 
 def _drift(e: Evidence) -> Iterator[Reason]:
     """Without known errors only loops tell of drift."""
     graph = e.optimisation.graph
     if len(graph.ids) > 1 and not graph.loop.any():
-        text = "No loop was closed, so nothing checks how much error has built up."
-        yield Reason("unchecked_drift", _all_posed(e), text)
+        text = "No loop was closed: the accumulated drift is unchecked."
+        yield Reason("unchecked_drift", e.posed, text)
     yield from _gap(e)
 
 
@@ -266,36 +386,48 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     promised = GOOD_M + GOOD_SHARE * _way(graph.poses)
     sigma, turn = _worst(e.covariances[:, :3, :3]), _worst(e.covariances[:, 3:, 3:])
     doubtful = ~((sigma <= UNCERTAIN_TIMES * promised) & (turn <= UNCERTAIN_RAD))
-    found = _runs(graph.ids.tolist(), doubtful.tolist())
+    found = runs(graph.ids.tolist(), doubtful.tolist())
     seldom = bool(doubtful.sum() <= SELDOM * len(doubtful))
     if found:
-        first, last = max(found, key=lambda ends: ends[1] - ends[0])
-        here = (graph.ids >= first) & (graph.ids <= last)
-        text = _doubt(first, last, float(sigma[here].max()), float(turn[here].max()))
-        text += f" So are {len(found) - 1} other stretches." if len(found) > 1 else ""
-        yield Reason("uncertain_frames" if seldom else "uncertain_poses", (first, last), text)
+        text = _doubt(e, sigma, turn, doubtful)
+        yield Reason("uncertain_frames" if seldom else "uncertain_poses", found, text)
     if not seldom:
         return
     _, bound = expected_error(graph)
     if bound > promised:
         text = (
-            f"The path may be off by {bound * 1e3:.0f} mm rms, by what was measured (two sigma). "
-            f"To be called good it must be held to {promised * 1e3:.0f} mm: 1 cm and 1 % of its "
-            "length."
+            f"Estimated trajectory error: up to {_length(bound)} rms (2σ); the threshold for "
+            f'"good" is {_length(promised)} (10 mm + 1 % of the path length).'
         )
-        yield Reason("uncertain_poses", _all_posed(e), text)
+        yield Reason("uncertain_poses", e.posed, text)
 
 
-def _doubt(first: int, last: int, sigma: float, turn: float) -> str:
-    which = f"Frame {first} is" if first == last else f"Frames {first} to {last} are"
-    if not np.isfinite(sigma):
-        return f"{which} not joined to the first by anything that was measured."
-    if turn >= np.pi:  # no two rotations are further apart
-        return f"{which} not held at all in at least one direction, by loops and structure."
-    return (
-        f"{which} held to no better than {sigma:.3f} m and {np.degrees(turn):.1f} degrees (one "
-        "sigma in the worst direction), by loops and structure."
-    )
+def _doubt(e: Evidence, sigma: Float64, turn: Float64, doubtful: NDArray[np.bool_]) -> str:
+    """Say how uncertain the doubtful poses of the graph are: m and rad, NaN where not connected."""
+    graph = e.optimisation.graph
+    ids = graph.ids.tolist()
+    apart = doubtful & ~np.isfinite(sigma)
+    free = np.zeros(len(ids), bool)
+    for first, last in runs(ids, (doubtful & ~apart).tolist()):
+        here = (graph.ids >= first) & (graph.ids <= last)
+        free |= here & (turn[here] >= np.pi).any()  # no two rotations are further apart
+    loose = doubtful & ~apart & ~free
+    out = []
+    where = runs(ids, loose.tolist())
+    if where:
+        worst = f"up to {_length(float(sigma[loose].max()))} and {_angle(float(turn[loose].max()))}"
+        out.append(f"{_poses_of(where)} uncertain: {worst} (1σ, worst direction).")
+        ends = np.sort(graph.ids[graph.edges[graph.loop]], axis=1)
+        if not any(((ends[:, 0] < k) & (k <= ends[:, 1])).any() for k in graph.ids[loose]):
+            out.append("No loop closure constrains them.")
+    where = runs(ids, free.tolist())
+    if where:
+        out.append(f"{_poses_of(where)} not constrained at all in some direction.")
+    where = runs(ids, apart.tolist())
+    if where:
+        verb = "is" if is_one(where) else "are"
+        out.append(f"{_sentence(where)} {verb} not connected to the first by any measurement.")
+    return " ".join(out)
 
 
 def _worst(covariances: Float64) -> Float64:
@@ -320,12 +452,13 @@ def _missed(e: Evidence) -> Iterator[Reason]:
         se3.inverse(e.sequential[i]) @ e.sequential[j]
     )
     first, last = sorted((int(graph.ids[i]), int(graph.ids[j])))
+    miss = f"{_length(float(np.linalg.norm(gap[:3, 3])))}, {_angle(float(se3.angle(gap)))}"
     text = (
-        f"The loop {first} to {last} misses by {np.linalg.norm(gap[:3, 3]):.3f} m and "
-        f"{np.degrees(se3.angle(gap)):.1f} degrees, {np.sqrt(errors[worst] / 6):.1f} times what "
-        "noise explains: the depth offset or the focal length of the camera may be wrong."
+        f"Odometry drift over loop {first}-{last} is {miss}, {np.sqrt(errors[worst] / 6):.1f} "
+        "times what noise explains: the depth offset or the focal length of the camera may be "
+        "wrong."
     )
-    yield Reason("calibration_alarm", (first, last), text)
+    yield Reason("calibration_alarm", ((first, last),), text)
 
 
 def _suspected(e: Evidence) -> Iterator[Reason]:
@@ -335,12 +468,13 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
         return
     gap = found.gap
     (m, rad), (m_after, rad_after) = gap.before, gap.after
+    cure = " or ".join(camera_in_words(found))
     text = (
-        f"Neighbours alone miss the loop {gap.i} to {gap.j} by {m:.3f} m and "
-        f"{np.degrees(rad):.1f} degrees; {' or '.join(in_words(found))} would leave "
-        f"{m_after:.3f} m and {np.degrees(rad_after):.1f} degrees."
+        f"Odometry drift over loop {gap.i}-{gap.j} is {_length(m)}, {_angle(rad)}. "
+        f"{cure[0].upper()}{cure[1:]} would reduce it to {_length(m_after)}, {_angle(rad_after)}: "
+        "check the calibration."
     )
-    yield Reason("calibration_alarm", (gap.i, gap.j), text)
+    yield Reason("calibration_alarm", ((gap.i, gap.j),), text)
 
 
 def _way(poses: Float64) -> float:
@@ -372,54 +506,61 @@ def _gap(e: Evidence) -> Iterator[Reason]:
         return
     _, first, last, distance, angle = max(wide)
     closed = int(graph.loop.sum())
-    many = f" {len(wide)} of {closed} loops had too wide a gap; this is the worst." * (closed > 1)
+    many = f" {len(wide)} of {closed} loops drifted too far; this is the worst." * (closed > 1)
     text = (
-        f"Before the loop {first} to {last} was closed, its ends were {distance:.3f} m and "
-        f"{np.degrees(angle):.1f} degrees from where it puts them.{many}"
+        f"Odometry drift over loop {first}-{last} was {_length(distance)}, {_angle(angle)} before "
+        f"it was closed.{many}"
     )
-    yield Reason("loop_gap", (first, last), text)
+    yield Reason("loop_gap", ((first, last),), text)
 
 
 def _images(e: Evidence) -> Iterator[Reason]:
     s = e.sightings
     if s is None or not np.isfinite(s.share()):
         return
-    found = f"{s.share():.0%} of what overlapping images say supports the poses"
+    found = f"{_percent(s.share())} of overlapping measurements are consistent with the poses"
     if np.isfinite(s.rms_m()):
-        found += f", with {s.rms_m() * 1e3:.1f} mm rms"
+        found += f" ({s.rms_m() * 1e3:.1f} mm rms)"
     if s.share() < CONTRADICTED_SHARE:
-        yield Reason("images_disagree", _all_posed(e), f"Only {found}.")
+        yield Reason("images_disagree", e.posed, f"Only {found}.")
         return
-    alone = [share < CONTRADICTED_SHARE for share in s.share_of_views()]
-    for first, last in _runs(s.frames, alone):
-        text = f"Most of what other images say contradicts the poses of frames {first} to {last}."
-        yield Reason("images_differ", (first, last), text)
+    texts = []
+    alone = runs(s.frames, [share < CONTRADICTED_SHARE for share in s.share_of_views()])
+    if alone:
+        verb = "is" if is_one(alone) else "are"
+        texts.append(f"{_sentence(alone)} {verb} inconsistent with most overlapping frames.")
     # Images next to each other see the same errors of the sensor, but hardly any drift.
     near = [p for p in s.pairs if p.j == p.i + 1]
     share, rms = s.share(near), s.rms_m(near)
     if s.share() < AGREEMENT_RATIO * share or s.rms_m() > RMS_RATIO * rms:
-        text = f"{found}; images next to each other reach {share:.0%} and {rms * 1e3:.1f} mm."
-        yield Reason("images_differ", _all_posed(e), text)
+        nearby = f"{_percent(share)} ({rms * 1e3:.1f} mm rms)"
+        texts.append(f"{found}, but {nearby} in consecutive images.")
+    if texts:
+        yield Reason("images_differ", alone or e.posed, " ".join(texts))
 
 
-def _all_posed(e: Evidence) -> tuple[int, int]:
-    ids = e.optimisation.graph.ids
-    return int(ids[0]), int(ids[-1])
-
-
-def stretches(records: Sequence[FrameRecord], status: str) -> list[tuple[int, int]]:
+def stretches(records: Sequence[FrameRecord], status: str) -> tuple[Range, ...]:
     """Return (first, last) frame index of each unbroken stretch of frames with that status."""
-    return _runs([r.index for r in records], [r.status == status for r in records])
+    return runs([r.index for r in records], [r.status == status for r in records])
 
 
-def _runs(frames: Sequence[int], marked: Sequence[bool]) -> list[tuple[int, int]]:
-    """Return (first, last) of each unbroken stretch of frames that are marked."""
-    has = np.array([False, *marked, False])
-    edges = np.flatnonzero([a != b for a, b in pairwise(has)])
-    return [
-        (int(frames[a]), int(frames[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
+def _sentence(ranges: Sequence[Range]) -> str:
+    """Begin a sentence with ranges: "Frame 3", "Frames 3-9, 20"."""
+    return in_words(ranges).capitalize()
 
 
-def _frames(first: int, last: int) -> str:
-    return f"Frame {first} has" if first == last else f"Frames {first} to {last} have"
+def _poses_of(ranges: Sequence[Range]) -> str:
+    one = is_one(ranges)
+    return f"{'The pose' if one else 'Poses'} of {in_words(ranges)} {'is' if one else 'are'}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def _length(metres: float) -> str:
+    return f"{metres * 1e3:.0f} mm" if metres < 1 else f"{metres:.2f} m"
+
+
+def _angle(rad: float) -> str:
+    return f"{np.degrees(rad):.1f}°"

@@ -749,7 +749,7 @@ class Mapper:
         text = "the views show no surface of some size; mesh.ply and mesh.glb are empty"
         if model.mesh is None:
             text = "clouds without a camera make no surface; there is no mesh.ply and no mesh.glb"
-        return (Reason("no_surface", (self._records[0].index, self._records[-1].index), text),)
+        return (Reason("no_surface", ((self._records[0].index, self._records[-1].index),), text),)
 
     def _finished_records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
         """The records with the covariances (P, 6, 6) of the frames that have a pose."""

@@ -37,13 +37,14 @@ from tofuse.recordings.still import average_still
 from tofuse.results.output import (
     RECORDING,
     OutputFolder,
+    component_number,
     is_result,
     plain,
     read_run_json,
     write_result,
 )
-from tofuse.results.types import Reason, Reconstruction
-from tofuse.results.verdict import verdict_of
+from tofuse.results.types import Reason, Reconstruction, in_main_model
+from tofuse.results.verdict import ranked, verdict_of
 
 _CLOUDS = 12  # views drawn, where they are clouds
 _TEXTURE = 2048  # texels, where no size is given
@@ -195,13 +196,13 @@ def with_findings(
     background is left out.
     """
     indices = [f.index for f in result.diagnostics.frames]
-    everything = (indices[0], indices[-1])
+    everything = ((indices[0], indices[-1]),)
     told = [
         Reason("faulty_recording", everything, f"{f.text} {f.remedy}")
         for f in findings
         if f.severity == "severe" and not (turning and f.code == "phase_wrap")
     ]
-    reasons = (*result.diagnostics.reasons, *told)
+    reasons = ranked((*result.diagnostics.reasons, *told))
     verdict = verdict_of(reasons)
     recording = {
         **result.recording,
@@ -209,7 +210,13 @@ def with_findings(
         "findings": [f.to_dict() for f in findings],
     }
     diagnostics = replace(result.diagnostics, verdict=verdict, reasons=reasons)
-    return replace(result, recording=recording, diagnostics=diagnostics)
+    components = tuple(
+        c
+        if c.result is None
+        else replace(c, result=with_findings(c.result, findings, turning=turning))
+        for c in result.components
+    )
+    return replace(result, recording=recording, diagnostics=diagnostics, components=components)
 
 
 def resolve(options: Options, kind: ViewKind = "range") -> Config:
@@ -285,8 +292,9 @@ def _check_guess(options: Options, recording: Recording) -> None:
 
 
 def exit_status(result: Reconstruction) -> int:
-    """Return 0 if every readable frame has a pose, else 3."""
-    return 3 if any(f.status == "lost" for f in result.diagnostics.frames) else 0
+    """Return 0 if every readable frame is in the main model, else 3."""
+    readable = (f for f in result.diagnostics.frames if f.status != "skipped")
+    return 0 if all(in_main_model(f, result.components) for f in readable) else 3
 
 
 def _report(recording: Recording, config: Config, result: Reconstruction, folder: Path) -> None:
@@ -295,18 +303,31 @@ def _report(recording: Recording, config: Config, result: Reconstruction, folder
     from tofuse.report.pictures import draw
     from tofuse.viewer.kept import NAME, write_kept
 
+    title = _title(Path(recording.path)) or recording.path
+    truth = truth_points(recording)
+    component = component_number(folder)
+    if component is not None:
+        title += f", component {component}"
+        truth = None  # nothing connects it to the world of this component
+        recording = _frames_of(recording, result)
     pictures = draw(result.diagnostics.samples)
     clouds = () if pictures else recording.sample(_CLOUDS)
     extras = ReportExtras(
-        title=_title(Path(recording.path)) or recording.path,
+        title=title,
         filter_steps=_filter_steps(config, recording, result),
         reference=reference_in_world(recording, result),
-        truth_points=truth_points(recording),
+        truth_points=truth,
         pictures=pictures,
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
     )
     write_report(result, folder / "report.html", extras)
     write_kept(result, pictures, folder / NAME)
+
+
+def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
+    """The frames of a recording that a result is of."""
+    frames = [record.index for record in result.diagnostics.frames]
+    return replace(recording, indices=recording.indices[np.isin(recording.indices, frames)])
 
 
 def _title(path: Path) -> str:

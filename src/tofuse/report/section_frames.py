@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tofuse.report import plots, words
+from tofuse.report.section_components import color
 from tofuse.report.subject import ROWS, Figure, Subject, Values
-from tofuse.results.types import FrameRecord
+from tofuse.results.types import Component, FrameRecord, in_main_model
 
 _STRIP = 600  # cells in the strip of frames
 
@@ -24,6 +27,9 @@ def frames(s: Subject) -> Values:
     }
     if not records:
         return out | {"strip_label": "", "strip_hint": ""}
+    components = s.result.components
+    if len(components) > 1:
+        out["lanes"].append("component")
     # With more frames than cells, a cell stands for several and shows the worst of them.
     size = -(-len(records) // _STRIP)
     for start in range(0, len(records), size):
@@ -31,7 +37,15 @@ def frames(s: Subject) -> Values:
         worst = max(group, key=lambda r: (1, 2, 3, 0)[words.STATUSES.index(r.status)])
         lane = words.STATUSES.index(worst.status)
         out["strip"].append(
-            {"status": worst.status, "lane": lane, "title": told(worst), "index": worst.index}
+            {
+                "status": worst.status,
+                "lane": lane,
+                "title": told(worst, components),
+                "index": worst.index,
+                "color": None
+                if worst.component is None or len(components) < 2
+                else color(worst.component),
+            }
         )
     counts = [f"{sum(r.status == name for r in records)} {name}" for name in words.STATUSES]
     out["strip_label"] = "Status of each frame: " + ", ".join(counts)
@@ -65,8 +79,8 @@ def frames(s: Subject) -> Values:
     return out
 
 
-def told(record: FrameRecord) -> str:
-    """Say what became of a frame."""
+def told(record: FrameRecord, components: Sequence[Component] = ()) -> str:
+    """Say what became of a frame; of components only where there are several."""
     parts = [f"Frame {record.index}: {record.status}"]
     if record.reason:
         parts[0] += f" – {record.reason}"
@@ -75,7 +89,10 @@ def told(record: FrameRecord) -> str:
     if record.rms_m is not None:
         parts.append(f"rms {words.length(record.rms_m)}")
     if len(record.unobservable):
-        parts.append(f"{len(record.unobservable)} of 6 directions not held by the data")
+        parts.append(f"{len(record.unobservable)} of 6 directions unobservable")
+    if record.component is not None and len(components) > 1:
+        apart = "" if in_main_model(record, components) else " (not connected to the main one)"
+        parts.append(f"component {record.component}{apart}")
     return ", ".join(parts)
 
 

@@ -184,7 +184,7 @@ def optimised(s: Subject) -> Values:
     d = s.result.diagnostics
     out = []
     if len(d.parts) > 1:
-        out.append(f"The graph falls into {len(d.parts)} parts that nothing joins.")
+        out.append(f"The pose graph has {len(d.parts)} disconnected parts.")
     if any(p.before > 0 and not p.improved for p in d.parts):
         out.append("The optimiser found nothing better than what it was given.")
     r = d.refinement

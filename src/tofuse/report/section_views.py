@@ -118,7 +118,10 @@ def player(s: Subject) -> Values:
     return {
         "player": {
             "index": [p.index for p in shown],
-            "told": [told(records[p.index]) if p.index in records else "" for p in shown],
+            "told": [
+                told(records[p.index], s.result.components) if p.index in records else ""
+                for p in shown
+            ],
             "status": [records[p.index].status if p.index in records else "" for p in shown],
             "poses": poses,
             "images": {

@@ -10,7 +10,14 @@ import numpy as np
 
 from tofuse._version import __version__
 from tofuse.kernels.threads import side_threads
-from tofuse.report import section_frames, section_model, section_path, section_views, words
+from tofuse.report import (
+    section_components,
+    section_frames,
+    section_model,
+    section_path,
+    section_views,
+    words,
+)
 from tofuse.report.extras import ReportExtras
 from tofuse.report.subject import Subject, Values
 from tofuse.results.types import Reconstruction
@@ -22,6 +29,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     out: Values = {}
     parts: tuple[Callable[[Subject], Values], ...] = (
         _verdict,
+        section_components.components,
         section_model.views,
         section_path.cameras,
         section_path.error,
@@ -47,6 +55,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         out["facts"].insert(5, ("width × height × depth", size))
     names = {
         "verdict": "Verdict",
+        "components": "Components",
         "model": "3D model",
         "views": "Sizes",
         "cameras": "Cameras",
@@ -62,6 +71,8 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     }
     if not out["clouds"]:
         del names["recording"]
+    if not out["components"]:
+        del names["components"]
     out["contents"] = list(names.items())
     return out
 

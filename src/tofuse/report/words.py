@@ -8,25 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofuse.results.ranges import Range, in_words, size
 from tofuse.results.types import Reason, Reconstruction
-from tofuse.results.verdict import REASONS
+from tofuse.results.verdict import ADVICE, REASONS, ranked
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
-
-# What a person can do about each reason for a verdict.
-ADVICE: dict[str, str] = {
-    "few_poses": "Record again with smaller steps between frames, or use every frame.",
-    "images_disagree": "Look at the model from above: walls that appear twice show where it broke.",
-    "lost_frames": "Move more slowly there, and keep corners and furniture in view.",
-    "images_differ": "Surfaces may be doubled there; measure distances elsewhere.",
-    "weak_registration": "Smaller steps between frames, or more structure in view, would help.",
-    "not_converged": "More iterations or smaller steps between frames would help.",
-    "uncertain_poses": "Come back to these places, or keep corners and texture in view there.",
-    "calibration_alarm": "Check the camera's calibration: a known distance, a right angle.",
-    "unchecked_drift": "Come back to where you started, so that a loop can check the path.",
-    "loop_gap": "Distances across the loop may be stretched; check one that you know.",
-    "optimiser_gave_up": "Give the optimiser more iterations.",
-}
 
 
 def length(metres: float | None) -> str:
@@ -86,44 +72,37 @@ def runs(items: Iterable[tuple[int, str, str]]) -> list[tuple[int, int, int, str
 
 @dataclass(frozen=True)
 class Finding:
-    """The reasons with one code, as the report shows them.
+    """A reason for the verdict, as the report shows it.
 
     Attributes
     ----------
     level
         "failed", "degraded" or "note".
-    meaning
-        What the code says.
-    texts
-        What each reason says, with its frames where that tells more.
-    frames
-        First and last frame of the first reason.
+    text
+        What was found, with its frames where that tells more.
+    ranges
+        The frames.
     advice
         What a person can do; may be empty.
     """
 
     level: str
-    meaning: str
-    texts: tuple[str, ...]
-    frames: tuple[int, int]
+    text: str
+    ranges: tuple[Range, ...]
     advice: str
 
 
 def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
-    """Return the reasons for a person, one finding for each code, the gravest first.
+    """Return the reasons for a person, the gravest first.
 
     `total` is the number of frames: what concerns most of them is said without their numbers.
     """
-    order = {"failed": 0, "degraded": 1, "note": 2}
-    by_code: dict[str, list[Reason]] = {}
-    for reason in reasons:
-        by_code.setdefault(reason.code, []).append(reason)
     out = []
-    for code, group in by_code.items():
-        level, meaning = REASONS[code]
-        texts = tuple(_placed(r, total) for r in group if r.text.strip())
-        out.append(Finding(level, meaning, texts, group[0].frames, ADVICE.get(code, "")))
-    return sorted(out, key=lambda f: order[f.level])
+    for reason in ranked(reasons):
+        level, meaning = REASONS[reason.code]
+        text = _placed(reason, total) if reason.text.strip() else meaning
+        out.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, "")))
+    return out
 
 
 def _placed(reason: Reason, total: int) -> str:
@@ -131,9 +110,9 @@ def _placed(reason: Reason, total: int) -> str:
     text = sentence(reason.text)
     first, last = reason.frames
     named = {str(first), str(last)} <= set(re.findall(r"\d+", text))
-    if named or 2 * (last - first + 1) > total:
+    if named or in_words(reason.ranges) in text or 2 * size(reason.ranges) > total:
         return text
-    return f"{text.rstrip('.')} ({frame_range(first, last)})."
+    return f"{text.rstrip('.')} ({in_words(reason.ranges)})."
 
 
 def sentence(text: str) -> str:
@@ -156,15 +135,8 @@ def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
     grave = [f for f in found if f.level == d.verdict]
     if d.verdict == "good":
         return f"Good: {have}, and no check found fault with the result."
-    first = look = ""
-    if grave:
-        texts = grave[0].texts
-        first = f" {texts[0] if len(texts) == 1 else grave[0].meaning}"
-        begin, end = grave[0].frames
-        # Frames that are most of the recording are no place to look at.
-        if 2 * (end - begin + 1) <= len(d.frames) and str(end) not in first:
-            look = f" Look first at {frame_range(begin, end)}."
+    first = f" {grave[0].text}" if grave else ""
     more = f" {count(len(grave) - 1, 'more reason')} below." if len(grave) > 1 else ""
     if d.verdict == "degraded":
-        return f"Degraded: use this model with care.{first}{look}{more}"
+        return f"Degraded: use this model with care.{first}{more}"
     return f"Failed: do not rely on this model.{first or f' {have}.'}{more}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
-from tofuse.results.types import Reconstruction
+from tofuse.results.types import Component, Reason, Reconstruction
 
 UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
 STAGING = f"{UNFINISHED}unfinished"
@@ -57,6 +58,8 @@ FILES = (
     "trajectory.kitti.txt",
     "trajectory.log",
 )
+# Components that have a model of their own have it in a folder, with the same files.
+_COMPONENT = re.compile(r"component-[1-9]\d*")
 
 
 class OutputFolder:
@@ -64,6 +67,9 @@ class OutputFolder:
 
     Making one checks everything that can be checked before hours of work: that the folder is
     ours or empty, and that it can be written.
+
+    What a run puts into place are files, and folders `component-1` and so on, which are moved as a
+    whole. Links are moved as what they are, and never followed.
     """
 
     def __init__(
@@ -125,10 +131,21 @@ class OutputFolder:
                 where=self.path,
                 remedy="give --overwrite to replace it, or another --out",
             )
+        for name in sorted(entries):
+            self._check_replaceable(name)
+
+    def _check_replaceable(self, name: str) -> None:
+        """Refuse to replace the folder of a component that somebody has put something into."""
+        if _COMPONENT.fullmatch(name) and not _is_component(self.path / name):
+            raise OutputError(
+                "holds something other than the files of an earlier result",
+                where=self.path / name,
+                remedy="move it away, or give another --out",
+            )
 
     @contextmanager
     def staging(self, *, instead_of: Sequence[str] = ()) -> Iterator[Path]:
-        """Give a folder to write files into; on success all are moved into place, else none.
+        """Give a folder to write into; on success all of it is moved into place, else nothing.
 
         What has the names `instead_of` is gone afterwards, written anew or not.
         """
@@ -136,17 +153,25 @@ class OutputFolder:
             yield self._staging
             files = sorted(p.name for p in self._staging.iterdir())
             files.sort(key=lambda name: name == self._marker)
-            gone = {name for name in (*files, *instead_of) if (self.path / name).exists()}
+            gone = {name for name in (*files, *instead_of) if os.path.lexists(self.path / name)}
+            for name in sorted(gone):
+                self._check_replaceable(name)
             old = sorted(gone, key=lambda name: (name != self._marker, name))
             _move_all(_Plan(tuple(files), tuple(old)), self._staging, self.path)
         except OutputError as error:
             # Named as it would have been called in the end.
-            where = self.path / Path(error.where or "").name
+            where = self._final(error.where or "")
             raise OutputError(error.problem, where=where, remedy=error.remedy) from error
         except OSError as error:
             raise _output_error(self.path, error) from error
         finally:
             self.discard()
+
+    def _final(self, staged: str) -> Path:
+        path = Path(staged)
+        if path.is_relative_to(self._staging):
+            return self.path / path.relative_to(self._staging)
+        return path if path.is_relative_to(self.path) else self.path / path.name
 
     def discard(self) -> None:
         """Remove what is unfinished, and the folders made for it if nothing else is in them."""
@@ -159,7 +184,7 @@ class OutputFolder:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Which files of a staging folder are moved into place, and which are moved away before.
+    """What of a staging folder is moved into place, and what is moved away before.
 
     It lies in the staging folder meanwhile, so that the next run can finish what a killed one
     began. The marker goes away first and comes last: where it is, everything is of one run.
@@ -171,19 +196,19 @@ class _Plan:
     def carry_out(self, staging: Path, folder: Path) -> None:
         """Move, or go on with it."""
         for name in self.old:
-            if not (staging / _ASIDE / name).exists():
+            if not os.path.lexists(staging / _ASIDE / name):
                 os.replace(folder / name, staging / _ASIDE / name)
         for name in self.files:
-            if (staging / name).exists():
+            if os.path.lexists(staging / name):
                 os.replace(staging / name, folder / name)
 
     def undo(self, staging: Path, folder: Path) -> None:
         """Move back, or go on with it."""
         for name in reversed(self.files):
-            if not (staging / name).exists():
+            if not os.path.lexists(staging / name):
                 os.replace(folder / name, staging / name)
         for name in reversed(self.old):
-            if (staging / _ASIDE / name).exists():
+            if os.path.lexists(staging / _ASIDE / name):
                 os.replace(staging / _ASIDE / name, folder / name)
 
 
@@ -231,6 +256,29 @@ def is_result(folder: Path) -> bool:
     return isinstance(data, dict) and {"schema", "version", "verdict"} <= set(data)
 
 
+def _is_component(folder: Path) -> bool:
+    """Say whether a folder holds nothing but files that a run or an export makes."""
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    return all(p.name in FILES and p.is_file() and not p.is_symlink() for p in folder.iterdir())
+
+
+def component_folders(folder: Path) -> tuple[str, ...]:
+    """Return the names of the folders of an earlier result's components, that may be removed."""
+    names = (p.name for p in folder.iterdir() if _COMPONENT.fullmatch(p.name))
+    return tuple(sorted(name for name in names if _is_component(folder / name)))
+
+
+def component_name(number: int) -> str:
+    """Return the name of the folder of a component that has a model of its own."""
+    return f"component-{number}"
+
+
+def component_number(folder: Path) -> int | None:
+    """Return the number of the component that a folder is named after; None for any other name."""
+    return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
+
+
 def write_result(
     result: Reconstruction,
     folder: OutputFolder,
@@ -239,24 +287,42 @@ def write_result(
 ) -> None:
     """Write every file of the contract; `report` writes what is for people into the folder it gets.
 
-    With a `texture`, `mesh.glb` has it, and so has `mesh.obj`, which is written then.
+    Components that are not connected to the main one, and have a model of their own, are written
+    into `component-1` and so on, by their numbers. With a `texture`, the `mesh.glb` of the main
+    model has it, and so has `mesh.obj`, which is written then.
 
     Raises
     ------
     OutputError
         If a file can't be written; then nothing that was there before has changed.
     """
+    replaced = (*FILES, *component_folders(folder.path))
+    with folder.staging(instead_of=replaced) as staging:
+        for number, component in enumerate(result.components):
+            if component.result is not None and not component.connected:
+                own = staging / component_name(number)
+                own.mkdir()
+                _write_files(component.result, own, report, None)
+        _write_files(result, staging, report, texture)
+
+
+def _write_files(
+    result: Reconstruction,
+    folder: Path,
+    report: Callable[[Reconstruction, Path], None] | None,
+    texture: Textured | None,
+) -> None:
     # Much of either is copying and drawing in which the other can go on.
-    with folder.staging(instead_of=FILES) as staging, side_threads(1, "tofuse-writer") as beside:
-        model = beside.submit(_write_model, result, staging, texture)
+    with side_threads(1, "tofuse-writer") as beside:
+        model = beside.submit(_write_model, result, folder, texture)
         posed = result.has_pose
-        write_tum(staging / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
-        write_g2o(staging / "pose_graph.g2o", result.graph)
+        write_tum(folder / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
+        write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
-            report(result, staging)
+            report(result, folder)
         model.result()
         text = json.dumps(run_json(result), indent=1, allow_nan=False)
-        (staging / "run.json").write_text(text + "\n", encoding="utf-8")
+        (folder / "run.json").write_text(text + "\n", encoding="utf-8")
 
 
 def _write_model(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
@@ -325,9 +391,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "config": result.config,
             "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
             "verdict": d.verdict,
-            "reasons": [
-                {"code": r.code, "frames": list(r.frames), "text": r.text} for r in d.reasons
-            ],
+            "reasons": reasons_json(d.reasons),
             "frames": [
                 {
                     "index": f.index,
@@ -339,9 +403,11 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                     "rms_m": f.rms_m,
                     "covariance": None if f.covariance is None else f.covariance.ravel(),
                     "unobservable": f.unobservable,
+                    "component": f.component,
                 }
                 for f in d.frames
             ],
+            "components": [_component(c) for c in result.components],
             "loops": [
                 {
                     "i": p.i,
@@ -381,6 +447,27 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
     )
+
+
+def reasons_json(reasons: Sequence[Reason]) -> list[dict[str, Any]]:
+    """Return the reasons as `run.json` has them."""
+    return [
+        {
+            "code": r.code,
+            "frames": list(r.frames),
+            "ranges": [list(each) for each in r.ranges],
+            "text": r.text,
+        }
+        for r in reasons
+    ]
+
+
+def _component(c: Component) -> dict[str, Any]:
+    return {
+        "frames": [list(each) for each in c.frames],
+        "T_main_component": c.T_main_component,
+        "joined": c.joined,
+    }
 
 
 def _refinement(r: Refinement | None) -> dict[str, Any] | None:
@@ -457,3 +544,17 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
     if not isinstance(data, dict) or data.get("schema") != 1:
         raise InputError("is not a run.json of schema 1", where=path)
     return data
+
+
+def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return what a `run.json` says of the frames with a line in `trajectory.txt`, in order.
+
+    Those of version 0.1 know no components: there every pose is in the one model.
+    """
+    connected = [c["T_main_component"] is not None for c in run.get("components", ())]
+    return [
+        frame
+        for frame in run["frames"]
+        if frame["status"] in ("tracked", "predicted")
+        and (frame.get("component") is None or connected[frame["component"]])
+    ]

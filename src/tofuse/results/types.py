@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from tofuse.odometry.base import Status
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
+from tofuse.results.ranges import Range
 from tofuse.results.samples import FrameSample
 
 Float64 = NDArray[np.float64]
@@ -23,16 +25,35 @@ Verdict = Literal["good", "degraded", "failed"]
 
 @dataclass(frozen=True)
 class Reason:
-    """One reason for the verdict: a code from the closed list in `verdict.REASONS`."""
+    """One reason for the verdict.
+
+    Attributes
+    ----------
+    code
+        From the closed list in `verdict.REASONS`.
+    ranges
+        (first, last) frame index of each stretch that it concerns, ascending; at least one.
+    text
+        What was found, one or a few sentences.
+    """
 
     code: str
-    frames: tuple[int, int]
+    ranges: tuple[Range, ...]
     text: str
+
+    @property
+    def frames(self) -> Range:
+        """First and last frame index that it concerns."""
+        return self.ranges[0][0], self.ranges[-1][1]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """What became of one frame; the fields of `run.json`, SI units."""
+    """What became of one frame; the fields of `run.json`, SI units.
+
+    `component` is the position in `Reconstruction.components`; None where it is in none, or where
+    nothing looked for components.
+    """
 
     index: int
     timestamp: float
@@ -43,6 +64,7 @@ class FrameRecord:
     rms_m: float | None = None
     covariance: Float64 | None = None  # (6, 6) of the final pose, relative to the first
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
+    component: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +109,53 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, eq=False)
+class Component:
+    """A stretch of the recording tracked without a break, or several joined with each other.
+
+    Attributes
+    ----------
+    frames
+        (first, last) frame index of each stretch, ascending.
+    T_main_component
+        (4, 4) the identity for component 0, the main one; None where it is not connected to that.
+    joined
+        How it was connected: by "links" between its views and others, or by the extrapolated
+        "motion" over the gap alone; None for component 0 and where it is not connected.
+    result
+        A model of its own, where it is not part of the main one and has more than a few frames. It
+        holds the frames of this component only, in a world frame of its own.
+    """
+
+    frames: tuple[Range, ...]
+    T_main_component: Float64 | None
+    joined: Literal["links", "motion"] | None
+    result: Reconstruction | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether it is part of the main model."""
+        return self.T_main_component is not None
+
+
+def in_main_model(record: FrameRecord, components: Sequence[Component]) -> bool:
+    """Say whether a frame has a pose in the main model, and not only in one of another component.
+
+    Without components every pose is in it.
+    """
+    if record.status not in ("tracked", "predicted"):
+        return False
+    return record.component is None or components[record.component].connected
+
+
+@dataclass(frozen=True, eq=False)
 class Reconstruction:
     """The result of `tofuse.reconstruct`.
 
     Attributes
     ----------
     trajectory
-        (N, 4, 4) T_world_camera of every frame read, NaN where it has none; the first pose is
-        the identity.
+        (N, 4, 4) T_world_camera of every frame read, NaN where it has none in the main model; the
+        first pose is the identity.
     timestamps
         (N,) seconds.
     graph
@@ -107,6 +168,9 @@ class Reconstruction:
         The resolved configuration, as plain data.
     recording
         path, format, frames and the reader's warnings, as plain data.
+    components
+        Component 0 is the main one: trajectory, graph, cloud and mesh are of what is connected to
+        it. Empty where nothing looked for them.
     """
 
     trajectory: Float64
@@ -119,8 +183,9 @@ class Reconstruction:
     seed: int
     threads: int
     mesh: Mesh | None = None
+    components: tuple[Component, ...] = ()
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
-        """(N,) mask of the frames with a pose."""
+        """(N,) mask of the frames with a pose in the main model."""
         return np.isfinite(self.trajectory[:, 0, 0])

@@ -2,44 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
+from tofuse.results.ranges import size, union
 from tofuse.results.types import Reason, Verdict
 
 # The closed list of reason codes. "failed" and "degraded" name the verdict each one forces;
-# "note" tells something without changing the verdict.
+# "note" adds information without changing the verdict.
 REASONS: dict[str, tuple[str, str]] = {
-    "few_poses": ("failed", "Fewer than half of the readable frames have a pose."),
-    "images_disagree": ("failed", "Most of what the images saw contradicts the estimated poses."),
+    "few_poses": ("failed", "Fewer than half of the readable frames are in the main model."),
+    "images_disagree": ("failed", "Most overlapping measurements contradict the poses."),
     "lost_frames": ("degraded", "Some readable frames have no pose."),
-    "images_differ": ("degraded", "Images that overlap do not agree as well as neighbours do."),
-    "jumped": ("degraded", "A frame was found far from where the motion led."),
-    "faulty_recording": ("degraded", "The recording itself is wrong, by what its frames show."),
-    "unobserved_motion": ("degraded", "Often the data did not hold the camera in every direction."),
-    "repeated_images": ("degraded", "Images were repeated, to the last pixel."),
-    "implausible_depth": ("degraded", "Depths are not such as this camera measures."),
-    "weak_registration": ("degraded", "Neighbouring frames had few points in common."),
-    "not_converged": ("degraded", "Registrations stopped before they settled."),
-    "uncertain_poses": ("degraded", "What was measured holds poses too loosely."),
-    "calibration_alarm": ("degraded", "Loops miss by more than noise explains."),
-    "unchecked_drift": ("degraded", "No loop checks how much error has built up."),
-    "loop_gap": ("degraded", "Closing a loop moved the cameras far; the path bends to fit."),
-    "optimiser_gave_up": ("degraded", "The optimiser ran out of iterations before it settled."),
-    "not_improved": ("note", "The optimiser found nothing better than what it was given."),
-    "not_refined": ("note", "Refining all views together made them agree worse."),
-    "sensor_differs": ("note", "A sensor beside the camera does not fit what was tracked."),
-    "uncertain_frames": ("note", "Few frames are held more loosely than the others."),
+    "disconnected": ("degraded", "The recording falls into disconnected parts."),
+    "bridged_gap": ("degraded", "Parts are connected by extrapolated motion only."),
+    "images_differ": ("degraded", "Overlapping frames agree less than consecutive ones do."),
+    "jumped": ("degraded", "A frame's pose jumps away from the predicted motion."),
+    "doubtful_poses": ("degraded", "Frames fit worse than this camera's views usually do."),
+    "faulty_recording": ("degraded", "The recording has a fault (see inspection)."),
+    "unobserved_motion": (
+        "degraded",
+        "Motion was often unobservable in some direction (degenerate geometry).",
+    ),
+    "repeated_images": ("degraded", "Images repeat the one before, to the last pixel."),
+    "implausible_depth": ("degraded", "Depths are implausible for this camera."),
+    "weak_registration": ("degraded", "Frames have too few correspondences."),
+    "not_converged": ("degraded", "Registrations stopped before they converged."),
+    "uncertain_poses": ("degraded", "Poses are poorly constrained."),
+    "calibration_alarm": ("degraded", "Loop-closure errors are larger than noise explains."),
+    "unchecked_drift": ("degraded", "No loop closure checks the accumulated drift."),
+    "loop_gap": ("degraded", "Odometry drifted far before a loop was closed."),
+    "optimiser_gave_up": ("degraded", "The optimiser stopped before it converged."),
+    "moving_objects": ("note", "Objects move in front of the camera; they are excluded."),
+    "not_improved": ("note", "The optimiser did not improve on the initial poses."),
+    "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
+    "sensor_differs": ("note", "An external sensor is inconsistent with the tracked motion."),
+    "uncertain_frames": ("note", "A few frames have high pose uncertainty."),
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
-    "single_frame": ("note", "Only one frame has a pose: there was nothing to register."),
+    "single_frame": ("note", "Single view: nothing to register, accuracy not assessed."),
     "stood_still": ("note", "The camera never moved: the model is what one view sees."),
     "no_surface": ("note", "No surface could be made, only a cloud."),
     "loop_rejected": ("note", "A loop given by hand could not be confirmed."),
 }
 
+# What a person can do about each reason, where there is something to do.
+ADVICE: dict[str, str] = {
+    "few_poses": "Record again with smaller steps between frames, or use every frame.",
+    "images_disagree": "Look at the model from above: walls that appear twice show where it broke.",
+    "lost_frames": "Move more slowly there, and keep corners and furniture in view.",
+    "disconnected": "Record again with overlap between these parts, or keep them as models of "
+    "their own.",
+    "bridged_gap": "Distances across the gap are not measured; check one that you know.",
+    "images_differ": "Surfaces may be doubled there; measure distances elsewhere.",
+    "doubtful_poses": "Check the model there, or record that part again.",
+    "weak_registration": "Smaller steps between frames, or more structure in view, would help.",
+    "not_converged": "More iterations or smaller steps between frames would help.",
+    "uncertain_poses": "Come back to these places, or keep corners and texture in view there.",
+    "calibration_alarm": "Check the camera's calibration: a known distance, a right angle.",
+    "unchecked_drift": "Come back to where you started, so that a loop can check the path.",
+    "loop_gap": "Distances across the loop may be stretched; check one that you know.",
+    "optimiser_gave_up": "Give the optimiser more iterations.",
+}
 
-def verdict_of(reasons: Sequence[Reason]) -> Verdict:
+_GRAVITY = {"failed": 0, "degraded": 1, "note": 2}
+
+
+def verdict_of(reasons: Iterable[Reason]) -> Verdict:
     """Return the verdict that the gravest of the reasons forces."""
     forced = {REASONS[reason.code][0] for reason in reasons}
     if "failed" in forced:
         return "failed"
     return "degraded" if "degraded" in forced else "good"
+
+
+def ranked(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
+    """Return the reasons with each code once: the gravest first, then those of most frames.
+
+    Reasons with the same code become one, with all their ranges and what each of them says.
+    """
+    by_code: dict[str, list[Reason]] = {}
+    for reason in reasons:
+        by_code.setdefault(reason.code, []).append(reason)
+    merged = [_merged(group) for group in by_code.values()]
+    return tuple(sorted(merged, key=lambda r: (_GRAVITY[REASONS[r.code][0]], -size(r.ranges))))
+
+
+def _merged(group: Sequence[Reason]) -> Reason:
+    if len(group) == 1:
+        return group[0]
+    texts = dict.fromkeys(reason.text for reason in group)
+    ranges = union(r for reason in group for r in reason.ranges)
+    return Reason(group[0].code, ranges, " ".join(texts))

@@ -17,7 +17,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
-from tofuse.results.output import is_result, read_run_json
+from tofuse.results.output import frames_in_main_model, is_result, read_run_json
 from tofuse.viewer.kept import read_kept
 
 Float32 = NDArray[np.float32]
@@ -125,7 +125,7 @@ def read_result(folder: Path) -> Result:
             "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"
         )
     run = read_run_json(folder / "run.json")
-    posed = [f["index"] for f in run["frames"] if f["status"] in ("tracked", "predicted")]
+    posed = [frame["index"] for frame in frames_in_main_model(run)]
     _, poses = read_tum(folder / "trajectory.txt")
     if len(posed) != len(poses):
         raise InputError(

@@ -1,0 +1,68 @@
+"""Ranges of frame indices, both ends included: found, merged, and written for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+Range = tuple[int, int]
+
+# A line that lists more ranges than these is not read; `run.json` has them all.
+_LISTED = 6
+
+
+def runs(frames: Sequence[int], marked: Sequence[bool]) -> tuple[Range, ...]:
+    """Return (first, last) of each unbroken run of marked frames.
+
+    Neighbours in the list count as neighbours, whatever their indices: a recording read with a
+    stride has gaps in them.
+
+    Parameters
+    ----------
+    frames
+        Ascending frame indices.
+    marked
+        One for each of them.
+    """
+    has = np.array([False, *marked, False], bool)
+    edges = np.flatnonzero([a != b for a, b in pairwise(has)])
+    return tuple(
+        (int(frames[a]), int(frames[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
+    )
+
+
+def union(ranges: Iterable[Range]) -> tuple[Range, ...]:
+    """Return ranges in ascending order, those joined that overlap or touch."""
+    out: list[Range] = []
+    for first, last in sorted(ranges):
+        if out and first <= out[-1][1] + 1:
+            out[-1] = (out[-1][0], max(out[-1][1], last))
+        else:
+            out.append((first, last))
+    return tuple(out)
+
+
+def size(ranges: Iterable[Range]) -> int:
+    """Return how many indices the ranges hold, if they do not overlap."""
+    return sum(last - first + 1 for first, last in ranges)
+
+
+def numbers(ranges: Sequence[Range]) -> str:
+    """Write "3-9, 20, 31-34"; only the first ones of many, and how many more there are."""
+    listed = [str(a) if a == b else f"{a}-{b}" for a, b in ranges[:_LISTED]]
+    more = len(ranges) - len(listed)
+    if more:
+        return f"{', '.join(listed)} and {more} more range{'' if more == 1 else 's'}"
+    return ", ".join(listed)
+
+
+def in_words(ranges: Sequence[Range]) -> str:
+    """Write "frame 20" or "frames 3-9, 20, 31-34"."""
+    return f"{'frame' if is_one(ranges) else 'frames'} {numbers(ranges)}"
+
+
+def is_one(ranges: Sequence[Range]) -> bool:
+    """Say whether the ranges hold a single frame, for the verb that follows."""
+    return len(ranges) == 1 and ranges[0][0] == ranges[0][1]
