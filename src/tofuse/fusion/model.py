@@ -101,7 +101,7 @@ class ModelBuilder:
         Parameters
         ----------
         poses
-            T_world_camera (4, 4) by index of the frame.
+            T_world_camera (4, 4) by index of the frame; views of other frames are left out.
         advance
             Called after each view.
         errors
@@ -111,9 +111,11 @@ class ModelBuilder:
             clouds = [
                 replace(c, points=without_errors(c.points, errors)) if errors else c
                 for c in self._clouds
+                if c.index in poses
             ]
             return Model(self._average(clouds, poses, self._voxel_m, advance), None)
-        views = without_camera_errors(self._ranges, errors)
+        ranges = [view for view in self._ranges if view.index in poses]
+        views = without_camera_errors(ranges, errors)
         at = np.array([poses[view.index] for view in views], float)
         mesh = fuse_surface(views, at, self._options, advance)
         if len(mesh):
@@ -133,11 +135,13 @@ class ModelBuilder:
         Of many images some are taken, evenly, and of each some pixels.
         """
         if self._clouds:
-            return self._average(self._clouds, poses, self._voxel_m)
-        some = self._ranges[:: -(-len(self._ranges) // _SKETCHED)]
+            clouds = [c for c in self._clouds if c.index in poses]
+            return self._average(clouds, poses, self._voxel_m)
+        ranges = [view for view in self._ranges if view.index in poses]
+        some = ranges[:: max(1, -(-len(ranges) // _SKETCHED))]
         voxel = self._range_voxel
-        clouds = [view.as_cloud(_SKETCHED_PIXELS) for view in some]
-        return self._average(clouds, poses, voxel, normals=False)
+        sketched = [view.as_cloud(_SKETCHED_PIXELS) for view in some]
+        return self._average(sketched, poses, voxel, normals=False)
 
     @property
     def _range_voxel(self) -> float:

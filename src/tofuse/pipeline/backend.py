@@ -19,13 +19,14 @@ from tofuse.pipeline.frame_log import FrameLog
 from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.progress import Progress, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import Optimisation, PoseGraph
+from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
 from tofuse.posegraph.joining import Join
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop, Loops
 from tofuse.posegraph.outside import Told, told_by, with_outside
 from tofuse.posegraph.refinement import Refinement, Refiner
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.recordings.frames import RangeFrame
+from tofuse.results.verdict import ranked
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 T = TypeVar("T")
@@ -80,6 +81,10 @@ class Kept:
         Images that are compared with each other at the final poses.
     depths
         Typical radial range of each posed frame, m, by index.
+    ambiguity_m
+        Range after which the camera's phase repeats, if it is known.
+    knows_errors
+        Whether registrations state errors that can be relied on; ICP's are too small.
     """
 
     loops: Loops
@@ -87,6 +92,8 @@ class Kept:
     model: ModelBuilder
     checks: Sequence[RangeFrame]
     depths: dict[int, float]
+    ambiguity_m: float | None
+    knows_errors: bool
 
 
 class BackEnd:
@@ -139,7 +146,7 @@ class BackEnd:
     def _close(self) -> Closed:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
-            loops = self._kept.loops.finish(self._poses)
+            loops = with_joins(self._kept.loops.finish(self._poses), self._joins)
             graph = self.graph(loops)
         sequential = led = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
@@ -153,7 +160,7 @@ class BackEnd:
                 if told and graph.loop.any():  # what loops are to be compared with
                     alone = with_outside(self.graph(()), told)
                     led = self._config.optimiser.optimise(alone).graph.poses
-            loops = _decided(loops, optimisation, self._extra)
+            loops = _decided(loops, optimisation)
             optimisation = without_left_out(optimisation)
         graph = optimisation.graph
         covariances = pose_covariances(graph)
@@ -195,59 +202,159 @@ class BackEnd:
         components: tuple[Component, ...],
     ) -> Reconstruction:
         optimisation, graph, model = closed.optimisation, refined.graph, fused.model
+        log, kept = self._log, self._kept
         self._progress.stage("checking")
         records = self._records(closed.covariances)
         loops = tuple(c.record for c in closed.loops)
-        # Only who looks at surfaces states errors that can be relied on; ICP's are too small.
-        knows_errors = any(e.step is not None and e.step.reason != "" for e in ()) or (
-            "range" in self._config.odometry.takes and self._config.knows_errors
-        )
-        registrations = tuple(
-            e.step.registration if e.step is not None and e.record.index in self._poses else None
-            for e in self._log.entries
-        )
         with self._watch.timing("checking"):
             evidence = Evidence(
                 records,
-                registrations,
+                tuple(e.step.registration if e.step is not None else None for e in log.entries),
                 loops,
                 closed.judged.sequential,
                 closed.judged.optimisation,
                 self._sightings(graph),
-                closed.judged.covariances if knows_errors else None,
+                closed.judged.covariances if kept.knows_errors else None,
                 refined.refinement,
                 frozenset((g.i, g.j) for g in self._given),
-                tuple(d for f, d in self._kept.depths.items() if d > 0 and f in self._poses),
-                self._log.ambiguity_m,
-                tuple(self._log.repeated),
-                tuple(self._breaks()),
+                tuple(d for index, d in kept.depths.items() if d > 0 and index in self._poses),
+                kept.ambiguity_m,
+                tuple(log.repeated),
+                tuple(log.interruptions),
                 closed.told.records,
+                components,
+                tuple((e.record.index, e.moving) for e in self._posed if e.moving > 0),
+                tuple(e.record.index for e in self._posed if e.step is not None and e.step.doubtful),
             )
             verdict, reasons = judge(evidence)
-        reasons = (*reasons, *self._about_surface(model))
         return Reconstruction(
             trajectory=self._scatter(graph.poses),
-            timestamps=np.array([e.record.timestamp for e in self._log.entries]),
+            timestamps=np.array([e.record.timestamp for e in log.entries]),
             graph=graph,
             cloud=model.cloud,
             mesh=model.mesh,
             diagnostics=Diagnostics(
                 verdict,
-                reasons,
+                ranked([*reasons, *self._about_surface(model)]),
                 records,
                 loops,
                 self._scatter(closed.sequential),
                 optimisation.objective,
                 {},
-                {},
+                dict(self._watch.seconds),
                 fused.before,
                 refined.refinement,
                 optimisation.parts,
                 closed.told.records,
             ),
             config=self._config.to_dict(),
-            recording={"path": None, "format": "frames", "frames": len(self._log.entries)},
+            recording={"path": None, "format": "frames", "frames": len(log.entries)},
             seed=0,
             threads=1,
             components=components,
         )
+
+    def graph(self, loops: Sequence[ClosedLoop], refined: Refinement | None = None) -> PoseGraph:
+        """The graph as it was tracked and joined, or with what the refinement measured instead."""
+        ids = [e.record.index for e in self._posed]
+        tracked = np.array([self._poses[index] for index in ids])
+        poses = tracked if refined is None else refined.poses
+        again = () if refined is None else refined.edges
+        replaced = {index for edge in again for index in (edge.i, edge.j)}
+        place = {index: k for k, index in enumerate(ids)}
+        sigma = prediction_sigma(tracked, [e.record.unobservable for e in self._posed])
+        sequence = []
+        for entry in self._posed:
+            step, index = entry.step, entry.record.index
+            if step is None or step.reference is None or step.registration is None:
+                continue
+            if {step.reference, index} <= replaced:
+                continue
+            r = step.registration
+            # What was predicted frame by frame since then adds up.
+            frames = abs(place[index] - place[step.reference])
+            predicted = (sigma[0] * frames, sigma[1] * frames)
+            information = with_prediction(r.information, r.unobservable, predicted)
+            sequence.append(Measured(step.reference, index, r.T_target_source, information))
+        needed = [
+            Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
+            for j in self._joins
+            if j.needed and not {j.link.i, j.link.j} <= replaced
+        ]
+        closing = [
+            Measured(c.record.i, c.record.j, c.T_i_j, c.information)
+            for c in loops
+            if c.T_i_j is not None and c.information is not None
+        ]
+        return build_graph(ids, poses, [*sequence, *needed, *again], closing)
+
+    def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
+        """The records with the covariances (P, 6, 6) of the frames that have a pose here."""
+        known = dict(zip((e.record.index for e in self._posed), covariances, strict=True))
+        out = []
+        for entry in self._log.entries:
+            C = known.get(entry.record.index)
+            finite = C is not None and bool(np.isfinite(C).all())
+            out.append(replace(entry.record, covariance=C) if finite else entry.record)
+        return tuple(out)
+
+    def _sightings(self, graph: PoseGraph) -> Sightings | None:
+        """What overlapping images say of the final poses."""
+        frames = [f for f in self._kept.checks if f.index in self._poses]
+        if len(frames) < 2:
+            return None
+        row = {int(frame): k for k, frame in enumerate(graph.ids)}
+        return sightings(frames, np.stack([graph.poses[row[f.index]] for f in frames]))
+
+    def _scatter(self, poses: Float64) -> Float64:
+        out = np.full((len(self._log.entries), 4, 4), np.nan)
+        out[[e.record.index in self._poses for e in self._log.entries]] = poses
+        return out
+
+    def _about_surface(self, model: Model) -> tuple[Reason, ...]:
+        """What is to be said where there is no surface."""
+        if model.mesh is not None and len(model.mesh):
+            return ()
+        text = "The views show no surface of any size: mesh.ply and mesh.glb are empty."
+        if model.mesh is None:
+            text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
+        entries = self._log.entries
+        everything = ((entries[0].record.index, entries[-1].record.index),)
+        return (Reason("no_surface", everything, text),)
+
+
+def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[ClosedLoop]:
+    """Loops, and what joins components beyond what is needed: these close loops as well."""
+    known = {(c.record.i, c.record.j) for c in loops}
+    more = []
+    for join in joins:
+        link = join.link
+        if join.needed or {(link.i, link.j), (link.j, link.i)} & known:
+            continue
+        seen = link.agreement
+        record = LoopRecord(
+            link.i,
+            link.j,
+            True,
+            f"joins components, {link.how}",
+            overlap=seen.overlap,
+            rms_m=seen.rms_m if np.isfinite(seen.rms_m) else None,
+            free_space_violation=seen.violation,
+            margin=link.margin,
+        )
+        more.append(ClosedLoop(record, link.T_i_j, link.information))
+    return [*loops, *more]
+
+
+def _decided(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[ClosedLoop]:
+    """The loops, those rejected that the optimiser left out because they contradict the others."""
+    if optimisation.weights is None:
+        return list(loops)
+    weights = iter(optimisation.weights[optimisation.graph.loop])
+    out = []
+    for loop in loops:
+        if loop.T_i_j is not None and next(weights) < LEFT_OUT:
+            reason = f"contradicts the rest of the graph ({loop.record.reason})"
+            loop = ClosedLoop(replace(loop.record, accepted=False, reason=reason))
+        out.append(loop)
+    return out

@@ -15,6 +15,7 @@ from tofuse.filters.correction import Correction
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
+from tofuse.posegraph.joining import Joining
 from tofuse.posegraph.loops import LoopDetector
 from tofuse.posegraph.outside import Outside
 from tofuse.posegraph.refinement import NoRefinement, Refining
@@ -51,6 +52,8 @@ class Config:
         its noise loses by what a clean model gains.
     outside
         Sensors beside the camera whose measurements count.
+    joining
+        Connects components that were tracked apart.
     """
 
     method: str
@@ -63,6 +66,7 @@ class Config:
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
     outside: tuple[Outside, ...] = ()
+    joining: Joining = Joining()  # noqa: RUF009 - immutable
 
     @property
     def window(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,6 +64,8 @@ class FrameLog:
     entries: list[Entry] = field(default_factory=list)
     interruptions: list[int] = field(default_factory=list)
     repeated: list[int] = field(default_factory=list)
+    _steps: dict[int, Step] = field(default_factory=dict, init=False, repr=False)
+    _counted: int = field(default=0, init=False, repr=False)
 
     def add(
         self,
@@ -90,7 +92,7 @@ class FrameLog:
         """All that were found on the way."""
         return [link for e in self.posed if e.step is not None for link in e.step.links]
 
-    def of(self, frames: Sequence[int] | set[int]) -> FrameLog:
+    def of(self, frames: Collection[int]) -> FrameLog:
         """The part of the log with these frames."""
         kept = set(frames)
         rows = [k for k, e in enumerate(self.entries) if e.record.index in kept]
@@ -100,6 +102,34 @@ class FrameLog:
             sorted({at for at in starts if 0 < at < len(rows)}),
             [index for index in self.repeated if index in kept],
         )
+
+    def of_component(self, component: int) -> FrameLog:
+        """The part of the log in one component of the tracker."""
+        found = [
+            e.record.index
+            for e in self.posed
+            if e.step is not None and e.step.component == component
+        ]
+        return self.of(found)
+
+    def step_of(self, frame: int) -> Step:
+        """The step of a frame with a pose."""
+        if self._counted != len(self.entries):
+            for entry in self.entries[self._counted :]:
+                if entry.step is not None:
+                    self._steps[entry.record.index] = entry.step
+            self._counted = len(self.entries)
+        return self._steps[frame]
+
+    def numbered(self, numbers: Mapping[int, int]) -> FrameLog:
+        """The log whose records say the final number of their component, by the tracker's."""
+        entries = [
+            replace(e, record=replace(e.record, component=numbers[e.step.component]))
+            if e.step is not None and e.has_pose
+            else e
+            for e in self.entries
+        ]
+        return FrameLog(entries, self.interruptions, self.repeated)
 
     def stretches(self, views: ViewStore[SurfaceMap]) -> list[Stretch]:
         """The components as they were tracked, in the order in which they began."""
@@ -136,7 +166,9 @@ class FrameLog:
         return Sensed(np.array(ids, np.intp), odometry, gravity, parts)
 
 
-def poses_in_world(log: FrameLog, T_world_component: dict[int, Float64]) -> dict[int, Float64]:
+def poses_in_world(
+    log: FrameLog, T_world_component: Mapping[int, Float64]
+) -> dict[int, Float64]:
     """(4, 4) T_world_camera by index, the first of them the identity, of the given components."""
     found: dict[int, Float64] = {}
     T_first: Float64 | None = None

@@ -224,7 +224,7 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     has_pose = e.in_main
     poses = [next(posed) if has else None for has in has_pose]
     moments = [Moment(r.index, r.timestamp) for r in e.records]
-    found = jumps(poses, {*e.interruptions, *_crossings(e.records, has_pose)}, moments)
+    found = jumps(poses, moments, {*e.interruptions, *_crossings(e.records, has_pose)})
     frames = [e.records[k].index for k, _ in found]
     if len(found) > max(UNORDERED, UNORDERED_SHARE * sum(has_pose)):
         text = (

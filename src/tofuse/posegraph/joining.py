@@ -75,7 +75,7 @@ class Stretch:
     poses
         (N, 4, 4) in its frame.
     views
-        Those that are kept, at least one.
+        Those that are kept.
     recording
         Which of several joined recordings it is of: between these, no motion is known.
     """
@@ -86,6 +86,11 @@ class Stretch:
     poses: Float64
     views: tuple[View, ...]
     recording: int = 0
+
+    @property
+    def depth(self) -> float:
+        """Typical distance of what its views see, m."""
+        return float(np.median([v.view.depth for v in self.views])) if self.views else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,7 +396,9 @@ class _Joiner:
         compare = self_scaled(self._usual)
         ours = [self._views[i] for i in self._views if self._component_of[i] in a.T]
         theirs = [self._views[i] for i in self._views if self._component_of[i] in b.T]
-        near = []
+        near: list[tuple[float, int, int]] = []
+        if not ours or not theirs:
+            return []
         Ta = np.stack([self._T_island(a, v.index) for v in ours])
         Tb = np.stack([T_a_b @ self._T_island(b, v.index) for v in theirs])
         for p, v in enumerate(ours):
@@ -442,7 +449,7 @@ class _Joiner:
                     first, second, T_c, T_d = second, first, T_d, T_c
                 between = se3.inverse(T_c @ first.poses[-1]) @ T_d @ second.poses[0]
                 reach = _reach(first, second)
-                depth = first.views[-1].view.depth
+                depth = first.depth
                 if (
                     np.linalg.norm(between[:3, 3]) > reach[0] + _NEAR * depth
                     or float(se3.angle(between)) > reach[1] + _NEAR
@@ -505,7 +512,7 @@ def _bridged(before: Stretch, after: Stretch) -> Link | None:
     wander = np.sqrt((change**2).mean(0)) * np.sqrt(max(elapsed / max(interval, 1e-9), 1.0))
     apart = np.abs(v[-2:].mean(0) - w[:2].mean(0))
     sigma = np.hypot(0.5 * wander, 0.5 * apart) * elapsed
-    depth = before.views[-1].view.depth
+    depth = before.depth
     limit = np.repeat([_BRIDGE_M * depth, _BRIDGE_RAD], 3)
     if (sigma > limit).any():
         return None

@@ -1,0 +1,111 @@
+"""What is kept of frames with a pose until the end: one store that all later stages ask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from tofuse.evaluation.sightings import whole
+from tofuse.fusion.cloud import as_cloud
+from tofuse.fusion.model import ModelBuilder
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.base import Step
+from tofuse.pipeline.backend import Kept
+from tofuse.pipeline.config import Config
+from tofuse.pipeline.preparation import Ready
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.recordings.frames import Frame, RangeFrame
+
+_KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
+_CHECKED_IMAGES = 60  # how many images are compared with each other in the end
+# Views as the global stages take them: more pixels would not say more.
+_COLUMNS = 200
+
+
+class Observations:
+    """Prepared views spaced by motion, small images for the model, and some for the checks.
+
+    Attributes
+    ----------
+    views
+        Prepared views of all components: joining, loops and refinement work on these.
+    loops
+        Loop detection at work, told of every frame.
+    """
+
+    def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
+        ends = [frame for loop in given for frame in (loop.i, loop.j)]
+        self.views: ViewStore[SurfaceMap] = ViewStore(Spacing(), always=ends)
+        self.loops = config.loops.start(seed, given, self.views)
+        self._refiner = config.refinement.start(self.views)
+        self._model = ModelBuilder(config.fusion)
+        self._checks = _EvenSample(_CHECKED_IMAGES)
+        self._depths: dict[int, float] = {}  # typical ranges, m
+        self._ambiguity_m: float | None = None
+        self._knows_errors = False
+
+    def add(self, ready: Ready, step: Step) -> None:
+        """Keep what joining, loops and refinement need of a frame with a pose."""
+        T, surface = step.T_component_camera, step.surface
+        assert T is not None
+        if isinstance(ready.frame, RangeFrame):
+            self._ambiguity_m = ready.frame.ambiguity_m
+        if surface is not None:
+            # Only who looks at surfaces states errors that can be relied on; ICP's are too small.
+            self._knows_errors = True
+            if self.views.wants(surface.index, surface.depth, T, step.component):
+                self.views.push(surface.thinned(_COLUMNS), T, step.component)
+        view: Frame = ready.clean
+        # Who looks at surfaces leaves the points alone, which take long to make.
+        if surface is None or self.loops.points or self._refiner.points:
+            view = as_cloud(ready.clean, _KEPT_POINTS)
+        self.loops.push(view, T)
+        self._refiner.push(view, T)
+
+    def add_to_model(self, frame: Frame, clean: Frame, step: Step) -> None:
+        """Keep what the model and the verdict need of a frame with a pose."""
+        if isinstance(frame, RangeFrame):
+            self._depths[frame.index] = _typical_range(frame)
+            if isinstance(clean, RangeFrame):
+                self._checks.add(lambda: whole(frame, clean))
+        self._model.add(clean, step.surface, _KEPT_POINTS)
+
+    def at_the_end(self) -> Kept:
+        """What the back end works on."""
+        return Kept(
+            self.loops,
+            self._refiner,
+            self._model,
+            self._checks.items,
+            self._depths,
+            self._ambiguity_m,
+            self._knows_errors,
+        )
+
+
+def _typical_range(frame: RangeFrame) -> float:
+    """Median radial range of some of the pixels, m; 0 where nothing is valid."""
+    ranges = frame.depth[::4, ::4]
+    if frame.depth_kind == "z":
+        ranges = ranges * ray_lengths(frame.camera)[::4, ::4]
+    known = ranges[ranges > 0]
+    return float(np.median(known)) if len(known) else 0.0
+
+
+class _EvenSample:
+    """Keeps at most `size` items of an endless stream, evenly spaced."""
+
+    def __init__(self, size: int) -> None:
+        self.items: list[RangeFrame] = []
+        self._size, self._step, self._count = size, 1, 0
+
+    def add(self, made: Callable[[], RangeFrame]) -> None:
+        if self._count % self._step == 0:
+            self.items.append(made())
+            if len(self.items) > self._size:
+                self.items = self.items[::2]
+                self._step *= 2
+        self._count += 1
