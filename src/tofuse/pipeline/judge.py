@@ -138,7 +138,8 @@ class Evidence:
 
     def runs_of(self, frames: Collection[int]) -> tuple[Range, ...]:
         """Ranges of the records with these indices."""
-        return self.runs([record.index in frames for record in self.records])
+        chosen = set(frames)
+        return self.runs([record.index in chosen for record in self.records])
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
