@@ -245,7 +245,11 @@ class KeyframeTracker(Tracker):
     def _begin_component(self, view: SurfaceMap, attempts: _Attempts) -> Step:
         """Start anew with a view that can't be connected, and look for where it may belong."""
         self._component += 1
-        links = self._relocalizer.links(view, self._keyframes, self._component)
+        last = None if self._last is None else self._last.view.index
+        adjacent = last if last is not None and view.index - last == 1 else None
+        links = self._relocalizer.links(
+            view, self._keyframes, self._component, self._usual, adjacent
+        )
         self._connected = any(link.certain for link in links)
         self._keyframes.add(Keyframe(view, np.eye(4), self._component))
         self._motion.interrupt()
@@ -281,7 +285,9 @@ class KeyframeTracker(Tracker):
         links: tuple[Link, ...] = ()
         if keyframe is self._last or self._keyframes.is_far(found.T, keyframe):
             if not self._connected:
-                links = self._relocalizer.links(view, self._keyframes, self._component)
+                links = self._relocalizer.links(
+                    view, self._keyframes, self._component, self._usual
+                )
                 self._connected = any(link.certain for link in links)
             self._keyframes.add(Keyframe(view, found.T, self._component))
         return Step(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
-from tofuse.registration.verification import Belief, Link, searched_link
+from tofuse.registration.verification import Belief, Link, UsualFit, searched_link
 
 # A search costs about as much as tracking so many frames. With one search for so many frames, being
 # lost costs no more than tracking does; some are free, as short recordings may be all large steps.
@@ -30,8 +30,18 @@ class Relocalizer:
         """Say that a frame was processed, which adds to the budget."""
         self._left += 1 / _FRAMES_PER_SEARCH
 
-    def links(self, view: SurfaceMap, keyframes: KeyframeMap, component: int) -> tuple[Link, ...]:
-        """Register a view of a component to keyframes of others; stops at a link that is certain."""
+    def links(
+        self,
+        view: SurfaceMap,
+        keyframes: KeyframeMap,
+        component: int,
+        usual: UsualFit,
+        last: int | None = None,
+    ) -> tuple[Link, ...]:
+        """Register a view of a component to keyframes of others; stops at a link that is certain.
+
+        `last` is the frame just before the view, if it has a pose.
+        """
         candidates: list[Keyframe] = []
         if len(keyframes) and keyframes.newest.component != component:
             candidates.append(keyframes.newest)
@@ -43,7 +53,8 @@ class Relocalizer:
             if self._belief is None or self._left < 1:
                 break
             self._left -= 1
-            link, _ = searched_link(view, keyframe.view, self._belief)
+            adjacent = keyframe.view.index == last
+            link, _ = searched_link(view, keyframe.view, self._belief, usual, adjacent=adjacent)
             if link is not None:
                 found.append(link)
                 if link.certain:

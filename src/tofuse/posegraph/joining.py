@@ -17,6 +17,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 
 from tofuse.geometry import se3
 from tofuse.kernels.motion import moved, twist_between
@@ -47,6 +49,9 @@ _LEARN = 16
 _VERIFY, _OVERLAP = 8, 0.2
 # Contradiction is unusual beyond so many standard deviations above the median of neighbours.
 _SIGMAS, _LEAST_SPREAD = 3.0, 0.02
+# By which fraction of their path components may have drifted in themselves; how far a link may be
+# off, and an alignment can follow: fractions of the depth, and rad.
+_DRIFT, _LINK_ERROR, _FOLLOWED = 0.05, 0.02, 0.1
 # Lengths and turns of the path on either side of a gap say how fast the camera is: it may go on
 # three times as fast, and is somewhere near where it was in any case (a fraction of the depth, rad).
 _AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
@@ -58,6 +63,7 @@ _RIVAL = 0.5
 # How many alignments from the identity are tried for each component, beside the searches.
 _ALIGNMENTS = 6
 _SHIFT = 0.35
+_NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +153,7 @@ class Joining:
     """
 
     belief: Belief = Belief()  # noqa: RUF009 - immutable
-    searches: int = 24
+    searches: int = 12
     searches_per_frame: float = 0.02
     bridge: bool = True
 
@@ -267,7 +273,7 @@ class _Joiner:
             if a is b or before.recording != after.recording:
                 continue
             link = _bridged(before, after)
-            if link is not None and not self._contradicts(a, b, self._T_a_b(a, b, link)):
+            if link is not None and not self._contradicts(a, b, link):
                 self._merge(a, b, link, [Join(link, "motion", True)])
 
     def groups(self) -> list[Group]:
@@ -312,7 +318,7 @@ class _Joiner:
             if link is not None:
                 return link
         self._searches -= 1
-        return searched_link(second.view, first.view, self._options.belief)[0]
+        return searched_link(second.view, first.view, self._options.belief, self._usual)[0]
 
     def _island_of(self, component: int) -> _Island:
         return next(island for island in self._islands if component in island.T)
@@ -344,7 +350,9 @@ class _Joiner:
         agree = np.ones((n, n), bool)
         for p in range(n):
             for q in range(p + 1, n):
-                agree[p, q] = agree[q, p] = self._say_the_same(b, between[p], T[p], T[q])
+                agree[p, q] = agree[q, p] = self._say_the_same(
+                    a, b, between[p], between[q], T[p], T[q]
+                )
         weights = [_weight(link) for link in between]
         chosen = maximum_consistent_set(agree, weights)
         weight = sum(weights[k] for k in chosen)
@@ -355,11 +363,63 @@ class _Joiner:
             return None
         return weight, [between[k] for k in chosen]
 
-    def _say_the_same(self, b: _Island, link: Link, T: Float64, other: Float64) -> bool:
-        """Whether two T_a_b put the view of a link at the same place, but for drift."""
-        frame = link.j if self._component_of[link.j] in b.T else link.i
-        at = self._T_island(b, frame)
-        return not self._options.belief.search.differ(T @ at, other @ at)
+    def _say_the_same(
+        self, a: _Island, b: _Island, first: Link, second: Link, T: Float64, other: Float64
+    ) -> bool:
+        """Whether the T_a_b of two links put the view of the first one at the same place.
+
+        Drift between the views of the two links, on both sides, is allowed for.
+        """
+        i, j = self._ends(a, first)
+        k, m = self._ends(a, second)
+        drift = _DRIFT * (self._path(a, i).get(k, np.inf) + self._path(b, j).get(m, np.inf))
+        at = self._T_island(b, j)
+        between = se3.inverse(T @ at) @ other @ at
+        search, depth = self._options.belief.search, self._depth_of(j)
+        return bool(
+            np.linalg.norm(between[:3, 3]) <= search.distinct_m + drift * depth
+            and se3.angle(between) <= search.distinct_rad + drift
+        )
+
+    def _ends(self, a: _Island, link: Link) -> tuple[int, int]:
+        """The frames of a link: the one in `a`, and the other."""
+        return (link.i, link.j) if self._component_of[link.i] in a.T else (link.j, link.i)
+
+    def _depth_of(self, frame: int) -> float:
+        return self._stretches[self._component_of[frame]].depth
+
+    def _path(self, island: _Island, start: int) -> dict[int, float]:
+        """Length of the way from a frame to those with kept views or joins, as drift grows with it.
+
+        Along the poses of components, and over what joins them; turns in rad plus motions as a
+        fraction of the depth.
+        """
+        nodes = {v.index for v in self._views.values() if self._component_of[v.index] in island.T}
+        nodes |= {f for join in island.joins for f in (join.link.i, join.link.j)} | {start}
+        nodes |= {
+            f
+            for link in self._links
+            for f in (link.i, link.j)
+            if self._component_of[f] in island.T
+        }
+        order = sorted(nodes, key=lambda f: (self._component_of[f], f))
+        T = np.stack([self._T_island(island, f) for f in order])
+        row = {f: k for k, f in enumerate(order)}
+        edges = [
+            (row[f], row[g])
+            for f, g in zip(order, order[1:], strict=False)
+            if self._component_of[f] == self._component_of[g]
+        ]
+        edges += [(row[join.link.i], row[join.link.j]) for join in island.joins]
+        if not edges:
+            return {start: 0.0}
+        i, j = np.array(edges).T
+        between = se3.inverse(T[i]) @ T[j]
+        depth = np.array([self._depth_of(order[k]) for k in i])
+        far = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
+        graph = csr_array((far + 1e-9, (i, j)), shape=(len(order), len(order)))
+        away = dijkstra(graph, directed=False, indices=row[start])
+        return {f: float(away[k]) for f, k in row.items()}
 
     def _join(self, a: _Island, b: _Island, links: list[Link]) -> bool:
         """Join two islands if what links say is verified."""
@@ -369,7 +429,7 @@ class _Joiner:
         certain = any(link.certain for link in links)
         if (
             not (certain or len(links) + len(extra) > 1)
-            or self._contradicts(a, b, T_a_b)
+            or self._contradicts(a, b, best)
             or not self._reachable(a, b, T_a_b)
         ):
             between = self._links_between()[self._positions(a, b)]
@@ -416,12 +476,42 @@ class _Joiner:
                 break
         return found
 
-    def _contradicts(self, a: _Island, b: _Island, T_a_b: Float64) -> bool:
-        """Whether views of both sides contradict each other more than neighbours do."""
-        pairs = self._overlapping(a, b, T_a_b)
-        overlap = sum(seen.overlap for *_, seen in pairs)
-        against = sum(seen.violation + seen.clash for *_, seen in pairs)
+    def _contradicts(self, a: _Island, b: _Island, link: Link) -> bool:
+        """Whether views of both sides contradict each other more than neighbours do.
+
+        Islands have drifted in themselves, the more the further it is from the link: what
+        contradicts at the pose that they imply counts only if no pose nearby explains it, and says
+        nothing where the drift may be larger than an alignment can follow.
+        """
+        overlap = against = 0.0
+        T_a_b = self._T_a_b(a, b, link)
+        i, j = self._ends(a, link)
+        from_i, from_j = self._path(a, i), self._path(b, j)
+        for first, second, T, at_implied in self._overlapping(a, b, T_a_b):
+            drift = _DRIFT * (from_i[first.index] + from_j[second.index])
+            if drift > _FOLLOWED:
+                continue
+            seen = at_implied
+            if seen.contradiction > self._contradiction:
+                at = [Target(first.view, np.eye(4))]
+                scale = self._usual.noise_scale
+                aligned = align(second.view, at, T, _NEARBY, usual_scale=scale)
+                if self._drifted(T, aligned.T_world_source, first.view.depth, drift):
+                    near = agreement(
+                        second.view, first.view, aligned.T_world_source, self_scaled(self._usual)
+                    )
+                    seen = min(seen, near, key=lambda found: found.contradiction)
+            overlap += seen.overlap
+            against += seen.violation + seen.clash
         return overlap > 0 and against / overlap > self._contradiction
+
+    def _drifted(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
+        """Whether two poses differ by no more than drift and what a single link is off by."""
+        between = se3.inverse(T) @ other
+        limit = drift + _LINK_ERROR
+        return bool(
+            np.linalg.norm(between[:3, 3]) <= limit * depth and se3.angle(between) <= limit
+        )
 
     def _confirming(
         self, a: _Island, b: _Island, T_a_b: Float64, known: list[Link]

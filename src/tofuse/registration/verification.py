@@ -240,9 +240,17 @@ _COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 
 
 
 def searched_link(
-    source: SurfaceMap, target: SurfaceMap, belief: Belief
+    source: SurfaceMap,
+    target: SurfaceMap,
+    belief: Belief,
+    usual: UsualFit,
+    *,
+    adjacent: bool = False,
 ) -> tuple[Link | None, str]:
     """Register two views by an exhaustive search.
+
+    A pose that leads clearly is certain. So is one that leads by less where other evidence agrees:
+    the views are adjacent in time, or an alignment from the identity ends there.
 
     Returns
     -------
@@ -259,14 +267,19 @@ def searched_link(
         return None, objection
     at = [Target(target, np.eye(4))]
     aligned = align(source, at, match.T_target_source, _AFTER_SEARCH)
-    doubt = belief.objection(match, alone=True)
+    T = aligned.T_world_source
+    doubt = "" if adjacent else belief.objection(match, alone=True)
+    if doubt:
+        near = aligned_link(source, target, np.eye(4), usual)
+        if near is not None and not belief.search.differ(near.T_i_j, T):
+            doubt = ""
     C = covariance(source, at, aligned, _AFTER_SEARCH, UncertaintyOptions())
     how = f"found by exhaustive search, margin {match.margin:.0%}"
     return (
         Link(
             target.index,
             source.index,
-            aligned.T_world_source,
+            T,
             np.asarray(np.linalg.inv(C), np.float64),
             match.agreement,
             match.margin,
