@@ -7,7 +7,7 @@ tracked and held in every direction, nothing but what is said of the clean seque
 the result, and the error is beyond three times the sigma that the pose states. Where there is no
 reference the clean run is it.
 
-    python benchmarks/robustness.py --scenes room rail torso corridor [--cases "depth"]
+    python benchmarks/spoilt.py --scenes room rail torso corridor [--cases "depth"]
 """
 
 from __future__ import annotations
