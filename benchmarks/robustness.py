@@ -1,235 +1,343 @@
-"""Spoilt recordings: does a wrong pose ever look fine?
+"""Is any recording lost, is any wrong pose unmarked, is any wrong join made?
 
-Of simulated and recorded sequences one frame, or all from one on, or all, are spoilt; the default
-tracker and the checks of the whole run have to notice. A pose is wrong if it is off by more than
-5 cm or 3 degrees beyond what the clean sequence drifts. It looks fine if the frame is called
-tracked and held in every direction, nothing but what is said of the clean sequence too is said of
-the result, and the error is beyond three times the sigma that the pose states. Where there is no
-reference the clean run is it.
+`real`: every recording of real cameras that is a sequence, beside small_gicp's map, KISS-ICP and
+Open3D's odometry on the same frames, filtered alike. Of each peer the tuning is taken whose first
+frames agree best with each other. `stress`: simulated recordings with exact truth, to which happens
+what happens to people (`stress.py`). What counts as a wrong pose, as marked and as a wrong join is
+said, and computed, in `scoring.py`. Peers mark nothing and know one component only.
 
-    python benchmarks/robustness.py --scenes room rail torso corridor [--cases "depth"]
+    python benchmarks/robustness.py real [--names kitchen] [--peers]
+    python benchmarks/robustness.py stress [--scenes room] [--cases covered] [--seeds 3] [--quick]
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
 
+import scoring
 import sequences
-from tofuse.geometry import se3
-from tofuse.pipeline.config import from_method
-from tofuse.pipeline.mapper import Mapper
-from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.results.types import Reconstruction
+import stress
+from peers import Method, kiss, o3d, sgicp
+from recorded import RECORDED, Recorded
+from scoring import Part, Score, Truth
+from tofuse.errors import InputError
+from tofuse.evaluation.consistency import map_consistency
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.run import Options, resolve
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.recording import Recording
 
 Float64 = NDArray[np.float64]
-Spoil = Callable[[RangeFrame], RangeFrame]
 
-FRAMES, FIRST = 16, 7
-OFF_M, OFF_RAD = 0.05, np.radians(3.0)
-SIGMAS = 3.0
-
-
-def arranged(order: tuple[slice, ...]) -> Spoil:
-    """Spoil by putting the pixels into another order."""
-
-    def spoil(frame: RangeFrame) -> RangeFrame:
-        light = frame.amplitude_image
-        return replace(
-            frame,
-            depth=np.ascontiguousarray(frame.depth[order]),
-            amplitude_image=None if light is None else np.ascontiguousarray(light[order]),
-        )
-
-    return spoil
+OURS = "tofuse"
+TUNING_FRAMES = 40
+QUICK_FRAMES = 100
 
 
-def scaled(factor: float) -> Spoil:
-    """Spoil by another unit of depth."""
-    return lambda frame: replace(frame, depth=frame.depth * np.float32(factor))
+@dataclass(frozen=True)
+class Row:
+    """What became of one recording.
+
+    Attributes
+    ----------
+    map_rms_m, map_inliers
+        Map consistency of the main component; NaN where no two views overlap.
+    components
+        How many there are, the main one and all that is joined to it counted once.
+    problem
+        Why there is no result, or empty.
+    compared
+        Whether there is a truth or reference.
+    """
+
+    group: str
+    name: str
+    method: str
+    score: Score
+    seconds: float
+    verdict: str = ""
+    components: int = 1
+    map_rms_m: float = np.nan
+    map_inliers: float = np.nan
+    problem: str = ""
+    compared: bool = True
 
 
-def sparse(frame: RangeFrame) -> RangeFrame:
-    """Leave one pixel in a hundred."""
-    return frame.keep(np.random.default_rng([1, frame.index]).random(frame.depth.shape) < 0.01)
+# ---- Runs ----------------------------------------------------------------------------------------
 
 
-def salted(frame: RangeFrame) -> RangeFrame:
-    """Put 30 % of the pixels very near or very far."""
-    rng = np.random.default_rng([2, frame.index])
-    hit = rng.random(frame.depth.shape) < 0.3
-    wrong = rng.choice([0.3, 8.0], frame.depth.shape)
-    return replace(frame, depth=np.where(hit, wrong, frame.depth).astype(np.float32))
+def lost(count: int, truth: Truth) -> Score:
+    """Score of a run without a result."""
+    nothing = Part(np.full((count, 4, 4), np.nan), (None,) * count)
+    return scoring.score([nothing], truth)
 
 
-def constant(frame: RangeFrame) -> RangeFrame:
-    """Put all pixels at one depth."""
-    return replace(frame, depth=np.full_like(frame.depth, np.median(frame.depth[frame.valid])))
+def ours(
+    recording: Recording, threads: int, *, turning: bool = False
+) -> tuple[list[Part], str, float, str]:
+    """Run the default method; parts, verdict, seconds, and what went wrong."""
+    began = time.perf_counter()
+    try:
+        config = resolve(Options(out=Path("unused"), object=turning))
+        result = reconstruct(recording, config, threads=threads)
+    except InputError as error:
+        return [], "", time.perf_counter() - began, str(error)
+    except Exception as error:
+        # A benchmark of robustness counts what breaks instead of breaking itself.
+        return [], "", time.perf_counter() - began, f"crashed: {type(error).__name__}: {error}"
+    seconds = time.perf_counter() - began
+    parts = scoring.parts_of(result, recording.indices)
+    return parts, result.diagnostics.verdict, seconds, ""
 
 
-def covered(frame: RangeFrame) -> RangeFrame:
-    """Hold a hand before the left half."""
-    depth = frame.depth.copy()
-    half = depth.shape[1] // 2
-    v, u = np.mgrid[: depth.shape[0], :half]
-    depth[:, :half] = 0.35 + 0.02 * np.sin(u / 9) + 0.03 * np.cos(v / 13)
-    light = frame.amplitude_image
-    if light is not None:
-        light = light.copy()
-        light[:, :half] = np.percentile(light, 99)
-    return replace(frame, depth=depth, amplitude_image=light)
+def peer_methods() -> dict[str, tuple[str, list[Method]]]:
+    """Label of each peer -> the module that it needs, and its tunings."""
+    maps = [sgicp.Map(v, m) for v, m in ((0.02, 0.05), (0.04, 0.1), (0.08, 0.2))]
+    return {
+        "small_gicp map": ("small_gicp", list(maps)),
+        "KISS-ICP": ("kiss_icp", [kiss.KissIcp(0.05, 0.1), kiss.KissIcp(0.1, 0.5)]),
+        "Open3D odometry": ("open3d", [o3d.Odometry()]),
+    }
 
 
-def saturated(frame: RangeFrame) -> RangeFrame:
-    """Saturate the amplitude."""
-    light = frame.amplitude_image
-    if light is None:
-        return frame
-    return replace(frame, amplitude_image=np.full_like(light, SATURATED_AMPLITUDE))
-
-
-SPOILT: dict[str, Spoil] = {
-    "blank": scaled(0),
-    "1 % valid": sparse,
-    "salt and pepper": salted,
-    "mirrored left to right": arranged((slice(None), slice(None, None, -1))),
-    "mirrored top to bottom": arranged((slice(None, None, -1),)),
-    "turned round": arranged((slice(None, None, -1), slice(None, None, -1))),
-    "depth x 10": scaled(10),
-    "depth / 10": scaled(0.1),
-    "depth x 1.1": scaled(1.1),
-    "depth x 0.9": scaled(0.9),
-    "one depth": constant,
-    "half covered": covered,
-    "saturated": saturated,
-}
-
-
-def cases(frames: list[RangeFrame], other: list[RangeFrame]) -> dict[str, tuple[list, list]]:
-    """Name of a case -> frames, and for each which of the clean frames it is, or None."""
-    n = min(FRAMES, len(frames))
-    first = min(FIRST, n // 2)
-    plain = list(range(n))
-    found: dict[str, tuple[list, list]] = {}
-    for name, spoil in SPOILT.items():
-        for how, last in (("one frame", first + 1), ("from a frame on", n)):
-            bad = range(first, last)
-            found[f"{name}, {how}"] = (
-                [spoil(frames[k]) if k in bad else frames[k] for k in plain],
-                plain,
-            )
-    for how, last in (("one frame", first + 1), ("from a frame on", n)):
-        bad = range(first, last)
-        truth = [None if k in bad else k for k in plain]
-        found[f"another room, {how}"] = (
-            [other[k] if k in bad else frames[k] for k in plain],
-            truth,
-        )
-        hung = [first - 1 if k in bad else k for k in plain]
-        found[f"frozen, {how}"] = ([frames[k] for k in hung], plain)
-    found["frozen from the start"] = ([frames[0]] * n, [0] * n)
-    for name in ("depth x 10", "depth / 10"):
-        found[f"{name}, all"] = [SPOILT[name](frames[k]) for k in plain], plain
-    if frames[0].amplitude_image is not None:
-        amiss = [
-            replace(SPOILT["mirrored left to right"](f), amplitude_image=f.amplitude_image)
-            for f in frames[:n]
-        ]
-        found["depth mirrored, amplitude not, all"] = amiss, plain
-    for far in (4, 8, 14, 32):
-        path = [*range(8), *range(8 + far, 12 + far), 7, 6, 5, 4]
-        if max(path) < len(frames):
-            found[f"jump of {far} frames and back"] = ([frames[k] for k in path], path)
-    return found
-
-
-def run(frames: Sequence[RangeFrame]) -> Reconstruction | None:
-    """Run the default method on frames that are corrected and filtered already."""
-    config = replace(from_method("default"), corrections=(), filters=())
-    mapper = Mapper(config, threads=1)
-    poses = [mapper.push(replace(frame, index=k)) for k, frame in enumerate(frames)]
-    return mapper.finish() if any(T is not None for T in poses) else None
-
-
-def errors(result: Reconstruction, poses: Sequence[Float64 | None]) -> Float64:
-    """(N, 2) m and rad; NaN without an estimate, infinite where there is no true pose."""
-    out = np.full((len(poses), 2), np.nan)
-    for k, true in enumerate(poses):
-        if result.has_pose[k]:
-            out[k] = np.inf
-            if true is not None:
-                off = se3.inverse(true) @ result.trajectory[k]
-                out[k] = np.linalg.norm(off[:3, 3]), float(se3.angle(off))
+def peer_poses(method: Method, frames: Sequence[RangeFrame], threads: int) -> Float64:
+    """(N, 4, 4) poses that a peer gives, NaN where none."""
+    session = method.start(frames[0], threads)
+    out = np.full((len(frames), 4, 4), np.nan)
+    for k, frame in enumerate(frames):
+        T = session.push(session.prepare(frame))
+        if T is not None:
+            out[k] = T
     return out
 
 
-def admitted(result: Reconstruction, off: Float64) -> NDArray[np.bool_]:
-    """(N,) whether errors (N, 2), m and rad, are such as the frames themselves allow for."""
-    out = np.array([len(frame.unobservable) > 0 for frame in result.diagnostics.frames])
-    for k, frame in enumerate(result.diagnostics.frames):
-        if not out[k] and frame.covariance is not None:
-            parts = frame.covariance[:3, :3], frame.covariance[3:, 3:]
-            sigma = np.sqrt([np.linalg.eigvalsh(part)[-1] for part in parts])
-            out[k] = bool((off[k] <= SIGMAS * sigma).all())
-    return out
+def as_part(poses: Float64) -> Part:
+    """Poses of a method that states nothing about them."""
+    nothing = np.zeros((0, 6))
+    records = tuple(
+        SimpleNamespace(index=k, status="tracked", covariance=None, unobservable=nothing)
+        for k in range(len(poses))
+    )
+    return Part(poses, records)
 
 
-def main() -> None:
-    """Print a row for each case in which a pose is wrong, and the counts."""
+def peer(
+    label: str, recording: Recording, frames: Sequence[RangeFrame], threads: int
+) -> tuple[list[Part], float, str]:
+    """Run a peer with its best tuning; parts, seconds, and what went wrong."""
+    module, tunings = peer_methods()[label]
+    if find_spec(module) is None:
+        return [], 0.0, f"{module} is not installed"
+    began = time.perf_counter()
+    try:
+        best = tunings[0]
+        if len(tunings) > 1:
+            few = frames[:TUNING_FRAMES]
+            part = recording.select(end=len(few))
+            best = max(tunings, key=lambda m: agreement(part, peer_poses(m, few, threads))[1])
+        began = time.perf_counter()
+        poses = peer_poses(best, frames, threads)
+    except Exception as error:
+        return [], time.perf_counter() - began, f"failed: {type(error).__name__}: {error}"
+    return [as_part(poses)], time.perf_counter() - began, ""
+
+
+def agreement(recording: Recording, poses: Float64) -> tuple[float, float]:
+    """Map consistency, rms in m and share of inliers; NaN and 0 where no two views overlap."""
+    try:
+        found = map_consistency(recording, poses)
+    except InputError:
+        return np.nan, 0.0
+    return found.rms_m, float(np.nan_to_num(found.inlier_share))
+
+
+# ---- Real recordings -----------------------------------------------------------------------------
+
+
+def real(
+    one: Recorded, data: Path, threads: int, frames: int | None, *, beside: bool
+) -> Iterator[Row]:
+    """Give the rows of one recording."""
+    recording = one.open(data).select(end=frames)
+    n = len(recording)
+    whole = np.zeros(n, np.intp)
+    known = [poses[:n] for poses in one.references(data, one.open(data))]
+    unknown = np.full((n, 4, 4), np.nan)
+    truths = [Truth(poses, whole, one.tolerance) for poses in known or [unknown]]
+
+    def row(method: str, parts: list[Part], seconds: float, problem: str, verdict: str) -> Row:
+        if not parts:
+            return Row("real", one.title, method, lost(n, truths[0]), seconds, problem=problem)
+        score = min((scoring.score(parts, truth) for truth in truths), key=lambda s: s.wrong)
+        rms, inliers = agreement(recording, parts[0].poses)
+        return Row(
+            "real",
+            one.title,
+            method,
+            score,
+            seconds,
+            verdict,
+            len(parts),
+            rms,
+            inliers,
+            compared=bool(known),
+        )
+
+    parts, verdict, seconds, problem = ours(recording, threads, turning=one.object)
+    yield row(OURS, parts, seconds, problem, verdict)
+    if not beside or one.object:
+        return
+    _, cleaned, _ = sequences.prepared(recording)
+    for label in peer_methods():
+        parts, seconds, problem = peer(label, recording, cleaned, threads)
+        yield row(label, parts, seconds, problem, "")
+
+
+# ---- Stress --------------------------------------------------------------------------------------
+
+
+def stressed(case: stress.Case, threads: int, *, beside: bool) -> Iterator[Row]:
+    """Give the rows of one case."""
+    n = len(case.recording)
+    parts, verdict, seconds, problem = ours(case.recording, threads)
+    score = scoring.score(parts, case.truth) if parts else lost(n, case.truth)
+    yield Row(case.scene, case.name, OURS, score, seconds, verdict, len(parts), problem=problem)
+    if not beside:
+        return
+    _, cleaned, _ = sequences.prepared(case.recording)
+    for label in peer_methods():
+        parts, seconds, problem = peer(label, case.recording, cleaned, threads)
+        score = scoring.score(parts, case.truth) if parts else lost(n, case.truth)
+        yield Row(case.scene, case.name, label, score, seconds, problem=problem)
+
+
+# ---- Words ---------------------------------------------------------------------------------------
+
+STRESS_HEAD = (
+    f"{'scene':10} {'case':31} {'method':15} frames  main  covered  parts  wrong unmarked"
+    f" (by reason only)  wrong joins  ATE mm  verdict       s"
+)
+REAL_HEAD = (
+    f"{'recording':35} {'method':15} frames  main  parts  ATE mm  map mm  inliers  wrong"
+    f" unmarked  wrong joins  verdict       s"
+)
+
+
+def stress_line(row: Row) -> str:
+    """Return a row of the stress part."""
+    s = row.score
+    share = f"{s.covered / s.overlapping:.0%}" if s.overlapping else "-"
+    return (
+        f"{row.group:10} {row.name:31} {row.method:15} {s.frames:6} {s.main / s.frames:5.0%}"
+        f" {share:>8} {row.components:6} {s.wrong:6} {s.unmarked:8} {s.by_reason:17}"
+        f" {s.joins:12}  {1000 * s.ate_m:6.0f}  {row.verdict:8} {row.seconds:6.1f}"
+        f"  {row.problem}"
+    ).rstrip()
+
+
+def real_line(row: Row) -> str:
+    """Return a row of the real part."""
+    s = row.score
+    counts = (s.wrong, s.unmarked, s.joins) if row.compared else ("-", "-", "-")
+    ate = f"{1000 * s.ate_m:.0f}" if row.compared else "-"
+    return (
+        f"{row.name:35} {row.method:15} {s.frames:6} {s.main / s.frames:5.0%} {row.components:6}"
+        f"  {ate:>6}  {1000 * row.map_rms_m:6.1f}  {row.map_inliers:7.1%} {counts[0]:>6}"
+        f" {counts[1]:>8} {counts[2]:>12}  {row.verdict:8} {row.seconds:6.1f}  {row.problem}"
+    ).rstrip()
+
+
+def summary(rows: Sequence[Row]) -> Iterator[str]:
+    """Give a line for each method: what all runs come to."""
+    for method in dict.fromkeys(row.method for row in rows):
+        own = [row for row in rows if row.method == method]
+        scores = [row.score for row in own]
+        overlapping = sum(s.overlapping for s in scores)
+        failed = [row for row in own if row.problem]
+        posed = sum(s.main for s in scores)
+        yield (
+            f"{method}: {len(own)} runs, {len(failed)} without a result; "
+            f"{sum(s.covered for s in scores) / max(overlapping, 1):.1%} of what overlaps covered "
+            f"(in the worst run {min(s.covered / max(s.overlapping, 1) for s in scores):.0%}); "
+            f"wrong poses {sum(s.wrong for s in scores)} of {posed} in "
+            f"{sum(s.wrong > 0 for s in scores)} runs, not marked "
+            f"{sum(s.unmarked for s in scores)} in {sum(s.unmarked > 0 for s in scores)} runs, "
+            f"marked by a reason alone {sum(s.by_reason for s in scores)}; "
+            f"wrong joins {sum(s.joins for s in scores)} "
+            f"({sum(s.joins_by_motion for s in scores)} with motion) in "
+            f"{sum(s.joins > 0 for s in scores)} runs"
+        )
+
+
+def keep(rows: Sequence[Row], path: Path) -> None:
+    """Write the rows as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a row for each run, and what they come to."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument(
-        "--scenes", nargs="+", type=sequences.check, default=["room", "rail", "torso"]
-    )
-    parser.add_argument("--cases", default="", help="only those whose name contains this")
+    parser.add_argument("parts", nargs="*", choices=["real", "stress", []], default=[])
+    parser.add_argument("--names", nargs="+", default=[""], help="of real ones, parts of names")
+    parser.add_argument("--scenes", nargs="+", choices=stress.SCENES, default=list(stress.SCENES))
+    parser.add_argument("--cases", default="", metavar="SUBSTRING")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N")
+    parser.add_argument("--quick", action="store_true", help="fewer cases; at most 100 frames")
+    parser.add_argument("--peers", action="store_true", help="run the peers as well")
+    parser.add_argument("--frames", type=int, help="of real ones only the first so many")
+    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=sequences.DATA)
-    options = parser.parse_args()
-    # Not the same room with chairs in it.
-    others = {"room": "rail", "torso": "box", "box": "torso", "iphone": "kitchen"}
-    others |= {"empty-room": "rail", "empty-room-uniform": "rail"}
-    print(f"{'scene':12} {'amplitude':9} {'case':40} wrong  marked  reasons")
-    counts = np.zeros(3, int)
-    for scene in options.scenes:
-        sequence = sequences.load(scene, options.data, 48)
-        foreign = sequences.load(others.get(scene, "room"), options.data, FRAMES)
-        for lit in (True, False):
-            frames, other = (
-                [f if lit else replace(f, amplitude_image=None, color_image=None) for f in s.frames]
-                for s in (sequence, foreign)
-            )
-            clean = run(frames)
-            assert clean is not None
-            reference = se3.inverse(sequence.reference[0]) @ sequence.reference
-            if not np.isfinite(reference).all():
-                reference = clean.trajectory
-            drift = np.nanmax(errors(clean, list(reference[: len(frames)])), axis=0)
-            said = {reason.code for reason in clean.diagnostics.reasons}
-            for name, (spoilt, path) in cases(frames, other).items():
-                if options.cases not in name:
-                    continue
-                counts[0] += 1
-                result = run(spoilt)
-                if result is None:
-                    continue
-                off = errors(result, [None if k is None else reference[k] for k in path])
-                tracked = [f.status == "tracked" for f in result.diagnostics.frames]
-                wrong = (off > drift + np.array([OFF_M, OFF_RAD])).any(1) & tracked
-                if not wrong.any():
-                    continue
-                new = {reason.code for reason in result.diagnostics.reasons} - said
-                marked = bool(new) or not (wrong & ~admitted(result, off)).any()
-                counts[1] += 1
-                counts[2] += not marked
-                word = "yes" if marked else "NO"
-                row = f"{scene:12} {lit!s:9} {name:40} {wrong.sum():5}  {word:6}"
-                print(row, " ".join(sorted(new)), flush=True)
-    print(f"{counts[0]} cases, {counts[1]} with a wrong pose, {counts[2]} of them look fine")
+    parser.add_argument("--out", type=Path, default=sequences.OUT)
+    options = parser.parse_args(arguments)
+    wanted = options.parts or ["real", "stress"]
+    if "real" in wanted:
+        frames = options.frames or (QUICK_FRAMES if options.quick else None)
+        rows: list[Row] = []
+        print(REAL_HEAD, flush=True)
+        for name, one in RECORDED.items():
+            if not any(part in name for part in options.names):
+                continue
+            try:
+                for row in real(one, options.data, options.threads, frames, beside=options.peers):
+                    rows.append(row)
+                    print(real_line(row), flush=True)
+            except FileNotFoundError as error:
+                print(f"{one.title}: left out, there is no {error}", flush=True)
+        _end(rows, options.out / "robustness_real.json")
+    if "stress" in wanted:
+        rows = []
+        print(STRESS_HEAD, flush=True)
+        for seed in range(options.seeds):
+            for name in options.scenes:
+                made = stress.cases(
+                    stress.SCENES[name], seed, quick=options.quick, containing=options.cases
+                )
+                for case in made:
+                    for row in stressed(case, options.threads, beside=options.peers):
+                        rows.append(row)
+                        print(stress_line(row), flush=True)
+        _end(rows, options.out / "robustness_stress.json")
+
+
+def _end(rows: Sequence[Row], path: Path) -> None:
+    print()
+    for line in summary(rows):
+        print(line)
+    print()
+    keep(rows, path)
 
 
 if __name__ == "__main__":

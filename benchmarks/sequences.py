@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import poses_of_frames
 from tofuse.files.trajectory import read_tum
-from tofuse.filters.base import apply_filters
+from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.foreground import Foreground
 from tofuse.pipeline.methods import default
 from tofuse.pipeline.reconstruct import fitted
@@ -80,8 +80,27 @@ def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = Fals
     if fresh:
         shutil.rmtree(OUT / "recordings" / name, ignore_errors=True)
     recording = kind.open(data).select(end=frames)
-    config = fitted(default("range"), recording)
     cut = () if kind.farthest_m is None else (Foreground(kind.farthest_m),)
+    tracked, cleaned, bare = prepared(recording, cut)
+    reference = recording.reference
+    if reference is None:
+        reference = np.full((len(tracked), 4, 4), np.nan)
+    source = ArraySource(bare, reference, metadata=recording.metadata)
+    return Sequence(
+        f"{kind.title}, {len(tracked)} frames",
+        tracked,
+        cleaned,
+        Recording.of(source, name, "benchmark"),
+        reference,
+        kind.exact,
+    )
+
+
+def prepared(
+    recording: Recording, cut: tuple[Filter, ...] = ()
+) -> tuple[tuple[RangeFrame, ...], tuple[RangeFrame, ...], list[Frame]]:
+    """Return frames as the default's tracker gets them, as its model does, and as they are."""
+    config = fitted(default("range"), recording)
     correctors = [correction.start() for correction in config.corrections]
     past: deque[Frame] = deque(maxlen=config.window - 1)
     tracked, cleaned, bare = [], [], []
@@ -92,18 +111,7 @@ def load(name: str, data: Path, frames: int | None = None, *, fresh: bool = Fals
         tracked.append(apply_filters((*cut, *config.filters), frame, past)[0])
         cleaned.append(apply_filters(config.model_filters, tracked[-1], past)[0])
         past.append(frame)
-    reference = recording.reference
-    if reference is None:
-        reference = np.full((len(tracked), 4, 4), np.nan)
-    source = ArraySource(bare, reference, metadata=recording.metadata)
-    return Sequence(
-        f"{kind.title}, {len(tracked)} frames",
-        _images(tracked),
-        _images(cleaned),
-        Recording.of(source, name, "benchmark"),
-        reference,
-        kind.exact,
-    )
+    return _images(tracked), _images(cleaned), bare
 
 
 def _images(frames: Iterable[Frame]) -> tuple[RangeFrame, ...]:
@@ -121,7 +129,7 @@ def _recorded(*parts: str) -> Callable[[Path], Recording]:
     return opened
 
 
-def _kinect_loop(data: Path) -> Recording:
+def kinect_loop(data: Path) -> Recording:
     """Stop-and-go views; beside them are the poses of the robot that carried the camera."""
     recording = _recorded("kinectv2_loop", "recording")(data)
     times, poses = read_tum(Path(recording.path) / "reference_poses.txt")
@@ -151,7 +159,7 @@ KINDS = {
     "iphone": _Kind(
         "Chair, iPhone LiDAR, 256 x 192", _recorded("iphone_chair_3dscannerapp"), False
     ),
-    "kinect": _Kind("Loop round boxes, Kinect v2, 512 x 424", _kinect_loop, False),
+    "kinect": _Kind("Loop round boxes, Kinect v2, 512 x 424", kinect_loop, False),
     "corridor": _Kind(
         "Corridor, SR4000, 176 x 144", _recorded("sr4000_corridor"), False, referenced=False
     ),

@@ -42,8 +42,9 @@ class Boards:
     boards: list[Board]
     ambient: float = 0.0
     name: str = field(default="boards")
+    passing_surfaces: frozenset[int] = frozenset()
 
-    def cast(self, origins, directions, T_world_object=None) -> Hits:
+    def cast(self, origins, directions, T_room_bodies=None) -> Hits:
         directions = np.asarray(directions, float)
         origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
         best = np.full(len(directions), np.inf)

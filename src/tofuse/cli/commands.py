@@ -194,7 +194,13 @@ def simulate(arguments: argparse.Namespace) -> int:
     """``tofuse simulate``."""
     from tofuse.kernels.threads import threads
     from tofuse.pipeline.demo import simulate_to
+    from tofuse.simulation.passing import Passing
 
+    passing = None
+    if arguments.with_person is not None:
+        passing = Passing("person", arguments.with_person)
+    elif arguments.with_box is not None:
+        passing = Passing("box", arguments.with_box)
     with progress_for(as_json=False) as progress, threads(arguments.threads):
         frames = simulate_to(
             arguments.scene,
@@ -203,7 +209,9 @@ def simulate(arguments: argparse.Namespace) -> int:
             seed=arguments.seed or 0,
             every=arguments.every,
             frames=arguments.frames,
+            first=arguments.first or 0,
             texture=not arguments.uniform,
+            passing=passing,
             without=tuple(w for w in arguments.without.split(",") if w),
             correction=not arguments.no_correction,
             imu=arguments.imu,

@@ -205,7 +205,16 @@ def _simulate(commands: Any) -> None:
     p.add_argument("--camera", default="sr4000", metavar="NAME", help="which camera (sr4000)")
     p.add_argument("--every", type=_count, metavar="N", help="stride (default: the thesis's)")
     p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
+    p.add_argument("--first", type=_seed_number, metavar="K", help="raw frame to begin with (0)")
     p.add_argument("--uniform", action="store_true", help="one albedo everywhere, no texture")
+    passing = p.add_mutually_exclusive_group()
+    for kind, does in (("person", "walks"), ("box", "slides")):
+        passing.add_argument(
+            f"--with-{kind}",
+            type=_ratio,
+            metavar="RATIO",
+            help=f"a {kind} {does} through the view and covers this part of it, 0 to 1",
+        )
     p.add_argument(
         "--without",
         default="",
@@ -403,6 +412,16 @@ def _seed_number(text: str) -> int:
     value = _whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _ratio(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not between 0 and 1")
     return value
 
 

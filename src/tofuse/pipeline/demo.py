@@ -17,6 +17,7 @@ from tofuse.pipeline.run import Options, resolve, run
 from tofuse.results.output import CHECKPOINT, RECORDING, UNFINISHED, OutputFolder
 from tofuse.results.types import Reconstruction
 from tofuse.simulation.effects import Effects
+from tofuse.simulation.passing import Passing
 from tofuse.simulation.record import simulate
 
 # What the thesis set differently for a scene (section 4.1): points beyond the object are cut.
@@ -118,7 +119,9 @@ def simulate_to(
     seed: int = 0,
     every: int | None = None,
     frames: int | None = None,
+    first: int = 0,
     texture: bool = True,
+    passing: Passing | None = None,
     without: tuple[str, ...] = (),
     correction: bool = True,
     imu: bool = False,
@@ -158,6 +161,8 @@ def simulate_to(
             effects=effects,
             every=every,
             frames=frames,
+            first=first,
+            passing=passing,
             correction=correction,
             texture=texture,
             imu=imu,

@@ -134,3 +134,5 @@ class Flag(IntFlag):
     """Motion between the phase images moves the range by more than 3 mm."""
     MIRROR = 256
     """More than a tenth of the light came by way of a mirroring surface."""
+    PASSING = 512
+    """On a thing that moves through the scene; no error of the camera."""

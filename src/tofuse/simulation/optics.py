@@ -16,6 +16,7 @@ from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
 from tofuse.simulation.scene import Scene
 
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 Complex = NDArray[np.complex128]
 
 # Paths start this far off a surface, so as not to hit it again.
@@ -101,6 +102,8 @@ class Returns:
         (N,) in m, infinite without a hit.
     points, normals
         (N, 3) in the room's frame; points infinite without a hit.
+    surface
+        (N,) int32 id of the surface, -1 without a hit.
     """
 
     strength: Float64
@@ -109,6 +112,7 @@ class Returns:
     distance: Float64
     points: Float64
     normals: Float64
+    surface: Int32
 
 
 def trace(
@@ -116,7 +120,7 @@ def trace(
     model: CameraModel,
     directions: Float64,
     T_room_camera: Float64,
-    T_room_object: Float64 | None,
+    T_room_bodies: Float64 | None,
     *,
     gloss: bool,
 ) -> Returns:
@@ -130,7 +134,7 @@ def trace(
     rays = directions @ T_room_camera[:3, :3].T
     seen: NDArray[np.bool_] = np.isfinite(rays @ np.ones(3))
     rays[~seen] = (0.0, 0.0, 1.0)
-    hits = scene.cast(origin, rays, T_room_object)
+    hits = scene.cast(origin, rays, T_room_bodies)
     distance: Float64 = np.where(seen, hits.distance.astype(float), np.inf)
     hit = np.isfinite(distance)
     safe = np.where(hit, np.maximum(distance, 1e-3), 1.0)
@@ -143,7 +147,9 @@ def trace(
     points[~hit] = np.inf
     shiny = np.flatnonzero(mirror > 0.01)
     if len(shiny) == 0:
-        return Returns(direct[:, None], 2 * safe[:, None], diffuse, distance, points, normals)
+        return Returns(
+            direct[:, None], 2 * safe[:, None], diffuse, distance, points, normals, hits.surface
+        )
     strength = np.zeros((len(rays), 3))
     path = np.zeros((len(rays), 3))
     strength[:, 0], path[:, 0] = direct, 2 * safe
@@ -153,7 +159,7 @@ def trace(
     strength[shiny, 0] += g * _HIGHLIGHT / (4 * r**2) * np.exp(-((tilt / _HIGHLIGHT_RAD) ** 2))
     onward = d - 2 * (d * n).sum(1, keepdims=True) * n
     start = points[shiny] + _LIFT * n
-    second = scene.cast(start, onward, T_room_object)
+    second = scene.cast(start, onward, T_room_bodies)
     found = np.isfinite(second.distance)
     s = np.where(found, second.distance, 1.0).astype(float)
     y = start + s[:, None] * onward
@@ -162,12 +168,12 @@ def trace(
     arriving = np.clip(-(n2 * onward).sum(1), 0, 1)
     strength[shiny, 1] = g * g * albedo * arriving / (r + s) ** 2
     path[shiny, 1] = 2 * (r + s)
-    lit, length = lit_by(scene, origin, y, n2, T_room_object)
+    lit, length = lit_by(scene, origin, y, n2, T_room_bodies)
     # Lit where the lamp shines there, not along the ray.
     lit *= _beam(model, (y - origin) @ T_room_camera[:3, :3]) / _beam(model, directions[shiny])
     strength[shiny, 2] = g * albedo * lit
     path[shiny, 2] = r + s + length
-    return Returns(strength, path, diffuse, distance, points, normals)
+    return Returns(strength, path, diffuse, distance, points, normals, hits.surface)
 
 
 def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
@@ -183,14 +189,14 @@ def lit_by(
     lamp: Float64,
     points: Float64,
     normals: Float64,
-    T_room_object: Float64 | None,
+    T_room_bodies: Float64 | None,
 ) -> tuple[Float64, Float64]:
     """Light of the lamp (3,) on points (N, 3): cos / r^2, 0 in shadow; and the distances r."""
     toward = points - lamp
     length = np.maximum(np.linalg.norm(toward, axis=1), 1e-3)
     toward = toward / length[:, None]
     cosine = np.clip(-(normals * toward).sum(1), 0, 1)
-    nearest = scene.cast(lamp, toward, T_room_object).distance
+    nearest = scene.cast(lamp, toward, T_room_bodies).distance
     clear = nearest > length - _SHADOW - 0.002 * length
     return np.where(clear, cosine / length**2, 0.0), length
 
@@ -238,7 +244,7 @@ def bounced_light(
     points: Float64,
     normals: Float64,
     T_room_camera: Float64,
-    T_room_object: Float64 | None,
+    T_room_bodies: Float64 | None,
     *,
     gloss: bool = True,
 ) -> list[Float64]:
@@ -277,11 +283,11 @@ def bounced_light(
         rays = np.einsum("kc,ncd->nkd", _hemisphere(_BOUNCE_RAYS), _frames(n_hit))
         starts = np.repeat(start, _BOUNCE_RAYS, axis=0)
         rays = rays.reshape(-1, 3)
-        second = scene.cast(starts, rays, T_room_object)
+        second = scene.cast(starts, rays, T_room_bodies)
         found = np.isfinite(second.distance)
         s = np.where(found, second.distance, 1.0).astype(float)
         y = starts + s[:, None] * rays
-        lit, length = lit_by(scene, lamp, y, second.normal.astype(float), T_room_object)
+        lit, length = lit_by(scene, lamp, y, second.normal.astype(float), T_room_bodies)
         beam = _beam(model, (y - lamp) @ T_room_camera[:3, :3])
         mirror = _mirrored(second.gloss.astype(float), np.clip(lit * length**2, 0, 1)) * gloss
         albedo = np.where(found, second.albedo * (1 - mirror), 0.0)

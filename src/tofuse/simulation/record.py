@@ -23,6 +23,7 @@ from tofuse.simulation import scene as scenes
 from tofuse.simulation import sensor
 from tofuse.simulation.accelerometer import accelerations
 from tofuse.simulation.effects import Effects
+from tofuse.simulation.passing import Passing, enter
 from tofuse.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.simulation.render import Rendered, render
 
@@ -89,15 +90,18 @@ def plan(
     effects: Effects = _DEFAULT,
     every: int | None = None,
     frames: int | None = None,
+    first: int = 0,
     texture: bool = True,
     axis_offset_m: float = 0.0,
+    passing: Passing | None = None,
 ) -> Plan:
     """Say what is to be recorded; see `simulate` for the parameters.
 
     Raises
     ------
     InputError
-        For an unknown scene or camera, or a stride or number of frames below 1.
+        For an unknown scene or camera, a stride or number of frames below 1, or a first frame
+        that is not there.
     """
     model = camera_model(camera)
     built, sequence = scenes.build(scene, seed=seed, texture=texture, axis_offset_m=axis_offset_m)
@@ -105,7 +109,17 @@ def plan(
     for name, value in (("every", stride), ("frames", 1 if frames is None else frames)):
         if value < 1:
             raise InputError(f"is {value}", where=name, remedy="give 1 or more")
-    raw = np.arange(0, sequence.frames, stride)[:frames]
+    if not 0 <= first < sequence.frames:
+        raise InputError(
+            f"is {first}", where="first", remedy=f"give one from 0 to {sequence.frames - 1}"
+        )
+    raw = np.arange(first, sequence.frames, stride)[:frames]
+    if passing is not None:
+        times = raw[[0, -1]] / sequence.frame_rate_hz
+        built, sequence = enter(
+            built, sequence, model, passing, first=times[0], last=times[1], seed=seed,
+            texture=texture,
+        )  # fmt: skip
     return Plan(built, sequence, model, effects, seed, raw)
 
 
@@ -117,9 +131,11 @@ def simulate_recording(
     effects: Effects = _DEFAULT,
     every: int | None = None,
     frames: int | None = None,
+    first: int = 0,
     correction: bool = True,
     texture: bool = True,
     axis_offset_m: float = 0.0,
+    passing: Passing | None = None,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
 ) -> Recording:
@@ -139,8 +155,10 @@ def simulate_recording(
         effects=effects,
         every=every,
         frames=frames,
+        first=first,
         texture=texture,
         axis_offset_m=axis_offset_m,
+        passing=passing,
     )
     factory = made.correction if correction else None
     taken = [
@@ -160,9 +178,11 @@ def simulate(
     effects: Effects = _DEFAULT,
     every: int | None = None,
     frames: int | None = None,
+    first: int = 0,
     correction: bool = True,
     texture: bool = True,
     axis_offset_m: float = 0.0,
+    passing: Passing | None = None,
     imu: bool = False,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
@@ -186,12 +206,17 @@ def simulate(
         the same whatever the stride.
     frames
         Stop after so many taken frames.
+    first
+        Raw frame to begin with; its camera's frame is the world.
     correction
         Whether the factory correction is written beside the (uncorrected) depth.
     texture
         False gives every surface the same albedo.
     axis_offset_m
         See `scene.build`.
+    passing
+        What passes through the view, if anything; its pixels are flagged in truth/flags. The
+        surface in truth/ is without it.
     imu
         Whether an accelerometer on the camera is recorded as well.
     sigma_m
@@ -219,10 +244,24 @@ def simulate(
         effects=effects,
         every=every,
         frames=frames,
+        first=first,
         texture=texture,
         axis_offset_m=axis_offset_m,
+        passing=passing,
     )
-    model = made.model
+    return write(made, out, correction=correction, imu=imu, progress=progress)
+
+
+def write(
+    made: Plan,
+    out: str | Path,
+    *,
+    correction: bool = True,
+    imu: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Take what is planned and write it as a native folder; see `simulate`."""
+    model, effects, seed = made.model, made.effects, made.seed
     writer = RecordingWriter(
         out,
         model.camera,

@@ -75,7 +75,7 @@ def render(
     time_s = index / sequence.frame_rate_hz
     grid = optics.ray_grid(model, effects.mixed_pixels)
     poses = [
-        (sequence.T_room_camera(t), sequence.T_room_object(t))
+        (sequence.T_room_camera(t), sequence.T_room_bodies(t))
         for t in (*tap_times(model, time_s), time_s)
     ]
     still = not effects.smear or all(_same(pose, poses[-1]) for pose in poses)
@@ -124,6 +124,8 @@ def render(
     measured = sensor.Measurement(ranges, measured.amplitude, measured.saturated)
     flags = parts.flags(model, effects)
     flags |= _pixel_flags(model, grid, taps, distance, ranges, expected)
+    surface = middle.surface.reshape(shape[:2])[pick.centre]
+    flags |= _bit(np.isin(surface, list(scene.passing_surfaces)), Flag.PASSING)
     return Rendered(
         _frame(model, effects, measured, index, time_s),
         _recorded(model, np.where(np.isfinite(distance), distance, 0)),

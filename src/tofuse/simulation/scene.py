@@ -1,14 +1,16 @@
 """What there is to see: surfaces that rays can be cast at, and how camera and object move.
 
-A scene stands in its room's frame (z up, the floor at 0). A scene with a moving object has a
-second body, which has its own frame and its own tree.
+A scene stands in its room's frame (z up, the floor at 0). What moves in it are bodies with frames
+and trees of their own: the object that a recording is about, and things that only pass by.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib
 from collections.abc import Sequence as SequenceOf
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,14 +140,45 @@ class Scene:
         self.materials = tuple(materials)
         self._room = Body(room)
         self._object = None if moving is None else Body(moving)
+        self._passing: tuple[Body, ...] = ()
+        self._seed = seed
         self._rows = texture.parameter_rows(self.materials, seed)
         self._noise = texture.noise_tables(seed)
 
+    def with_passing(self, materials: SequenceOf[Material], meshes: SequenceOf[Mesh]) -> Self:
+        """Return the scene with more bodies that move through it.
+
+        Parameters
+        ----------
+        materials
+            Of the new bodies; they are numbered after those that the scene has.
+        meshes
+            One for each body, in its own frame; surfaces are numbered as in `materials`.
+        """
+        scene = copy.copy(self)
+        first = len(self.materials)
+        scene.materials = (*self.materials, *materials)
+        scene._passing = (
+            *self._passing,
+            *(Body(replace(mesh, surface=mesh.surface + first)) for mesh in meshes),
+        )
+        scene._rows = texture.parameter_rows(scene.materials, self._seed)
+        return scene
+
+    @property
+    def _moving(self) -> tuple[Body, ...]:
+        """All bodies that move, the object first."""
+        return self._passing if self._object is None else (self._object, *self._passing)
+
+    @property
+    def passing_surfaces(self) -> frozenset[int]:
+        """Ids of the surfaces of what passes by."""
+        return frozenset(int(k) for body in self._passing for k in np.unique(body.mesh.surface))
+
     @property
     def triangles(self) -> int:
-        """Number of triangles, of room and object together."""
-        bodies = [self._room] if self._object is None else [self._room, self._object]
-        return sum(len(body.mesh.faces) for body in bodies)
+        """Number of triangles, of all bodies together."""
+        return sum(len(body.mesh.faces) for body in (self._room, *self._moving))
 
     def surface_named(self, name: str) -> int:
         """Return the id of the first surface with this name; ValueError if there is none."""
@@ -155,7 +188,7 @@ class Scene:
         self,
         origins: ArrayLike,
         directions: ArrayLike,
-        T_world_object: ArrayLike | None = None,
+        T_room_bodies: ArrayLike | None = None,
     ) -> Hits:
         """Find what rays hit first.
 
@@ -166,16 +199,21 @@ class Scene:
             hit it again: start 0.1 mm off it, along the normal.
         directions
             (N, 3) unit vectors in the room's frame.
-        T_world_object
-            (4, 4) pose of the moving object in the room; identity if not given.
+        T_room_bodies
+            (B, 4, 4) poses of what moves in the room, the object first; (4, 4) where it is one
+            body. Identity if not given.
         """
         directions = np.asarray(directions)
         origins = np.atleast_2d(np.asarray(origins))
         size = len(directions)
         if origins.shape not in ((1, 3), (size, 3)) or directions.shape != (size, 3):
             raise ValueError(f"rays of shapes {origins.shape} and {directions.shape}")
-        T = np.eye(4) if T_world_object is None else np.asarray(T_world_object, float)
-        T_object_room = se3.inverse(T)
+        bodies = self._moving
+        if T_room_bodies is None:
+            T_room_bodies = np.tile(np.eye(4), (len(bodies), 1, 1))
+        poses = np.asarray(T_room_bodies, float).reshape(-1, 4, 4)
+        if len(poses) != len(bodies):
+            raise ValueError(f"{len(poses)} poses for {len(bodies)} moving bodies")
         distance = np.empty(size, np.float32)
         normal = np.zeros((size, 3), np.float32)
         albedo = np.zeros(size, np.float32)
@@ -192,12 +230,13 @@ class Scene:
             face, weights = self._room.cast(starts, rays, nearest)
             rows, noise = self._rows, self._noise
             self._room.shade(rows, noise, starts, rays, np.eye(3), nearest, face, weights, out)
-            if self._object is not None:
-                starts = np.ascontiguousarray(se3.transform(T_object_room, starts))
-                rays = np.ascontiguousarray(rays @ T_object_room[:3, :3].T)
-                face, weights = self._object.cast(starts, rays, nearest)
+            for body, T in zip(bodies, poses, strict=True):
+                T_body_room = se3.inverse(T)
+                own = np.ascontiguousarray(se3.transform(T_body_room, starts))
+                turned = np.ascontiguousarray(rays @ T_body_room[:3, :3].T)
+                face, weights = body.cast(own, turned, nearest)
                 R = np.ascontiguousarray(T[:3, :3])
-                self._object.shade(rows, noise, starts, rays, R, nearest, face, weights, out)
+                body.shade(rows, noise, own, turned, R, nearest, face, weights, out)
             distance[a:b] = nearest
 
         run_chunks(chunk, size, chunks=max(1, size // _RAYS_PER_CHUNK))
@@ -228,6 +267,9 @@ class Sequence:
     camera_path, object_path
         Poses in the room at a time in s, for any time; `object_path` is None where nothing but
         the camera moves.
+    passing_paths
+        Poses in the room of the bodies that pass by, in the scene's order. Poses of the camera
+        are not relative to them.
     """
 
     frames: int
@@ -235,6 +277,7 @@ class Sequence:
     frame_rate_hz: float
     camera_path: Path = field(repr=False)
     object_path: Path | None = field(default=None, repr=False)
+    passing_paths: tuple[Path, ...] = field(default=(), repr=False)
 
     def T_room_camera(self, t: float) -> Float64:
         """(4, 4) pose of the camera in the room at time t in s."""
@@ -243,6 +286,17 @@ class Sequence:
     def T_room_object(self, t: float) -> Float64 | None:
         """(4, 4) pose of the object in the room at time t in s; None if there is no object."""
         return None if self.object_path is None else self.object_path(t)
+
+    def with_passing(self, passing: SequenceOf[Path]) -> Self:
+        """Return the sequence with the paths of more bodies that pass by."""
+        return replace(self, passing_paths=(*self.passing_paths, *passing))
+
+    def T_room_bodies(self, t: float) -> Float64 | None:
+        """(B, 4, 4) poses of all that moves, the object first, at time t in s; None: nothing."""
+        paths = self.passing_paths
+        if self.object_path is not None:
+            paths = (self.object_path, *paths)
+        return np.stack([path(t) for path in paths]) if paths else None
 
     def T_world_camera(self, t: float, first: float = 0.0) -> Float64:
         """(4, 4) true pose of the camera in the recording's world at time t in s.
@@ -296,6 +350,8 @@ SCENES: dict[str, SceneKind] = {
     "box": SceneKind("a box of 300 x 300 x 400 mm on a stand, one turn", "box", 570, 10),
     "wall": SceneKind("one flat wall, swaying in front of it", "plain", 60, 3),
     "corner": SceneKind("three planes that meet, swaying in front of them", "plain", 60, 3),
+    "flat": SceneKind("a walk of 22 m through four rooms of a flat", "flat", 1140, 3),
+    "flat-alike": SceneKind("the same walk where the four rooms look alike", "flat", 1140, 3),
     "hall": SceneKind("a hall of 8 x 8 m, larger than some cameras' period", "plain", 180, 6),
     "corridor": SceneKind("1.5 m forward along a corridor", "plain", 60, 3),
     "checkerboard": SceneKind(

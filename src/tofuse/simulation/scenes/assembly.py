@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.simulation import mesh as meshes
+from tofuse.simulation import paths
 from tofuse.simulation.mesh import Mesh
 from tofuse.simulation.texture import Material
 
@@ -37,6 +39,13 @@ class Assembly:
     def mesh(self) -> Mesh:
         """Return everything added so far."""
         return meshes.joined(self._parts)
+
+
+def placed(position: tuple[float, float], yaw: float) -> NDArray[np.float64]:
+    """Pose of furniture on the floor, turned about z."""
+    T = paths.rotation([0, 0, yaw])
+    T[:2, 3] = position
+    return T
 
 
 def shell(

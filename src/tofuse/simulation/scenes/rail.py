@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation import paths
 from tofuse.simulation.scene import Plan, SceneOptions
 from tofuse.simulation.scenes import furniture
-from tofuse.simulation.scenes.assembly import Assembly, shell
+from tofuse.simulation.scenes.assembly import Assembly, placed, shell
 from tofuse.simulation.texture import Material
 
 RAIL_LENGTH = 0.90
@@ -38,10 +37,3 @@ def plan(options: SceneOptions) -> Plan:
     camera = paths.look_at((-RAIL_LENGTH / 2, 0, 1.15), (-RAIL_LENGTH / 2, 2.4, 0.80))
     path = paths.there_and_back(camera, RAIL_LENGTH, options.seconds)
     return Plan(assembly.materials, assembly.mesh(), path, ambient=0.3)
-
-
-def placed(position: tuple[float, float], yaw: float) -> NDArray[np.float64]:
-    """Pose of furniture on the floor, turned about z."""
-    T = paths.rotation([0, 0, yaw])
-    T[:2, 3] = position
-    return T

@@ -1,0 +1,183 @@
+"""Every recording of real cameras at hand, with what is known of its poses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scoring import Tolerance
+from sequences import kinect_loop
+from tofuse.geometry import se3
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+
+Float64 = NDArray[np.float64]
+
+# One for each way to read the reference; none where there is nothing to compare with.
+References = Callable[[Path, Recording], list[Float64]]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One recording.
+
+    Attributes
+    ----------
+    name
+        Its folder in the data.
+    reference_m, reference_rad
+        How far the reference itself may be off.
+    references
+        (N, 4, 4) T_world_camera. Of several the one that fits best counts: a direction may not be
+        known.
+    object
+        Whether the object is the world.
+    """
+
+    name: str
+    title: str
+    open: Callable[[Path], Recording] = field(repr=False)
+    references: References = field(repr=False)
+    reference_m: float = 0.0
+    reference_deg: float = 0.0
+    object: bool = False
+
+    @property
+    def tolerance(self) -> Tolerance:
+        """What is wrong, the reference's own error allowed for."""
+        return Tolerance().beside(self.reference_m, np.radians(self.reference_deg))
+
+
+def _folder(*parts: str) -> Callable[[Path], Recording]:
+    def opened(data: Path) -> Recording:
+        path = data.joinpath(*parts)
+        if not path.exists():
+            raise FileNotFoundError(path)
+        return open_recording(path)
+
+    return opened
+
+
+def _own(_data: Path, recording: Recording) -> list[Float64]:
+    """What was found beside the frames."""
+    return [] if recording.reference is None else [recording.reference]
+
+
+def _none(_data: Path, _recording: Recording) -> list[Float64]:
+    return []
+
+
+def _still(_data: Path, recording: Recording) -> list[Float64]:
+    """The camera does not move."""
+    return [np.tile(np.eye(4), (len(recording), 1, 1))]
+
+
+def _corridor(_data: Path, recording: Recording) -> list[Float64]:
+    """Two places, the second 305 mm further along the optical axis."""
+    poses = np.tile(np.eye(4), (len(recording), 1, 1))
+    poses[len(poses) // 2 :, 2, 3] = 0.305
+    return [poses]
+
+
+def _rig(*parts: str, either: bool = False) -> References:
+    def read(data: Path, recording: Recording) -> list[Float64]:
+        found = json.loads(data.joinpath(*parts).read_text())
+        poses = np.array([found[key] for key in sorted(found)], float)
+        if len(poses) != len(recording):
+            return []
+        return [poses, se3.inverse(poses)] if either else [poses]
+
+    return read
+
+
+RECORDED = {
+    one.name + ("-object" if one.object else ""): one
+    for one in (
+        Recorded(
+            "azure_kinect_tags",
+            "Azure Kinect over tags, 1280 x 720",
+            _folder("azure_kinect_tags"),
+            _own,
+            0.002,
+            0.1,
+        ),
+        Recorded(
+            "iphone_chair_3dscannerapp",
+            "iPhone round a chair, 256 x 192",
+            _folder("iphone_chair_3dscannerapp"),
+            _own,
+            0.03,
+            1.5,
+        ),
+        Recorded(
+            "iphone_stray", "iPhone, Stray, 256 x 192", _folder("iphone_stray"), _own, 0.03, 1.5
+        ),
+        Recorded(
+            "iphone_record3d",
+            "iPhone, Record3D, 192 x 256",
+            _folder("iphone_record3d"),
+            _own,
+            0.03,
+            1.5,
+        ),
+        Recorded("kinectv2_loop", "Kinect v2 round boxes, 512 x 424", kinect_loop, _own, 0.07, 1.3),
+        Recorded(
+            "sevenscenes_kitchen",
+            "Kinect v1, kitchen, 640 x 480",
+            _folder("sevenscenes_kitchen"),
+            _own,
+            0.05,
+            2.0,
+        ),
+        Recorded(
+            "realsense_desk",
+            "RealSense along a desk, 640 x 480",
+            _folder("realsense_desk"),
+            _own,
+            0.08,
+            2.0,
+        ),
+        Recorded("iphone_room", "iPhone in a room, 720 x 960", _folder("iphone_room"), _none),
+        Recorded(
+            "person_turning", "a person turns, whole image", _folder("person_turning"), _still
+        ),
+        Recorded(
+            "person_turning",
+            "a person turns, the person",
+            _folder("person_turning"),
+            _none,
+            object=True,
+        ),
+        Recorded(
+            "sr4000_corridor", "SR4000, corridor, 176 x 144", _folder("sr4000_corridor"), _corridor
+        ),
+        Recorded(
+            "pico_zense_static",
+            "Pico Zense, still, 640 x 480",
+            _folder("pico_zense_static"),
+            _still,
+        ),
+        Recorded(
+            "xtion_ring",
+            "eight Xtions in a ring, 320 x 240",
+            _folder("xtion_ring"),
+            _rig("xtion_ring", "rig_T_rig_camera.json", either=True),
+            0.05,
+            3.0,
+        ),
+        Recorded(
+            "azure_kinect_rig",
+            "five Azure Kinects, 1920 x 1080",
+            _folder("azure_kinect_rig"),
+            _rig("azure_kinect_rig", "reference_T_world_camera.json"),
+            0.02,
+            1.0,
+        ),
+        Recorded("open3d_rgbd5", "PrimeSense, 5 frames", _folder("open3d_rgbd5"), _own, 0.02, 1.0),
+    )
+}

@@ -1,0 +1,497 @@
+"""Recordings that ask much: what can happen while one records, made of simulated recordings.
+
+The simulated recordings have exact truth. They are taken without multipath and, but for the quick
+turns, without smear (which take most of the time and nothing of the difficulty), and kept in
+`out/recordings/robustness`. Which frames can be connected at all is found from the truth: two
+frames are tied where each sees at least 35 % of the other.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from scoring import Truth
+from tofuse.geometry import se3
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.simulation import paths
+from tofuse.simulation import scene as simulated
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.passing import Kind, Passing
+from tofuse.simulation.record import plan, write
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
+
+OVERLAP, NEAR_M = 0.35, 0.10
+APART_M = 100.0  # between places that have nothing in common
+DURATIONS_S = (0.3, 1.0, 3.0)
+SHARES = (0.10, 0.25, 0.40)
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """Frames in memory with their true poses (N, 4, 4) T_room_camera."""
+
+    frames: tuple[RangeFrame, ...]
+    poses: Float64
+    metadata: dict[str, object]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def at(self, chosen: Sequence[int] | Integers) -> Take:
+        """Return some of the frames, in the order given."""
+        return replace(self, frames=tuple(self.frames[k] for k in chosen), poses=self.poses[chosen])
+
+    @property
+    def step_s(self) -> float:
+        """Time between frames."""
+        return float(np.median(np.diff([frame.timestamp for frame in self.frames])))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is recorded for one scene.
+
+    Attributes
+    ----------
+    camera
+        One of `sensor.models.CAMERAS`.
+    first, frames
+        Raw frame to begin with, and how many are taken.
+    elsewhere
+        Another place: scene, first raw frame.
+    again
+        Raw frame from which on the recording is back at its start.
+    bare
+        Place of a camera close to a bare wall, and what it looks at.
+    """
+
+    name: str
+    camera: str
+    first: int
+    frames: int
+    elsewhere: tuple[str, int]
+    again: int
+    bare: tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (
+        Scene("room", "sr4000", 0, 128, ("rail", 0), 264, ((-0.15, 1.22, 1.3), (-0.15, 1.6, 1.3))),
+        Scene("rail", "sr4000", 0, 63, ("room", 0), 190, ((0.2, 2.6, 1.8), (0.2, 3.0, 1.8))),
+        Scene("flat", "ifm-o3r", 0, 110, ("room", 0), 900, ((-2.6, -4.0, 1.3), (-2.6, -4.4, 1.3))),
+        # The other place is another one of the rooms.
+        Scene(
+            "flat-alike",
+            "ifm-o3r",
+            0,
+            110,
+            ("flat-alike", 570),
+            900,
+            ((-2.6, -4.0, 1.3), (-2.6, -4.4, 1.3)),
+        ),
+    )
+}
+
+STRETCH_S = 1.5  # to the bare wall, before it, and back
+
+
+def take(
+    scene: Scene,
+    seed: int,
+    *,
+    passing: Passing | None = None,
+    motion: str = "",
+    other: tuple[str, int] | None = None,
+    frames: int | None = None,
+) -> Take:
+    """Simulate a recording, or read it if it was made before.
+
+    Parameters
+    ----------
+    passing
+        What passes through the view.
+    motion
+        "quick turns", "close-up", or nothing: as the scene has it.
+    other
+        Another scene and first raw frame, with the same camera.
+    """
+    name, first = other or (scene.name, scene.first)
+    count = frames or scene.frames
+    key = [name, scene.camera, str(first), str(count), str(seed), motion.replace(" ", "-")]
+    if passing is not None:
+        key += [passing.kind, f"{passing.share:.2f}"]
+    folder = OUT / "_".join(part for part in key if part)
+    hidden = ("multipath",) if motion == "quick turns" else ("multipath", "smear")
+    made = plan(
+        name,
+        camera=scene.camera,
+        seed=seed,
+        effects=Effects().without(*hidden),
+        first=first,
+        frames=count,
+        passing=passing,
+    )
+    rate = made.sequence.frame_rate_hz
+    start = made.raw[0] / rate
+    if motion == "quick turns":
+        path = quick_turns(made.sequence.camera_path, start)
+        made = replace(made, sequence=replace(made.sequence, camera_path=path))
+    elif motion == "close-up":
+        path = close_up(made.sequence.camera_path, start + 2.0, paths.look_at(*scene.bare))
+        made = replace(made, sequence=replace(made.sequence, camera_path=path))
+    if not folder.is_dir():
+        unfinished = folder.with_name(f"{folder.name}.part")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        write(made, unfinished)
+        unfinished.rename(folder)
+    recording = open_recording(folder)
+    images = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
+    poses = made.sequence.T_room_camera(start) @ made.poses
+    return Take(images, poses, dict(recording.metadata))
+
+
+def quick_turns(path: paths.Path, start: float) -> paths.Path:
+    """Turn by 60 degrees to a side within 0.4 s and back, every 3 s."""
+
+    def turned(t: float) -> Float64:
+        u = (t - start) % 3.0
+        side = 1 if int((t - start) // 3.0) % 2 else -1
+        away = paths.smooth_step((u - 1.2) / 0.4) - paths.smooth_step((u - 2.2) / 0.4)
+        return path(t) @ paths.rotation([0, side * np.radians(60) * away, 0])
+
+    return turned
+
+
+def close_up(path: paths.Path, leave: float, T_room_wall: Float64) -> paths.Path:
+    """Leave the path at a time, go to a place close to a wall, slide there, come back, go on."""
+    T = path(leave)
+    way = se3.log(se3.inverse(T) @ T_room_wall)
+
+    def there(t: float) -> Float64:
+        u = t - leave
+        if u <= 0:
+            return path(t)
+        if u >= 3 * STRETCH_S:
+            return path(t - 3 * STRETCH_S)
+        share = paths.smooth_step(u / STRETCH_S) - paths.smooth_step(u / STRETCH_S - 2)
+        slid = np.array([0.04 * np.sin(2 * np.pi * u / STRETCH_S), 0, 0, 0, 0, 0]) * share
+        return T @ se3.exp(share * way) @ se3.exp(slid)
+
+    return there
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One recording to reconstruct, and what is true of it."""
+
+    scene: str
+    name: str
+    recording: Recording
+    truth: Truth
+
+
+def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = ()) -> Integers:
+    """(N,) number of the group of frames that overlap; -1 for those that are blind or alone.
+
+    Parameters
+    ----------
+    frames
+        As the camera saw them; pixels are thinned to about 40 x 30.
+    poses
+        (N, 4, 4) true poses.
+    blind
+        Positions of frames that show nothing of the scene.
+    """
+    n = len(frames)
+    step = max(1, frames[0].depth.shape[1] // 40)
+    pick = (slice(step // 2, None, step), slice(step // 2, None, step))
+    clouds, images = [], []
+    for frame in frames:
+        z = frame.z
+        xy = frame.camera.rays()[pick].reshape(-1, 2).astype(float)
+        flat = z[pick].reshape(-1)
+        good = (flat > 0) & np.isfinite(xy).all(1)
+        clouds.append(np.column_stack([xy[good], np.ones(good.sum())]) * flat[good, None])
+        images.append(z)
+    share = np.zeros((n, n))
+    seeing = [k for k in range(n) if k not in set(blind) and len(clouds[k]) > 20]
+    for i in seeing:
+        T = se3.inverse(poses[i]) @ poses
+        centre = T[:, :3, 3]
+        for j in seeing:
+            # Another place needs no look.
+            if i == j or np.linalg.norm(centre[j]) > APART_M / 2:
+                continue
+            points = se3.transform(T[j], clouds[j])
+            points = points[points[:, 2] > 0.05]
+            if len(points) < OVERLAP * len(clouds[j]):
+                continue
+            pixels = np.rint(np.nan_to_num(frames[i].camera.project(points), nan=-1)).astype(int)
+            u, v = pixels.T
+            height, width = images[i].shape
+            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            z = images[i][v[inside], u[inside]]
+            near = np.abs(z - points[inside, 2]) < NEAR_M
+            share[i, j] = near.sum() / len(clouds[j])
+    tied = np.minimum(share, share.T) >= OVERLAP
+    _, label = connected_components(tied, directed=False)
+    sizes = np.bincount(label, minlength=n)
+    out = np.full(n, -1, np.intp)
+    for number, group in enumerate(np.flatnonzero(sizes > 1)):
+        out[label == group] = number
+    return out
+
+
+def as_case(
+    scene: str, name: str, took: Take, *, blind: Sequence[int] = (), seen: Take | None = None
+) -> Case:
+    """Make a case of a take.
+
+    Parameters
+    ----------
+    blind
+        Positions of frames that show nothing of the scene, or nothing to place them by.
+    seen
+        The same frames as they would be without the trouble, where that hides what overlaps.
+    """
+    frames = [replace(frame, index=k) for k, frame in enumerate(took.frames)]
+    clear = took if seen is None else seen
+    label = groups(clear.frames, took.poses, blind)
+    source = ArraySource(frames, took.poses, metadata=dict(took.metadata))
+    recording = Recording.of(source, f"{scene}, {name}", "simulated")
+    return Case(scene, name, recording, Truth(took.poses, label))
+
+
+# ---- What happens to frames ----------------------------------------------------------------------
+
+
+def covered(frame: RangeFrame) -> RangeFrame:
+    """Put the lid on: no valid pixel."""
+    light = frame.amplitude_image
+    return replace(
+        frame,
+        depth=np.zeros_like(frame.depth),
+        amplitude_image=None if light is None else np.zeros_like(light),
+    )
+
+
+def hand(frame: RangeFrame, rng: np.random.Generator) -> RangeFrame:
+    """Hold a hand right before the lens: 6 to 14 cm away, bright, its border blurred."""
+    height, width = frame.depth.shape
+    v, u = np.mgrid[:height, :width] / width
+    tilt = rng.uniform(-0.04, 0.04, 2)
+    depth = 0.10 + tilt[0] * u + tilt[1] * v + 0.012 * np.sin(23 * u + rng.uniform(0, 6))
+    depth += rng.normal(0, 0.003, depth.shape)
+    # A gap at one side, through which the scene shows.
+    gap = u > rng.uniform(0.90, 1.0)
+    light = frame.amplitude_image
+    if light is not None:
+        bright = np.percentile(light[light > 0], 99) if (light > 0).any() else 1000.0
+        light = np.where(gap, light, 1.5 * bright + 0 * depth).astype(np.float32)
+    return replace(
+        frame,
+        depth=np.where(gap, frame.depth, depth).astype(np.float32),
+        amplitude_image=light,
+        sigma_image=None
+        if frame.sigma_image is None
+        else np.where(gap, frame.sigma_image, 0.003).astype(np.float32),
+    )
+
+
+def brighter(frame: RangeFrame, factor: float) -> RangeFrame:
+    """Let the amplitude jump, as with another integration time; depth stays as it was."""
+    light = frame.amplitude_image
+    if light is None:
+        return frame
+    scaled = np.minimum(factor * light, SATURATED_AMPLITUDE - 1)
+    scaled = np.where(light >= SATURATED_AMPLITUDE, light, scaled)
+    return replace(frame, amplitude_image=scaled.astype(np.float32))
+
+
+def farther(frame: RangeFrame, metres: float) -> RangeFrame:
+    """Add to the range of every valid pixel."""
+    depth = frame.depth.astype(float)
+    length = 1.0
+    if frame.depth_kind == "z":
+        xy = frame.camera.rays().astype(float)
+        length = np.sqrt(1 + (np.nan_to_num(xy) ** 2).sum(-1))
+    moved = np.where(depth > 0, depth + metres / length, 0)
+    return replace(frame, depth=moved.astype(np.float32))
+
+
+def timed(frames: Sequence[RangeFrame], times: Sequence[float] | Float64) -> tuple[RangeFrame, ...]:
+    """Return the frames with other timestamps."""
+    return tuple(replace(frame, timestamp=float(t)) for frame, t in zip(frames, times, strict=True))
+
+
+# ---- Cases ---------------------------------------------------------------------------------------
+
+
+def hidden(
+    base: Take, seconds: float, how: str, rng: np.random.Generator
+) -> tuple[Take, list[int]]:
+    """Cover the lens for a time, somewhere in the middle, while the camera moves on."""
+    count = max(1, round(seconds / base.step_s))
+    first = int(rng.integers(len(base) // 4, max(len(base) // 4 + 1, 3 * len(base) // 4 - count)))
+    bad = list(range(first, min(first + count, len(base) - 1)))
+    frames = tuple(
+        frame if k not in bad else covered(frame) if how == "lid" else hand(frame, rng)
+        for k, frame in enumerate(base.frames)
+    )
+    return replace(base, frames=frames), bad
+
+
+def two_places(base: Take, other: Take) -> Take:
+    """Go on in another place, without a break in time."""
+    half = base.at(range(len(base) // 2))
+    step = base.step_s
+    frames = (*half.frames, *other.frames[: len(half)])
+    times = frames[0].timestamp + step * np.arange(len(frames))
+    return replace(
+        base,
+        frames=timed(frames, times),
+        poses=np.concatenate([half.poses, other.poses[: len(half)]]),
+    )
+
+
+def twice(base: Take, again: Take, gap_s: float = 60.0) -> Take:
+    """Stop, and begin again later: the end is where the begin was."""
+    half = base.at(range(len(base) // 2))
+    end = half.frames[-1].timestamp + gap_s
+    later = end + again.step_s * np.arange(len(again))
+    return replace(
+        base,
+        frames=(*half.frames, *timed(again.frames, later)),
+        poses=np.concatenate([half.poses, again.poses]),
+    )
+
+
+def shuffled(base: Take, rng: np.random.Generator) -> Take:
+    """Put the frames into a random order, the times staying in order."""
+    order = rng.permutation(len(base))
+    times = [frame.timestamp for frame in base.frames]
+    took = base.at(order)
+    return replace(took, frames=timed(took.frames, times))
+
+
+def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "") -> Iterator[Case]:
+    """Make the cases of a scene, one after the other.
+
+    Parameters
+    ----------
+    seed
+        Of the scene, the camera's noise, and what happens when.
+    quick
+        Leave out what differs by degree only.
+    containing
+        Make only those whose name contains this.
+    """
+    durations = DURATIONS_S[1:2] if quick else DURATIONS_S
+    shares = SHARES[1:2] if quick else SHARES
+    made: dict[str, Callable[[np.random.Generator], Case]] = {}
+    cache: list[Take] = []
+
+    def base() -> Take:
+        if not cache:
+            cache.append(take(scene, seed))
+        return cache[0]
+
+    def add(name: str, make: Callable[[np.random.Generator, str], Case]) -> None:
+        if containing in name:
+            made[name] = lambda rng: make(rng, name)
+
+    add("as it is", lambda rng, name: as_case(scene.name, name, base()))
+    for seconds in durations:
+        for how in ("lid", "hand"):
+
+            def hide(
+                rng: np.random.Generator, name: str, seconds: float = seconds, how: str = how
+            ) -> Case:
+                took, bad = hidden(base(), seconds, how, rng)
+                return as_case(scene.name, name, took, blind=bad)
+
+            add(f"lens covered by a {how}, {seconds:g} s", hide)
+    kinds: tuple[Kind, ...] = ("box", "person")
+    for kind in kinds:
+        for share in shares:
+
+            def passes(
+                rng: np.random.Generator, name: str, kind: Kind = kind, share: float = share
+            ) -> Case:
+                took = take(scene, seed, passing=Passing(kind, share))
+                return as_case(scene.name, name, took, seen=base())
+
+            add(f"{kind} passes over {share:.0%}", passes)
+    for every in (4,) if quick else (2, 4):
+        add(
+            f"every {every}th frame" if every > 3 else "every 2nd frame",
+            lambda rng, name, every=every: as_case(
+                scene.name, name, base().at(range(0, len(base()), every))
+            ),
+        )
+
+    def dropped(rng: np.random.Generator, name: str) -> Case:
+        kept = np.flatnonzero(rng.random(len(base())) < 0.5)
+        return as_case(scene.name, name, base().at(kept))
+
+    def amplitude(rng: np.random.Generator, name: str) -> Case:
+        first = int(rng.integers(len(base()) // 3, 2 * len(base()) // 3))
+        frames = [f if k < first else brighter(f, 4.0) for k, f in enumerate(base().frames)]
+        return as_case(scene.name, name, replace(base(), frames=tuple(frames)))
+
+    def warming(rng: np.random.Generator, name: str) -> Case:
+        frames = tuple(farther(f, 0.001 * k) for k, f in enumerate(base().frames))
+        return as_case(scene.name, name, replace(base(), frames=frames), seen=base())
+
+    def bare(rng: np.random.Generator, name: str) -> Case:
+        took = take(scene, seed, motion="close-up")
+        near = np.linalg.norm(took.poses[:, :3, 3] - np.array(scene.bare[0]), axis=1) < 0.25
+        return as_case(scene.name, name, took, blind=np.flatnonzero(near).tolist())
+
+    def places(rng: np.random.Generator, name: str) -> Case:
+        # Another room of the same flat has its place in it; other scenes have none.
+        other = take(scene, seed, other=scene.elsewhere, frames=scene.frames // 2)
+        if scene.elsewhere[0] != scene.name:
+            away = other.poses.copy()
+            away[:, 0, 3] += APART_M
+            other = replace(other, poses=away)
+        return as_case(scene.name, name, two_places(base(), other))
+
+    def later(rng: np.random.Generator, name: str) -> Case:
+        stride = round(base().step_s * 30)
+        count = (scene_frames(scene.name) - scene.again) // stride
+        took = take(scene, seed, other=(scene.name, scene.again), frames=count)
+        return as_case(scene.name, name, twice(base(), took))
+
+    add("half of the frames dropped", dropped)
+    add("amplitude x 4 from a frame on", amplitude)
+    add("warm-up, 1 mm a frame", warming)
+    add(
+        "quick turns",
+        lambda rng, name: as_case(scene.name, name, take(scene, seed, motion="quick turns")),
+    )
+    add("close-up of a bare wall", bare)
+    add("two places", places)
+    add("the same place after a gap", later)
+    add("random order", lambda rng, name: as_case(scene.name, name, shuffled(base(), rng)))
+    for name, make in made.items():
+        yield make(np.random.default_rng([seed, *name.encode()]))
+
+
+def scene_frames(name: str) -> int:
+    """Raw frames of a scene's whole sequence."""
+    return simulated.SCENES[name].frames

@@ -1,0 +1,96 @@
+"""People and boxes that pass through the view of a moving camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.files.images import read_image
+from tofuse.simulation.effects import Effects, Flag
+from tofuse.simulation.passing import Passing
+from tofuse.simulation.record import plan, simulate, simulate_recording
+
+
+def covered(made, step=3):
+    """Share of the image that what passes covers in each frame (N,)."""
+    ids = list(made.scene.passing_surfaces)
+    xy = made.model.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    out = []
+    for raw in made.raw:
+        t = raw / made.sequence.frame_rate_hz
+        T = made.sequence.T_room_camera(t)
+        hits = made.scene.cast(T[:3, 3], rays @ T[:3, :3].T, made.sequence.T_room_bodies(t))
+        out.append(np.isin(hits.surface, ids).mean())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("kind", ["person", "box"])
+@pytest.mark.parametrize("scene", ["room", "flat", "rail"])
+@pytest.mark.parametrize("share", [0.10, 0.25, 0.40])
+def test_it_covers_what_was_asked_for_while_it_passes(kind, scene, share) -> None:
+    part = covered(plan(scene, passing=Passing(kind, share), every=6, frames=40))
+    seen = part > 0.02
+    assert 0.25 < seen.mean() < 0.6
+    assert 0.6 * share < part[seen].mean() < 1.5 * share
+    # It comes and goes: more than one pass, with nothing in view between.
+    assert (np.diff(seen.astype(int)) == 1).sum() >= 1
+    assert (np.diff(seen.astype(int)) == -1).sum() >= 1
+
+
+def test_the_truth_stays_the_cameras() -> None:
+    plain, passed = plan("flat", frames=20), plan("flat", frames=20, passing=Passing())
+    np.testing.assert_array_equal(plain.poses, passed.poses)
+    np.testing.assert_array_equal(plain.scene.truth_mesh()[0], passed.scene.truth_mesh()[0])
+    assert passed.scene.triangles > plain.scene.triangles
+    assert not plain.scene.passing_surfaces
+
+
+def test_motion_has_no_jumps_within_a_pass_and_limbs_swing() -> None:
+    made = plan("flat", frames=40, passing=Passing("person", 0.25, seconds=2.0, start_s=0.0))
+    times = np.linspace(0.01, 1.99, 100)
+    poses = np.array([made.sequence.T_room_bodies(t) for t in times])
+    assert poses.shape == (100, 5, 4, 4)
+    places = poses[:, :, :3, 3]
+    assert np.abs(np.diff(places, axis=0)).max() < 0.1  # at 50 Hz
+    assert np.ptp(poses[:, 0, 2, 3]) < 1e-9  # the trunk stays at its height
+    assert np.ptp(poses[:, 1, 2, 2]) > 0.05  # a leg leans
+    away = made.sequence.T_room_bodies(3.0)
+    assert (away[:, 2, 3] < -50).all()
+
+
+def test_pixels_on_it_are_flagged_and_nearer(tmp_path) -> None:
+    effects = Effects.none()
+    options = {"every": 3, "frames": 3, "first": 66, "effects": effects}
+    passing = Passing("box", 0.3, start_s=-1.0)
+    path = simulate("rail", tmp_path / "rail", passing=passing, **options)
+    flags = read_image(path / "truth" / "flags" / "000000.png") & Flag.PASSING > 0
+    assert 0.15 < flags.mean() < 0.6
+    memory = simulate_recording("rail", passing=passing, **options)
+    empty = simulate_recording("rail", **options)
+    nearer = memory[0].z < empty[0].z - 0.05
+    assert nearer[flags].mean() > 0.9
+    assert nearer[~flags].mean() < 0.02
+    np.testing.assert_array_equal(memory.reference, empty.reference)
+
+
+def test_beside_a_turning_object_the_object_stays_the_world() -> None:
+    made = plan("box", every=30, frames=4, passing=Passing("person", 0.2, start_s=0.0))
+    np.testing.assert_array_equal(made.poses, plan("box", every=30, frames=4).poses)
+    assert made.sequence.T_room_bodies(0.5).shape == (6, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"kind": "dog"}, "dog"), ({"share": 0.0}, "share"), ({"seconds": 5.0}, "end before")],
+)
+def test_bad_requests_say_what_to_do(options, words) -> None:
+    with pytest.raises(InputError, match=words):
+        Passing(**options)
+
+
+def test_a_first_frame_must_be_there() -> None:
+    with pytest.raises(InputError, match="first"):
+        plan("wall", first=60)
