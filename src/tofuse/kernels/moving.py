@@ -34,81 +34,55 @@ _NEAREST = 0.02  # m; what comes nearer to the other camera is not compared
 _EDGE_SIGMAS = 4.0  # depths of neighbours that differ by less are no outline
 
 
+# What follows takes numbers, not arrays: Numba counts references to each array handed over.
+
+
 @kernel
-def cell_depth(
-    z: Float32, sigma: Float32, planes: Float32, plane_variance: Float32, i: int, j: int
-) -> tuple[float, float]:
-    """Depth in m of pixel (i, j) and its variance: of its plane, else as measured; 0 if unknown."""
-    w = planes[i, j, 3]
+def cell_depth(w: float, plane_variance: float, z: float, sigma: float) -> tuple[float, float]:
+    """Depth in m of a pixel and its variance: of its plane (w = 1/z), else as measured; or 0."""
     if w > 0:
         depth = 1.0 / w
-        return depth, plane_variance[i, j] * depth * depth * depth * depth
-    if z[i, j] > 0 and sigma[i, j] > 0:
-        s = np.float64(sigma[i, j])
-        return np.float64(z[i, j]), s * s
+        square = depth * depth
+        return depth, plane_variance * square * square
+    if z > 0 and sigma > 0:
+        return z, sigma * sigma
     return 0.0, 0.0
 
 
 @kernel
-def _depth_along(
-    z: Float32,
-    sigma: Float32,
-    planes: Float32,
-    plane_variance: Float32,
-    i: int,
-    j: int,
-    x: float,
-    y: float,
-) -> tuple[float, float]:
-    """As `cell_depth`, where the plane of the pixel meets the ray (x, y), which is within it."""
-    w = planes[i, j, 3]
-    if w > 0:
-        along = planes[i, j, 0] * x + planes[i, j, 1] * y + planes[i, j, 2]
-        # At a grazing angle half a pixel can be far along the plane.
-        along = min(max(along, 0.9 * w), 1.1 * w)
-        depth = 1.0 / along
-        return depth, plane_variance[i, j] * depth * depth * depth * depth
-    return cell_depth(z, sigma, planes, plane_variance, i, j)
+def _along(w: float, on_ray: float) -> float:
+    """1/z of a pixel's plane on a ray that is within the pixel, where it is w at its centre.
 
-
-@kernel
-def _depth_range(z: Float32, i: int, j: int, radius: int) -> tuple[float, float, int]:
-    """Least and largest valid depth in a window, and how many pixels of it are invalid."""
-    low, high, missing = np.inf, 0.0, 0
-    for a in range(max(i - radius, 0), min(i + radius + 1, z.shape[0])):
-        for b in range(max(j - radius, 0), min(j + radius + 1, z.shape[1])):
-            value = np.float64(z[a, b])
-            if value > 0:
-                low = min(low, value)
-                high = max(high, value)
-            else:
-                missing += 1
-    return low, high, missing
+    At a grazing angle half a pixel can be far along the plane, which is limited.
+    """
+    return min(max(on_ray, 0.9 * w), 1.1 * w) if w > 0 else w
 
 
 @kernel
 def moved_point(
-    T: Float64, x: float, y: float, depth: float
-) -> tuple[float, float, float]:
-    """Ray coordinates (x/z, y/z) and z, under T, of the point at `depth` on the ray (x, y)."""
+    r00: float, r01: float, r02: float, t0: float,
+    r10: float, r11: float, r12: float, t1: float,
+    r20: float, r21: float, r22: float, t2: float,
+    x: float, y: float, depth: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Ray coordinates (x/z, y/z) and z of the point at `depth` on the ray (x, y), moved by (r, t).
+
+    All 0 where it comes too near to the camera.
+    """
     px, py = x * depth, y * depth
-    z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * depth + T[2, 3]
+    z = r20 * px + r21 * py + r22 * depth + t2
     if not z > _NEAREST:
         return 0.0, 0.0, 0.0
-    u = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * depth + T[0, 3]) / z
-    v = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * depth + T[1, 3]) / z
+    per_z = 1.0 / z
+    u = (r00 * px + r01 * py + r02 * depth + t0) * per_z
+    v = (r10 * px + r11 * py + r12 * depth + t1) * per_z
     return u, v, z
 
 
 @kernel
-def pixel_at(
-    x: float, y: float, lookup: Float32, lookup_frame: Float64, rows: int, columns: int
-) -> tuple[int, int]:
-    """Pixel (i, j) that the ray (x, y) falls on, (-1, -1) outside of the image."""
-    u, v, node, _ = landing(x, y, lookup, lookup_frame)
-    if node < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
-        return -1, -1
-    return int(v + 0.5), int(u + 0.5)
+def inside(u: float, v: float, node: int, rows: int, columns: int) -> bool:
+    """Whether what `landing` returned is a pixel of an image."""
+    return node >= 0 and u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5
 
 
 @kernel
@@ -135,6 +109,9 @@ def residual_ratios(
     Takes every `every`-th cell in both directions that is not known to move (`moving`, one per
     cell); the other parameters are those of `compare`.
     """
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     rows, columns = moving.shape
     out = np.empty(((rows + every - 1) // every) * ((columns + every - 1) // every), np.float32)
     n = 0
@@ -143,22 +120,48 @@ def residual_ratios(
             i, j = a * stride, b * stride
             if moving[a, b]:
                 continue
-            depth, variance = cell_depth(z, sigma, planes, plane_variance, i, j)
+            depth, variance = cell_depth(
+                np.float64(planes[i, j, 3]),
+                np.float64(plane_variance[i, j]),
+                np.float64(z[i, j]),
+                np.float64(sigma[i, j]),
+            )
             if not depth > 0:
                 continue
-            x, y, here = moved_point(T, rays[i, j, 0], rays[i, j, 1], depth)
+            x, y, here = moved_point(
+                r00,
+                r01,
+                r02,
+                t0,
+                r10,
+                r11,
+                r12,
+                t1,
+                r20,
+                r21,
+                r22,
+                t2,
+                np.float64(rays[i, j, 0]),
+                np.float64(rays[i, j, 1]),
+                depth,
+            )
             if here == 0:
                 continue
-            k, m = pixel_at(x, y, lookup, lookup_frame, other_z.shape[0], other_z.shape[1])
-            if k < 0:
+            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            if not inside(u, v, node, other_z.shape[0], other_z.shape[1]):
                 continue
-            there, other = _depth_along(
-                other_z, other_sigma, other_planes, other_variance, k, m, x, y
+            k, m = int(v + 0.5), int(u + 0.5)
+            on_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
+            there, other = cell_depth(
+                _along(np.float64(other_planes[k, m, 3]), on_ray),
+                np.float64(other_variance[k, m]),
+                np.float64(other_z[k, m]),
+                np.float64(other_sigma[k, m]),
             )
             if not there > 0:
                 continue
-            v = variance + other + model_error * model_error * there * there
-            out[n] = abs(here - there) / np.sqrt(v)
+            total = variance + other + model_error * model_error * there * there
+            out[n] = abs(here - there) / np.sqrt(total)
             n += 1
     return out[:n]
 
@@ -186,7 +189,6 @@ def compare(
     radius: int,
     max_evidence: float,
     max_agreement: float,
-    flagged_weight: float,
     outcome: UInt8,
     llr: Float32,
     start: int,
@@ -203,7 +205,8 @@ def compare(
     other_z, other_sigma, other_planes, other_variance, lookup, lookup_frame
         Of the other view.
     other_moving
-        Cells of the other view that are known to move: what agrees with them is not static.
+        Cells of the other view that are known to move: that a cell agrees with one of them says
+        nothing (its llr is 0).
     T
         (4, 4) T_other_view.
     scale
@@ -217,12 +220,13 @@ def compare(
         behind it, only if it is so for all pixels within.
     max_evidence, max_agreement
         Largest llr, and largest -llr.
-    flagged_weight
-        Factor of the llr where a cell agrees with one that moves.
     outcome, llr
         (rows, columns) of cells, written: see above. Of what is behind the other view, llr is that
         of something that moved away from it.
     """
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     rows, columns = other_z.shape
     model2, scale2 = model_error * model_error, scale * scale
     window = (2 * radius + 1) * (2 * radius + 1)
@@ -230,40 +234,77 @@ def compare(
         for b in range(outcome.shape[1]):
             outcome[a, b], llr[a, b] = NONE, 0.0
             i, j = a * stride, b * stride
-            depth, variance = cell_depth(z, sigma, planes, plane_variance, i, j)
+            depth, variance = cell_depth(
+                np.float64(planes[i, j, 3]),
+                np.float64(plane_variance[i, j]),
+                np.float64(z[i, j]),
+                np.float64(sigma[i, j]),
+            )
             if not depth > 0:
                 continue
-            x, y, here = moved_point(T, rays[i, j, 0], rays[i, j, 1], depth)
+            x, y, here = moved_point(
+                r00,
+                r01,
+                r02,
+                t0,
+                r10,
+                r11,
+                r12,
+                t1,
+                r20,
+                r21,
+                r22,
+                t2,
+                np.float64(rays[i, j, 0]),
+                np.float64(rays[i, j, 1]),
+                depth,
+            )
             if here == 0:
                 continue
-            k, m = pixel_at(x, y, lookup, lookup_frame, rows, columns)
-            if k < 0:
+            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            if not inside(u, v, node, rows, columns):
                 continue
-            there, other = _depth_along(
-                other_z, other_sigma, other_planes, other_variance, k, m, x, y
+            k, m = int(v + 0.5), int(u + 0.5)
+            on_ray = other_planes[k, m, 0] * x + other_planes[k, m, 1] * y + other_planes[k, m, 2]
+            there, other = cell_depth(
+                _along(np.float64(other_planes[k, m, 3]), on_ray),
+                np.float64(other_variance[k, m]),
+                np.float64(other_z[k, m]),
+                np.float64(other_sigma[k, m]),
             )
             if not there > 0:
                 continue
             own = scale2 * variance
-            v = own + scale2 * (other + model2 * there * there)
-            gap = max(np.log(there * there / (2 * np.pi * v)), 0.0)
+            total = own + scale2 * (other + model2 * there * there)
+            gap = max(np.log(there * there / (2 * np.pi * total)), 0.0)
             d = here - there
-            if d * d <= gap * v:
-                value = max(0.5 * (d * d / v - gap), -max_agreement)
-                if other_moving[k // other_stride, m // other_stride]:
-                    value *= flagged_weight
-                outcome[a, b], llr[a, b] = AGREES, value
+            if d * d <= gap * total:
+                outcome[a, b] = AGREES
+                if not other_moving[k // other_stride, m // other_stride]:
+                    llr[a, b] = max(0.5 * (d * d / total - gap), -max_agreement)
                 continue
             outcome[a, b] = UNCLEAR
-            low, high, missing = _depth_range(other_z, k, m, radius)
+            low, high, missing = np.inf, 0.0, 0
+            for p in range(max(k - radius, 0), min(k + radius + 1, rows)):
+                for q in range(max(m - radius, 0), min(m + radius + 1, columns)):
+                    if other_z[p, q] > 0:
+                        low = min(low, np.float64(other_z[p, q]))
+                        high = max(high, np.float64(other_z[p, q]))
+                    else:
+                        missing += 1
             d = here - low if d < 0 else here - high
-            if (d < 0) != (here < there) or not d * d > gap * v or 2 * missing > window:
+            if (d < 0) != (here < there) or not d * d > gap * total or 2 * missing > window:
                 continue
-            low, high, _ = _depth_range(z, i, j, 1)
+            low, high = depth, depth
+            for p in range(max(i - 1, 0), min(i + 2, z.shape[0])):
+                for q in range(max(j - 1, 0), min(j + 2, z.shape[1])):
+                    if z[p, q] > 0:
+                        low = min(low, np.float64(z[p, q]))
+                        high = max(high, np.float64(z[p, q]))
             if high - low > max(edge_jump * depth, _EDGE_SIGMAS * np.sqrt(own)):
                 continue
             outcome[a, b] = IN_FRONT if d < 0 else BEHIND
-            llr[a, b] = min(0.5 * (d * d / v - gap), max_evidence)
+            llr[a, b] = min(0.5 * (d * d / total - gap), max_evidence)
 
 
 @kernel
@@ -287,6 +328,7 @@ def carry(
     depth_now: Float32,
     odds: Float32,
     tracked: UInt8,
+    arrived: Bool,
     start: int,
     stop: int,
 ) -> None:
@@ -306,28 +348,54 @@ def carry(
         By which fraction of its depth a surface may have moved since.
     prior
         Log-odds of what was not seen before.
-    depth_now, odds, tracked
-        Cells of the view, written.
+    depth_now, odds, tracked, arrived
+        Cells of the view, written. `arrived` is whether the view before saw through there.
     """
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for a in range(start, stop):
         for b in range(odds.shape[1]):
             i, j = a * stride, b * stride
-            odds[a, b], tracked[a, b] = prior, 0
-            depth, variance = cell_depth(z, sigma, planes, plane_variance, i, j)
+            odds[a, b], tracked[a, b], arrived[a, b] = prior, 0, False
+            depth, variance = cell_depth(
+                np.float64(planes[i, j, 3]),
+                np.float64(plane_variance[i, j]),
+                np.float64(z[i, j]),
+                np.float64(sigma[i, j]),
+            )
             depth_now[a, b] = depth
             if not depth > 0:
                 continue
-            x, y, here = moved_point(T, rays[i, j, 0], rays[i, j, 1], depth)
+            x, y, here = moved_point(
+                r00,
+                r01,
+                r02,
+                t0,
+                r10,
+                r11,
+                r12,
+                t1,
+                r20,
+                r21,
+                r22,
+                t2,
+                np.float64(rays[i, j, 0]),
+                np.float64(rays[i, j, 1]),
+                depth,
+            )
             if here == 0:
                 continue
-            k, m = pixel_at(x, y, lookup, lookup_frame, shape_before[0], shape_before[1])
-            if k < 0:
+            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            if not inside(u, v, node, shape_before[0], shape_before[1]):
                 continue
+            k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // stride_before, m // stride_before
             there = np.float64(before[k, m])
             apart = max(tolerance * here, _EDGE_SIGMAS * np.sqrt(variance))
             if there > 0 and abs(here - there) <= apart:
                 odds[a, b], tracked[a, b] = odds_before[k, m], tracked_before[k, m]
+            arrived[a, b] = there > here + apart
 
 
 @kernel
@@ -351,6 +419,9 @@ def predict(
     `moving` (one per cell of the view) is written, `moving_before` says which cells of the view
     before moved, `radius` is in its cells. The others are those of `carry`.
     """
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     for a in range(moving.shape[0]):
         for b in range(moving.shape[1]):
             i, j = a * stride, b * stride
@@ -358,12 +429,29 @@ def predict(
             depth = np.float64(z[i, j])
             if not depth > 0:
                 continue
-            x, y, here = moved_point(T, rays[i, j, 0], rays[i, j, 1], depth)
+            x, y, here = moved_point(
+                r00,
+                r01,
+                r02,
+                t0,
+                r10,
+                r11,
+                r12,
+                t1,
+                r20,
+                r21,
+                r22,
+                t2,
+                np.float64(rays[i, j, 0]),
+                np.float64(rays[i, j, 1]),
+                depth,
+            )
             if here == 0:
                 continue
-            k, m = pixel_at(x, y, lookup, lookup_frame, shape_before[0], shape_before[1])
-            if k < 0:
+            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            if not inside(u, v, node, shape_before[0], shape_before[1]):
                 continue
+            k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // stride_before, m // stride_before
             for p in range(max(k - radius, 0), min(k + radius + 1, before.shape[0])):
                 for q in range(max(m - radius, 0), min(m + radius + 1, before.shape[1])):

@@ -90,14 +90,14 @@ class MovingOptions:
         Of how many reference views the log-odds are remembered.
     """
 
-    columns: int = 160
+    columns: int = 112
     model_error: float = 0.005
     edge_jump: float = 0.04
     misregistration: int = 2
     outliers: float = 0.05
     self_overlap: float = 0.3
     prior: float = 0.05
-    decay: float = 0.9
+    decay: float = 0.95
     detect: float = 1.5
     extend: float = -0.5
     min_core: float = 0.25
@@ -306,7 +306,7 @@ class MovingObjects:
             The keyframe and its (4, 4) pose.
         """
         options = self.options
-        now = self._carried(view, T_world_camera)
+        now, arrived = self._carried(view, T_world_camera)
         then = self._reference(reference)
         T = np.ascontiguousarray(se3.inverse(T_world_reference) @ T_world_camera)
         scale = self._scale(view, now.moving, reference, T)
@@ -324,24 +324,26 @@ class MovingObjects:
             follows = (tracked > 0) | (now.odds > options.extend)
             evidence[(seen == kernels.BEHIND) & ~follows] = 0
             evidence_then[met == kernels.BEHIND] = 0
+            # The last view saw through there, which the reference does not say a second time.
+            alone = arrived & (seen != kernels.IN_FRONT)
+            evidence[alone] += np.float32(self._max_evidence)
             now = self._learnt(now, evidence, seen)
             then = self._learnt(then, evidence_then, met)
             tracked = np.where(seen == kernels.AGREES, np.uint8(1), tracked)
-        now = replace(now, tracked=tracked)
-        moving, segments = self._segmented(now, evidence if reliable else now.odds)
-        now = replace(now, moving=moving)
-        then_moving, _ = self._segmented(then, evidence_then if reliable else then.odds)
-        then = replace(then, moving=then_moving)
+        else:
+            evidence, evidence_then = now.odds, then.odds
+        now, segments = self._segmented(replace(now, tracked=tracked), evidence)
+        then, _ = self._segmented(then, evidence_then)
         self._last = _Last(view, T_world_camera, now)
         self._remember(reference.index, then)
 
         rest = _counts(seen, now.moving) + _counts(met, then.moving)
         everything = _counts(seen, None) + _counts(met, None)
-        mask = _pixels(moving, view.z.shape, self._stride(view))
+        mask = _pixels(now.moving, view.z.shape, self._stride(view))
         valid = view.z > 0
         return Moving(
             view=mask,
-            reference=_pixels(then_moving, reference.z.shape, self._stride(reference)),
+            reference=_pixels(then.moving, reference.z.shape, self._stride(reference)),
             fraction=np.count_nonzero(mask & valid) / max(np.count_nonzero(valid), 1),
             compared=int(rest.sum()),
             agreement=float(rest[0] / max(rest.sum(), 1)),
@@ -351,6 +353,10 @@ class MovingObjects:
             segments=segments,
             reliable=reliable,
         )
+
+    @property
+    def _max_evidence(self) -> float:
+        return -float(np.log(self.options.outliers))
 
     @property
     def _typical_scale(self) -> float:
@@ -382,12 +388,12 @@ class MovingObjects:
         while len(self._references) > self.options.keyframes:
             self._references.popitem(last=False)
 
-    def _carried(self, view: SurfaceMap, T_world_camera: Float64) -> _Cells:
-        """What is known of the cells of a view from the last one."""
+    def _carried(self, view: SurfaceMap, T_world_camera: Float64) -> tuple[_Cells, Bool]:
+        """What is known of the cells of a view from the last one, and what arrived since."""
         options, last, stride = self.options, self._last, self._stride(view)
         shape = _cell_shape(view.z.shape, stride)
         depth, odds = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        tracked = np.empty(shape, np.uint8)
+        tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
             T, before = np.eye(4), view
             cells = _Cells(
@@ -406,11 +412,11 @@ class MovingObjects:
                 view.rays, view.z, view.sigma, view.planes, view.plane_variance, stride,
                 cells.depth, cells.odds, tracked_before, self._stride(before), before.z.shape,
                 grid.lookup, grid.frame, T, options.tolerance, self._prior, depth, odds, tracked,
-                a, b,
+                arrived, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
-        return _Cells(depth, odds, odds > options.detect, tracked)
+        return _Cells(depth, odds, odds > options.detect, tracked), arrived
 
     def _scale(
         self, view: SurfaceMap, moving: Bool, reference: SurfaceMap, T: Float64
@@ -443,8 +449,8 @@ class MovingObjects:
                 other.z, other.sigma, other.planes, other.plane_variance, other_moving,
                 self._stride(other), grid.lookup, grid.frame, T_other_view, scale,
                 options.model_error, options.edge_jump, options.misregistration,
-                -float(np.log(options.outliers)), -float(np.log(options.self_overlap)),
-                options.self_overlap, outcome, llr, a, b,
+                self._max_evidence, -float(np.log(options.self_overlap)),
+                outcome, llr, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
@@ -454,34 +460,54 @@ class MovingObjects:
         """Add the evidence of a pair of views."""
         options, prior = self.options, np.float32(self._prior)
         odds = prior + np.float32(options.decay) * (cells.odds - prior) + evidence
-        most = options.detect - 2 * np.log(options.outliers)
+        most = options.detect + 2 * self._max_evidence
         return replace(cells, odds=np.clip(odds, 2 * prior, most).astype(np.float32))
 
-    def _segmented(self, cells: _Cells, evidence: Float32) -> tuple[Bool, int]:
-        """Segment cells with hysteresis, and count the segments; grown over their outlines.
+    def _segmented(self, cells: _Cells, evidence: Float32) -> tuple[_Cells, int]:
+        """Segment cells with hysteresis, and count the segments.
 
-        `evidence` of this frame: what agrees in it is not grown over.
+        `evidence` of this frame: segments are not grown over what agrees in it.
         """
-        options, odds = self.options, cells.odds
+        options, odds, depth = self.options, cells.odds, cells.depth
         likely = odds > options.extend
+        none = replace(cells, moving=np.zeros(odds.shape, np.bool_))
         if not likely.any():
-            return likely, 0
+            return none, 0
         likely = cv2.morphologyEx(likely.view(np.uint8), cv2.MORPH_OPEN, _NEIGHBOURS)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(likely, connectivity=4)
-        if count < 2:
-            return np.zeros(odds.shape, np.bool_), 0
         sizes = stats[:, cv2.CC_STAT_AREA]
         core = np.bincount(labels[odds > options.detect], minlength=count)
         kept = (core >= options.min_core * sizes) & (sizes >= options.min_size * odds.size)
         kept[0] = False
-        moving = kept[labels]
+        if not kept.any():
+            return none, 0
+        moving = self._completed(kept[labels], depth)
+        # All of a segment is as likely to move as what made it one.
+        sure = np.float32(options.detect + 0.5 * self._max_evidence)
+        odds = np.where(moving, np.maximum(odds, sure), odds)
         # At the outline no comparison tells. One cell more mixes both surfaces; another one is the
         # object's if it is as far away.
-        depth = cells.depth
         near = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)
         grown = cv2.dilate(moving.view(np.uint8), _NEIGHBOURS) > 0
         grown |= (near > 0) & (np.abs(near - depth) <= np.float32(options.tolerance) * near)
-        return moving | (grown & (evidence >= 0) & (odds >= self._prior)), int(kept.sum())
+        moving = moving | (grown & (evidence >= 0) & (odds >= self._prior))
+        return replace(cells, odds=odds, moving=moving), int(kept.sum())
+
+    def _completed(self, moving: Bool, depth: Float32) -> Bool:
+        """Add the rest of surfaces of which most moves.
+
+        Where an object still overlaps itself, it agrees with the reference.
+        """
+        jump = np.float32(0.5 * self.options.edge_jump)
+        inside = depth > 0
+        for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+            inside[a] &= np.abs(depth[a] - depth[b]) <= jump * depth[b]
+        count, labels = cv2.connectedComponents(inside.view(np.uint8), connectivity=4)
+        sizes = np.bincount(labels.ravel(), minlength=count)
+        moved = np.bincount(labels[moving], minlength=count)
+        most = 2 * moved > sizes
+        most[0] = False
+        return np.asarray(moving | most[labels], np.bool_)
 
 
 def _cell_shape(shape: tuple[int, ...], stride: int) -> tuple[int, int]:
