@@ -189,6 +189,7 @@ def compare(
     radius: int,
     max_evidence: float,
     max_agreement: float,
+    flagged_weight: float,
     outcome: UInt8,
     llr: Float32,
     start: int,
@@ -206,7 +207,7 @@ def compare(
         Of the other view.
     other_moving
         Cells of the other view that are known to move: that a cell agrees with one of them says
-        nothing (its llr is 0).
+        little.
     T
         (4, 4) T_other_view.
     scale
@@ -220,6 +221,8 @@ def compare(
         behind it, only if it is so for all pixels within.
     max_evidence, max_agreement
         Largest llr, and largest -llr.
+    flagged_weight
+        Factor of the llr of a cell that agrees with one that moves.
     outcome, llr
         (rows, columns) of cells, written: see above. Of what is behind the other view, llr is that
         of something that moved away from it.
@@ -280,8 +283,9 @@ def compare(
             d = here - there
             if d * d <= gap * total:
                 outcome[a, b] = AGREES
-                if not other_moving[k // other_stride, m // other_stride]:
-                    llr[a, b] = max(0.5 * (d * d / total - gap), -max_agreement)
+                llr[a, b] = max(0.5 * (d * d / total - gap), -max_agreement)
+                if other_moving[k // other_stride, m // other_stride]:
+                    llr[a, b] *= flagged_weight
                 continue
             outcome[a, b] = UNCLEAR
             low, high, missing = np.inf, 0.0, 0

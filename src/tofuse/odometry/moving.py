@@ -67,7 +67,8 @@ class MovingOptions:
         Limits the evidence of one frame.
     self_overlap
         Probability that a moving pixel agrees with the keyframe nevertheless: the object still
-        overlaps itself. Limits how much one frame that agrees says.
+        overlaps itself. Limits how much one frame that agrees says; by as much less it says where
+        the keyframe's surface is known to move.
     prior
         Probability that a pixel moves, before it was compared.
     decay
@@ -156,7 +157,9 @@ class Moving:
         The same of all comparisons, masked or not. The masks explain the difference between both.
     scale
         Robust scale of the residuals outside of what moved before, in sigmas of noise and
-        `MovingOptions.model_error`. Some way above its value in earlier frames: the pose is wrong.
+        `MovingOptions.model_error`.
+    scale_ratio
+        The same over its median in earlier frames. Well above 1: the pose is wrong.
     spread
         Fraction of the tiles (of 4 x 4 over the image, that are compared) in which most comparisons
         outside of the masks agree. An object leaves most tiles alone; a wrong pose few.
@@ -174,6 +177,7 @@ class Moving:
     agreement: float
     agreement_unmasked: float
     scale: float
+    scale_ratio: float
     spread: float
     segments: int
     reliable: bool
@@ -287,7 +291,9 @@ class MovingObjects:
 
     def reference_mask(self, reference: SurfaceMap) -> Bool:
         """(H, W) pixels of a keyframe that are known to have moved."""
-        return _pixels(self._reference(reference).moving, reference.z.shape, self._stride(reference))
+        return _pixels(
+            self._reference(reference).moving, reference.z.shape, self._stride(reference)
+        )
 
     def update(
         self,
@@ -310,7 +316,9 @@ class MovingObjects:
         then = self._reference(reference)
         T = np.ascontiguousarray(se3.inverse(T_world_reference) @ T_world_camera)
         scale = self._scale(view, now.moving, reference, T)
-        used = min(scale, _MAX_SCALE_RATIO * self._typical_scale)
+        typical = median(np.array(self._scales)) if self._scales else scale
+        # Noise is not less than it is claimed to be, but may be more.
+        used = max(1.0, min(scale, _MAX_SCALE_RATIO * max(typical, 1.0)))
         seen, evidence = self._compare(view, reference, then.moving, T, used)
         inverse = np.ascontiguousarray(se3.inverse(T))
         met, evidence_then = self._compare(reference, view, now.moving, inverse, used)
@@ -318,8 +326,8 @@ class MovingObjects:
         before = _counts(seen, now.moving) + _counts(met, then.moving)
         reliable = bool(before[0] >= options.min_agreement * before.sum() and before[0] > 0)
         tracked = now.tracked
-        self._scales.append(scale)
         if reliable:
+            self._scales.append(scale)
             # What is behind the reference was revealed, unless it had been followed from there.
             follows = (tracked > 0) | (now.odds > options.extend)
             evidence[(seen == kernels.BEHIND) & ~follows] = 0
@@ -349,6 +357,7 @@ class MovingObjects:
             agreement=float(rest[0] / max(rest.sum(), 1)),
             agreement_unmasked=float(everything[0] / max(everything.sum(), 1)),
             scale=scale,
+            scale_ratio=scale / max(typical, 1e-6),
             spread=_spread(seen, now.moving),
             segments=segments,
             reliable=reliable,
@@ -357,10 +366,6 @@ class MovingObjects:
     @property
     def _max_evidence(self) -> float:
         return -float(np.log(self.options.outliers))
-
-    @property
-    def _typical_scale(self) -> float:
-        return median(np.array(self._scales)) if self._scales else 1.0
 
     def _stride(self, view: SurfaceMap) -> int:
         return -(-view.z.shape[1] // self.options.columns)
@@ -396,9 +401,7 @@ class MovingObjects:
         tracked, arrived = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
         if last is None:
             T, before = np.eye(4), view
-            cells = _Cells(
-                np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked
-            )
+            cells = _Cells(np.zeros(shape, np.float32), odds, np.zeros(shape, np.bool_), tracked)
         else:
             T, before = se3.inverse(last.T_world_camera) @ T_world_camera, last.view
             cells = last.cells
@@ -418,17 +421,15 @@ class MovingObjects:
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return _Cells(depth, odds, odds > options.detect, tracked), arrived
 
-    def _scale(
-        self, view: SurfaceMap, moving: Bool, reference: SurfaceMap, T: Float64
-    ) -> float:
-        """Robust scale of the residuals between two views, in sigmas, at least 1."""
+    def _scale(self, view: SurfaceMap, moving: Bool, reference: SurfaceMap, T: Float64) -> float:
+        """Robust scale of the residuals between two views, in sigmas."""
         grid = reference.projection
         ratios = kernels.residual_ratios(
             view.rays, view.z, view.sigma, view.planes, view.plane_variance, moving,
             self._stride(view), _SCALE_EVERY, reference.z, reference.sigma, reference.planes,
             reference.plane_variance, grid.lookup, grid.frame, T, self.options.model_error,
         )  # fmt: skip
-        return max(1.0, _robust_scale(ratios))
+        return _robust_scale(ratios)
 
     def _compare(
         self,
@@ -450,6 +451,7 @@ class MovingObjects:
                 self._stride(other), grid.lookup, grid.frame, T_other_view, scale,
                 options.model_error, options.edge_jump, options.misregistration,
                 self._max_evidence, -float(np.log(options.self_overlap)),
+                options.self_overlap,
                 outcome, llr, a, b,
             )  # fmt: skip
 
@@ -482,9 +484,9 @@ class MovingObjects:
         if not kept.any():
             return none, 0
         moving = self._completed(kept[labels], depth)
-        # All of a segment is as likely to move as what made it one.
+        # All of a segment is as likely to move as what made it one, unless it is seen to be static.
         sure = np.float32(options.detect + 0.5 * self._max_evidence)
-        odds = np.where(moving, np.maximum(odds, sure), odds)
+        odds = np.where(moving & (evidence >= 0), np.maximum(odds, sure), odds)
         # At the outline no comparison tells. One cell more mixes both surfaces; another one is the
         # object's if it is as far away.
         near = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)
@@ -536,10 +538,10 @@ def _robust_scale(ratios: Float32) -> float:
 
 def _counts(outcome: UInt8, masked: Bool | None) -> NDArray[np.int64]:
     """How many comparisons agree, and how many see through a surface."""
-    if masked is not None and masked.any():
-        outcome = outcome[~masked]
-    counts = np.bincount(outcome.ravel(), minlength=kernels.UNCLEAR + 1)
-    return counts[[kernels.AGREES, kernels.IN_FRONT]]
+    of = [outcome == kernels.AGREES, outcome == kernels.IN_FRONT]
+    if masked is not None:
+        of = [here & ~masked for here in of]
+    return np.array([np.count_nonzero(here) for here in of])
 
 
 def _spread(outcome: UInt8, masked: Bool, tiles: int = 4) -> float:
