@@ -37,7 +37,7 @@ _CHUNK_ROWS = 60
 _SCALE_EVERY = 2
 # Iterations, cut-off in sigmas, and the median of the absolute values that are left of a normal
 # distribution, of a scale that outliers of up to half of the samples don't spoil.
-_SCALE_ITERATIONS, _SCALE_CUT, _MEDIAN_WITHIN = 5, 3.0, 0.6728
+_SCALE_ITERATIONS, _SCALE_CUT, _MEDIAN_WITHIN = 5, 3.0, 0.6724
 _LOWER_QUARTILE = 0.3186  # of the absolute values of a normal distribution
 _FEWEST_RESIDUALS = 50
 # The scale is that of the pair, but at most so many times the median of the last ones: a wrong pose
@@ -104,7 +104,7 @@ class MovingOptions:
     min_core: float = 0.25
     min_size: float = 0.004
     tolerance: float = 0.05
-    reach: int = 2
+    reach: int = 3
     min_agreement: float = 0.5
     keyframes: int = 40
 
@@ -335,8 +335,8 @@ class MovingObjects:
             # The last view saw through there, which the reference does not say a second time.
             alone = arrived & (seen != kernels.IN_FRONT)
             evidence[alone] += np.float32(self._max_evidence)
-            now = self._learnt(now, evidence, seen)
-            then = self._learnt(then, evidence_then, met)
+            now = self._learnt(now, evidence)
+            then = self._learnt(then, evidence_then)
             tracked = np.where(seen == kernels.AGREES, np.uint8(1), tracked)
         else:
             evidence, evidence_then = now.odds, then.odds
@@ -352,7 +352,7 @@ class MovingObjects:
         return Moving(
             view=mask,
             reference=_pixels(then.moving, reference.z.shape, self._stride(reference)),
-            fraction=np.count_nonzero(mask & valid) / max(np.count_nonzero(valid), 1),
+            fraction=_fraction(mask & valid, valid),
             compared=int(rest.sum()),
             agreement=float(rest[0] / max(rest.sum(), 1)),
             agreement_unmasked=float(everything[0] / max(everything.sum(), 1)),
@@ -407,7 +407,7 @@ class MovingObjects:
             cells = last.cells
         T = np.ascontiguousarray(T)
         # At the rim of what is followed a cell may be that of a surface beside it.
-        tracked_before = cv2.erode(cells.tracked, _NEIGHBOURS) if last else cells.tracked
+        tracked_before = np.asarray(cv2.erode(cells.tracked, _NEIGHBOURS), np.uint8)
         grid = before.projection
 
         def work(a: int, b: int) -> None:
@@ -450,15 +450,14 @@ class MovingObjects:
                 other.z, other.sigma, other.planes, other.plane_variance, other_moving,
                 self._stride(other), grid.lookup, grid.frame, T_other_view, scale,
                 options.model_error, options.edge_jump, options.misregistration,
-                self._max_evidence, -float(np.log(options.self_overlap)),
-                options.self_overlap,
+                self._max_evidence, -float(np.log(options.self_overlap)), options.self_overlap,
                 outcome, llr, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return outcome, llr
 
-    def _learnt(self, cells: _Cells, evidence: Float32, outcome: UInt8) -> _Cells:
+    def _learnt(self, cells: _Cells, evidence: Float32) -> _Cells:
         """Add the evidence of a pair of views."""
         options, prior = self.options, np.float32(self._prior)
         odds = prior + np.float32(options.decay) * (cells.odds - prior) + evidence
@@ -471,14 +470,15 @@ class MovingObjects:
         `evidence` of this frame: segments are not grown over what agrees in it.
         """
         options, odds, depth = self.options, cells.odds, cells.depth
-        likely = odds > options.extend
+        certain = odds > options.detect
         none = replace(cells, moving=np.zeros(odds.shape, np.bool_))
-        if not likely.any():
+        if not certain.any():
             return none, 0
-        likely = cv2.morphologyEx(likely.view(np.uint8), cv2.MORPH_OPEN, _NEIGHBOURS)
+        likely = (odds > options.extend).view(np.uint8)
+        likely = np.asarray(cv2.morphologyEx(likely, cv2.MORPH_OPEN, _NEIGHBOURS), np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(likely, connectivity=4)
         sizes = stats[:, cv2.CC_STAT_AREA]
-        core = np.bincount(labels[odds > options.detect], minlength=count)
+        core = np.bincount(labels[certain], minlength=count)
         kept = (core >= options.min_core * sizes) & (sizes >= options.min_size * odds.size)
         kept[0] = False
         if not kept.any():
@@ -555,5 +555,9 @@ def _spread(outcome: UInt8, masked: Bool, tiles: int = 4) -> float:
 
     good = summed(outcome == kernels.AGREES)
     bad = summed((outcome == kernels.IN_FRONT) | (outcome == kernels.UNCLEAR))
-    compared = good + bad > 0
-    return float(np.count_nonzero(good > bad) / max(np.count_nonzero(compared), 1))
+    compared: Bool = good + bad > 0
+    return _fraction(good > bad, compared)
+
+
+def _fraction(part: Bool, whole: Bool) -> float:
+    return int(np.count_nonzero(part)) / (int(np.count_nonzero(whole)) or 1)
