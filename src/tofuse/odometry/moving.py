@@ -160,9 +160,6 @@ class Moving:
         `MovingOptions.model_error`.
     scale_ratio
         The same over its median in earlier frames. Well above 1: the pose is wrong.
-    spread
-        Fraction of the tiles (of 4 x 4 over the image, that are compared) in which most comparisons
-        outside of the masks agree. An object leaves most tiles alone; a wrong pose few.
     segments
         Connected components of `view`.
     reliable
@@ -178,7 +175,6 @@ class Moving:
     agreement_unmasked: float
     scale: float
     scale_ratio: float
-    spread: float
     segments: int
     reliable: bool
 
@@ -248,9 +244,11 @@ class _Last:
 class MovingObjects:
     """Segments what moves by itself, from views whose poses relative to keyframes are known.
 
-    Call `predicted_mask` before a view is aligned, `update` afterwards. Views and references must
-    be whole: what moved is left out of them for tracking only. References are recognised by their
-    `SurfaceMap.index`; one that was the last view updated keeps what was learnt of it.
+    Before a view is aligned, leave `predicted_mask` out of it and `reference_mask` out of the
+    keyframe; afterwards call `update`. Where its masks have grown much beyond those (something just
+    began to move), align once more without them: they are right before the pose is. `update` itself
+    takes whole views. References are recognised by their `SurfaceMap.index`; one that was the last
+    view updated keeps what was learnt of it.
     """
 
     def __init__(self, options: MovingOptions | None = None) -> None:
@@ -301,6 +299,8 @@ class MovingObjects:
         T_world_camera: Float64,
         reference: SurfaceMap,
         T_world_reference: Float64,
+        *,
+        learn: bool = True,
     ) -> Moving:
         """Segment a view that was aligned with a keyframe, and the keyframe.
 
@@ -310,6 +310,9 @@ class MovingObjects:
             The view and its (4, 4) pose.
         reference, T_world_reference
             The keyframe and its (4, 4) pose.
+        learn
+            Whether the outcome is kept. A tracker that has several poses for a view, or doubts the
+            one it has, compares what would come of them without.
         """
         options = self.options
         now, arrived = self._carried(view, T_world_camera)
@@ -327,7 +330,6 @@ class MovingObjects:
         reliable = bool(before[0] >= options.min_agreement * before.sum() and before[0] > 0)
         tracked = now.tracked
         if reliable:
-            self._scales.append(scale)
             # What is behind the reference was revealed, unless it had been followed from there.
             follows = (tracked > 0) | (now.odds > options.extend)
             evidence[(seen == kernels.BEHIND) & ~follows] = 0
@@ -342,8 +344,11 @@ class MovingObjects:
             evidence, evidence_then = now.odds, then.odds
         now, segments = self._segmented(replace(now, tracked=tracked), evidence)
         then, _ = self._segmented(then, evidence_then)
-        self._last = _Last(view, T_world_camera, now)
-        self._remember(reference.index, then)
+        if learn:
+            self._last = _Last(view, T_world_camera, now)
+            self._remember(reference.index, then)
+            if reliable:
+                self._scales.append(scale)
 
         rest = _counts(seen, now.moving) + _counts(met, then.moving)
         everything = _counts(seen, None) + _counts(met, None)
@@ -358,7 +363,6 @@ class MovingObjects:
             agreement_unmasked=float(everything[0] / max(everything.sum(), 1)),
             scale=scale,
             scale_ratio=scale / max(typical, 1e-6),
-            spread=_spread(seen, now.moving),
             segments=segments,
             reliable=reliable,
         )
@@ -542,21 +546,6 @@ def _counts(outcome: UInt8, masked: Bool | None) -> NDArray[np.int64]:
     if masked is not None:
         of = [here & ~masked for here in of]
     return np.array([np.count_nonzero(here) for here in of])
-
-
-def _spread(outcome: UInt8, masked: Bool, tiles: int = 4) -> float:
-    """Fraction of the tiles in which most comparisons outside of the mask agree."""
-    rows, columns = outcome.shape
-    heights, widths = np.arange(tiles) * rows // tiles, np.arange(tiles) * columns // tiles
-
-    def summed(of: Bool) -> NDArray[np.int64]:
-        by_rows = np.add.reduceat((of & ~masked).astype(np.int64), heights, axis=0)
-        return np.asarray(np.add.reduceat(by_rows, widths, axis=1), np.int64)
-
-    good = summed(outcome == kernels.AGREES)
-    bad = summed((outcome == kernels.IN_FRONT) | (outcome == kernels.UNCLEAR))
-    compared: Bool = good + bad > 0
-    return _fraction(good > bad, compared)
 
 
 def _fraction(part: Bool, whole: Bool) -> float:
