@@ -266,8 +266,8 @@ def albedo_image(
 ) -> None:
     """Logarithm of the albedo, up to a constant: light * range^2 / cos(incidence).
 
-    Light `falls` with the square of the range unless that has been compensated. Without a lamp of
-    its own a camera sees surfaces as bright from any side, and the cosine is left out. NaN where
+    Light `falls` with the square of the range, and with the fourth power of the cosine to the axis
+    (natural vignetting), unless the camera has compensated both. Without a lamp of its own a camera sees surfaces as bright from any side, and the cosine is left out. NaN where
     there is no plane, no light, or the surface is seen too slantwise.
     """
     rows, columns = light.shape
@@ -289,7 +289,8 @@ def albedo_image(
             if cosine < np.float32(0.15):
                 continue
             shade = cosine if own_lamp else one
-            apart = length2 / (v * v)  # the squared range
+            # The squared range, over the fourth power of the cosine to the axis.
+            apart = length2 * length2 * length2 / (v * v)
             out[i, j] = np.log(light[i, j] / shade * (apart if falls else one))
 
 
