@@ -12,11 +12,11 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Recovery
-from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.search import SearchOptions
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)

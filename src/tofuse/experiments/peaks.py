@@ -15,6 +15,7 @@ from tofuse.posegraph.build import Measured, chain
 from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.planes import Planes
+from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.icp import algorithm_1
 from tofuse.simulation.peaks import (
@@ -117,12 +118,13 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
     """
     views, truth = peaks_views(sigma, seed)
     tracker = Sequential(registration=CoarseToFine(), guess="previous").start(seed)
-    refiner = Planes().start()
+    refiner = Planes().start(ViewStore(Spacing()))
     poses: list[Float64] = []
     for view in views:
         step = tracker.push(view)
-        poses.append(poses[-1] if step.T_world_camera is None else step.T_world_camera)
-        refiner.push(view, None, poses[-1])
+        T = step.T_component_camera
+        poses.append(poses[-1] if T is None else T)
+        refiner.push(view, poses[-1])
     start = np.array(poses)
     refined = refiner.finish([view.index for view in views], start).poses
     return PoseErrors.of(start, truth), PoseErrors.of(refined, truth)

@@ -267,8 +267,9 @@ def albedo_image(
     """Logarithm of the albedo, up to a constant: light * range^2 / cos(incidence).
 
     Light `falls` with the square of the range, and with the fourth power of the cosine to the axis
-    (natural vignetting), unless the camera has compensated both. Without a lamp of its own a camera sees surfaces as bright from any side, and the cosine is left out. NaN where
-    there is no plane, no light, or the surface is seen too slantwise.
+    (natural vignetting), unless the camera has compensated both. Without a lamp of its own a camera
+    sees surfaces as bright from any side, and the cosine is left out. NaN where there is no plane,
+    no light, or the surface is seen too slantwise.
     """
     rows, columns = light.shape
     one = np.float32(1)

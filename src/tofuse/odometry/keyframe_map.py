@@ -109,6 +109,8 @@ class KeyframeMap:
         away = np.hypot(apart, angle)
         away[np.triu_indices(len(old))] = np.inf
         away[component[:, None] != component] = np.inf
-        if np.isinf(away).all():  # nothing but components of one keyframe: the oldest is missed least
+        if np.isinf(
+            away
+        ).all():  # nothing but components of one keyframe: the oldest is missed least
             return 0
         return int(np.argmin(away.min(1)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,47 +10,31 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, surface_map
+from tofuse.odometry.attempts import CLEARLY, Attempt, Attempts, Reference
 from tofuse.odometry.base import Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.odometry.motion import Moment, Motion, is_small
+from tofuse.odometry.moving import Moving, MovingObjects, without_pixels
 from tofuse.odometry.relocalization import Relocalizer
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registration
-from tofuse.registration.projective import UNITS, Aligned, align
+from tofuse.registration.projective import UNITS, Target
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import (
-    PATIENT,
-    Assessment,
-    Link,
-    UsualFit,
-    comparable,
-    self_scaled,
-)
+from tofuse.registration.verification import Link, UsualFit, comparable, self_scaled
 
+Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
 # From one frame to the next: what moves further without a prediction is a large step, which has
 # rivals. rad, and fraction of the depth.
 _LARGE = 0.35
-# A turn must explain more than standing still does: a flat wall fits any.
-_CLEARLY = 1.03
-
-
-@dataclass(frozen=True, eq=False)
-class _Attempt:
-    """An alignment of the view with a keyframe, and how it compares with usual ones."""
-
-    aligned: Aligned
-    keyframe: Keyframe
-    predicted: bool
-    how: str
-    assessment: Assessment
-
-    @property
-    def T(self) -> Float64:
-        return self.aligned.T_world_source
+# Moving objects are looked for in every n-th frame, and wherever something indicates them: what
+# fits worse than usual, so many points in free space, or objects in the frame before.
+_LOOK_EVERY, _IN_FRONT = 4, 0.005
+# Fraction of a view that moves, from which the rest is aligned once more, and which is reported.
+_NOTICED = 0.01
 
 
 class KeyframeTracker(Tracker):
@@ -64,6 +46,8 @@ class KeyframeTracker(Tracker):
         self._relocalizer = Relocalizer(options.belief if options.searches else None)
         self._usual = UsualFit(options.unusual)
         self._motion = Motion()
+        self._moving = MovingObjects()
+        self._moved = False  # whether something did in the last frame
         self._component = -1
         self._connected = True  # whether a certain link joins the component to an earlier one
         self._last: Keyframe | None = None  # the last frame of the component
@@ -89,13 +73,11 @@ class KeyframeTracker(Tracker):
             return Step("lost", "too few pixels have a surface", None)
         now = Moment(frame.index, frame.timestamp)
         attempts = self._attempts(view, now, T_odometry)
-        found = self._first_usual(attempts, now)
-        if found is None:
-            found = self._unrivalled(view, attempts, now)
+        found = self._first_usual(attempts, now) or self._unrivalled(view, attempts, now)
         if found is None:
             step = self._begin_component(view, attempts)
         else:
-            step = self._continue_component(view, found, lit=frame.amplitude_image is not None)
+            step = self._continue_component(frame, view, found, attempts)
         assert step.T_component_camera is not None
         self._last = Keyframe(view, step.T_component_camera, self._component)
         self._motion.follow(step.T_component_camera, now)
@@ -123,49 +105,34 @@ class KeyframeTracker(Tracker):
                 return ""
         return f"every depth is {first:.3g} m"
 
-    def _attempts(
-        self, view: SurfaceMap, now: Moment, T_odometry: Float64 | None
-    ) -> _Attempts:
-        """Alignments with the last keyframe and the last frame, the likeliest first."""
-        return _Attempts(self._alignments(view, now, T_odometry))
+    def _attempts(self, view: SurfaceMap, now: Moment, T_odometry: Float64 | None) -> Attempts:
+        """Alignments with the last keyframe and the last frame."""
+        last, options = self._last, self._options
+        T_last = np.eye(4) if last is None else last.T_component_camera
+        references = []
+        if last is not None:
+            keyframes = [self._keyframes.newest]
+            if last.view.index != keyframes[0].view.index:
+                keyframes.append(last)
+            references = [self._reference(k) for k in keyframes if comparable(view.depth, k.depth)]
+        expected = None if last is None else self._predicted(last, now, T_odometry)
+        steady = self._motion.steadily(now) if options.guess == "previous" else None
+        if self._moved:
+            T = T_last if expected is None else expected
+            view = without_pixels(view, self._moving.predicted_mask(T, view))
+        if options.guess == "identity":
+            expected = None
+        return Attempts(view, references, expected, steady, T_last, options.alignment, self._usual)
 
-    def _alignments(
-        self, view: SurfaceMap, now: Moment, T_odometry: Float64 | None
-    ) -> Iterator[_Attempt]:
-        last = self._last
-        if last is None:
-            return
-        keyframes = [self._keyframes.newest]
-        if last.view.index != keyframes[0].view.index:
-            keyframes.append(last)
-        keyframes = [k for k in keyframes if comparable(view.depth, k.depth)]
-        options = self._options
-        expected = self._predicted(last, now, T_odometry)
-        if expected is not None and options.guess != "identity":
-            steady = self._motion.steadily(now) if options.guess == "previous" else None
-            for k in keyframes:
-                aligned = align(
-                    view,
-                    [k.target],
-                    expected if steady is None else steady,
-                    options.alignment,
-                    start=expected,
-                    usual_scale=self._usual.noise_scale,
-                )
-                yield self._attempt(aligned, k, "", predicted=True)
-        unknown = "nothing predicted it" if expected is None else "the prediction did not fit"
-        for k in keyframes:
-            aligned, where = self._turned(view, k, last.T_component_camera)
-            yield self._attempt(aligned, k, f"{unknown}: found from {where}", predicted=False)
+    def _reference(self, keyframe: Keyframe) -> Reference:
+        """A keyframe as it is aligned with: without what has moved."""
+        mask = self._moving.reference_mask(keyframe.view)
+        if not mask.any():
+            return Reference(keyframe, keyframe.target)
+        view = without_pixels(keyframe.view, mask)
+        return Reference(keyframe, Target(view, se3.inverse(keyframe.T_component_camera)))
 
-    def _attempt(
-        self, aligned: Aligned, keyframe: Keyframe, how: str, *, predicted: bool
-    ) -> _Attempt:
-        return _Attempt(aligned, keyframe, predicted, how, self._usual.assess(aligned))
-
-    def _predicted(
-        self, last: Keyframe, now: Moment, T_odometry: Float64 | None
-    ) -> Float64 | None:
+    def _predicted(self, last: Keyframe, now: Moment, T_odometry: Float64 | None) -> Float64 | None:
         """Where the guess puts the camera; None where it says nothing."""
         if self._options.guess == "previous":
             return self._motion.expected(now)
@@ -176,51 +143,27 @@ class KeyframeTracker(Tracker):
             return None
         return np.asarray(last.T_component_camera @ se3.inverse(before) @ T_odometry, np.float64)
 
-    def _turned(
-        self, view: SurfaceMap, keyframe: Keyframe, T_last: Float64
-    ) -> tuple[Aligned, str]:
-        """Align from where the camera was, or from the turn of it that fits best."""
-        options, target = self._options, [keyframe.target]
-        coarse = replace(options.alignment, levels=PATIENT[:1])
-        motions = _turns(view)
-        scale = self._usual.noise_scale
-        still, *turned = [
-            align(view, target, T_last @ motion, coarse, usual_scale=scale) for motion in motions
-        ]
-        best = max(range(len(turned)), key=lambda k: turned[k].score)
-        moves = turned[best].score > _CLEARLY * still.score
-        chosen, where = (turned[best], "a turn") if moves else (still, "where the camera was")
-        if moves:
-            where += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
-        # With no prediction to keep to, what little the data says is the better guess.
-        how = replace(options.alignment, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
-        T = chosen.T_world_source if moves else T_last
-        start = chosen.T_world_source
-        return align(view, target, T, how, start=start, usual_scale=scale), where
-
-    def _first_usual(self, attempts: _Attempts, now: Moment) -> _Attempt | None:
+    def _first_usual(self, attempts: Attempts, now: Moment) -> Attempt | None:
         """The first alignment that fits as usual, and that the camera's motion allows."""
         for attempt in attempts:
-            if not attempt.assessment.usual or self._motion.surprise(attempt.T, now):
-                continue
-            if attempt.predicted or self._is_safe(attempt):
+            if attempt.assessment.usual and self._is_possible(attempt, now):
                 return attempt
         return None
 
-    def _is_safe(self, attempt: _Attempt) -> bool:
-        """Whether an alignment that nothing predicted is no large step, and is well determined."""
+    def _is_possible(self, attempt: Attempt, now: Moment) -> bool:
+        """Whether the camera may have moved like this; without a prediction by no large step."""
         assert self._last is not None
-        between = se3.inverse(self._last.T_component_camera) @ attempt.T
-        if is_small(between):
+        if self._motion.surprise(attempt.T_component_camera, now):
+            return False
+        between = se3.inverse(self._last.T_component_camera) @ attempt.T_component_camera
+        if attempt.predicted or is_small(between):
             return True
         far = np.linalg.norm(between[:3, 3]) > _LARGE * self._last.depth
         if far or se3.angle(between) > _LARGE:
             return False
         return attempt.aligned.converged and not len(attempt.aligned.unobservable)
 
-    def _unrivalled(
-        self, view: SurfaceMap, attempts: _Attempts, now: Moment
-    ) -> _Attempt | None:
+    def _unrivalled(self, view: SurfaceMap, attempts: Attempts, now: Moment) -> Attempt | None:
         """The alignment that explains the view best, unless both images contradict even that.
 
         A poor fit is believed in sequence only, where the motion leads; never after a gap.
@@ -230,19 +173,61 @@ class KeyframeTracker(Tracker):
         compare = self_scaled(self._usual)
         best, best_score = None, 0.0
         for attempt in attempts:
-            if self._motion.surprise(attempt.T, now) or not np.isfinite(attempt.aligned.rms_m):
+            if not np.isfinite(attempt.aligned.rms_m) or not self._is_possible(attempt, now):
                 continue
-            if not (attempt.predicted or self._is_safe(attempt)):
-                continue
-            k = attempt.keyframe
-            T_keyframe_view = se3.inverse(k.T_component_camera) @ attempt.T
-            score = agreement(view, k.view, T_keyframe_view, compare).score
+            moving = self._segment(view, attempt, learn=False)
+            if moving.reliable and moving.fraction > _NOTICED:
+                attempt = self._without_moving(view, attempt, moving, attempts)
+                if attempt.assessment.usual and self._is_possible(attempt, now):
+                    return attempt
+            score = agreement(
+                attempt.view, attempt.reference.target.view, attempt.T_keyframe_camera, compare
+            ).score
             # Of equals the likeliest, which comes first.
-            if score > _CLEARLY * best_score:
+            if score > CLEARLY * best_score:
                 best, best_score = attempt, score
         return best
 
-    def _begin_component(self, view: SurfaceMap, attempts: _Attempts) -> Step:
+    def _segment(self, view: SurfaceMap, attempt: Attempt, *, learn: bool = True) -> Moving:
+        k = attempt.keyframe
+        return self._moving.update(
+            view, attempt.T_component_camera, k.view, k.T_component_camera, learn=learn
+        )
+
+    def _without_moving(
+        self, view: SurfaceMap, attempt: Attempt, moving: Moving, attempts: Attempts
+    ) -> Attempt:
+        """Align once more without what moves by itself."""
+        k = attempt.keyframe
+        target = Target(moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera))
+        return attempts.again(attempt, moving.applied(view), Reference(k, target))
+
+    def _followed(
+        self, view: SurfaceMap, found: Attempt, attempts: Attempts
+    ) -> tuple[Attempt, Moving | None]:
+        """Segment what moves by itself where something may, and align the rest if much does."""
+        a = found.aligned
+        look = (
+            self._moved
+            or not found.assessment.usual
+            or a.in_front > _IN_FRONT * a.compared
+            or view.index % _LOOK_EVERY == 0
+        )
+        if not look:
+            return found, None
+        moving = self._segment(view, found)
+        new = moving.fraction - float(
+            (found.view.planes[..., 3] == 0).mean() - (view.planes[..., 3] == 0).mean()
+        )
+        if moving.reliable and new > _NOTICED:
+            again = self._without_moving(view, found, moving, attempts)
+            if again.assessment.usual or not found.assessment.usual:
+                found = again
+                moving = self._segment(view, found)
+        self._moved = moving.fraction > 0
+        return found, moving
+
+    def _begin_component(self, view: SurfaceMap, attempts: Attempts) -> Step:
         """Start anew with a view that can't be connected, and look for where it may belong."""
         self._component += 1
         last = None if self._last is None else self._last.view.index
@@ -253,6 +238,8 @@ class KeyframeTracker(Tracker):
         self._connected = any(link.certain for link in links)
         self._keyframes.add(Keyframe(view, np.eye(4), self._component))
         self._motion.interrupt()
+        self._moving.reset()
+        self._moved = False
         reason = ""
         if self._component:
             why = attempts.objection or "another recording begins"
@@ -260,99 +247,71 @@ class KeyframeTracker(Tracker):
             if links:
                 reason += f"; {links[-1].how} in frame {links[-1].i}"
         return Step(
-            "tracked",
-            reason,
-            np.eye(4),
-            surface=view,
-            component=self._component,
-            links=links,
+            "tracked", reason, np.eye(4), surface=view, component=self._component, links=links
         )
 
-    def _continue_component(self, view: SurfaceMap, found: _Attempt, *, lit: bool) -> Step:
-        options, aligned, keyframe = self._options, found.aligned, found.keyframe
-        doubtful = not found.assessment.usual
+    def _continue_component(
+        self, frame: RangeFrame, view: SurfaceMap, found: Attempt, attempts: Attempts
+    ) -> Step:
+        found, moving = self._followed(view, found, attempts)
+        aligned, keyframe, T = found.aligned, found.keyframe, found.T_component_camera
         self._usual.learn(aligned, view.depth)
-        C = covariance(view, [keyframe.target], aligned, options.alignment, options.uncertainty)
-        # Odds that are twice as high as usual double the standard deviation.
-        C = C * np.exp(2 * min(found.assessment.excess, 5.0))
         notes = [found.how, found.assessment.reason]
-        if lit and not aligned.photometric:
+        if frame.amplitude_image is not None and not aligned.photometric:
             notes.append("the albedo took no part")
         status: Literal["tracked", "predicted"] = "tracked"
         if len(aligned.unobservable) == 6:
             status = "predicted"
             notes.insert(0, "all directions are degenerate")
         links: tuple[Link, ...] = ()
-        if keyframe is self._last or self._keyframes.is_far(found.T, keyframe):
+        if keyframe is self._last or self._keyframes.is_far(T, keyframe):
             if not self._connected:
-                links = self._relocalizer.links(
-                    view, self._keyframes, self._component, self._usual
-                )
+                links = self._relocalizer.links(view, self._keyframes, self._component, self._usual)
                 self._connected = any(link.certain for link in links)
-            self._keyframes.add(Keyframe(view, found.T, self._component))
+            self._keyframes.add(Keyframe(view, T, self._component))
+        mask = None
+        if moving is not None and moving.fraction > _NOTICED:
+            mask = _at_size(moving.view, frame)
+            view = moving.applied(view)
         return Step(
             status,
             "; ".join(filter(None, notes)),
-            found.T,
+            T,
             keyframe.view.index,
-            _registration(aligned, keyframe.T_component_camera, C),
+            self._registration(found),
             view,
             self._component,
             links,
-            doubtful,
+            not found.assessment.usual,
+            mask,
+        )
+
+    def _registration(self, found: Attempt) -> Registration:
+        a, options = found.aligned, self._options
+        targets = [found.reference.target]
+        C = covariance(found.view, targets, a, options.alignment, options.uncertainty)
+        # Odds that are twice as high as usual double the standard deviation.
+        C = C * np.exp(2 * min(found.assessment.excess, 5.0))
+        directions = a.unobservable * UNITS
+        lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+        return Registration(
+            T_target_source=found.T_keyframe_camera,
+            converged=a.converged,
+            iterations=a.iterations,
+            correspondences=a.inliers,
+            points=max(a.compared, 1),
+            error=a.scale,
+            rms_m=a.rms_m,
+            information=np.asarray(np.linalg.inv(C), np.float64),
+            unobservable=directions / np.maximum(lengths, 1e-12),
         )
 
 
-class _Attempts:
-    """Attempts that are made when they are asked for, and kept."""
-
-    def __init__(self, attempts: Iterator[_Attempt]) -> None:
-        self._coming = attempts
-        self._made: list[_Attempt] = []
-
-    def __iter__(self) -> Iterator[_Attempt]:
-        yield from self._made
-        for attempt in self._coming:
-            self._made.append(attempt)
-            yield attempt
-
-    @property
-    def objection(self) -> str:
-        """What speaks against the likeliest one, in words."""
-        for attempt in self._made:
-            if attempt.assessment.reason:
-                return attempt.assessment.reason
-        return "it is far from where the motion leads" if self._made else ""
-
-
-def _turns(view: SurfaceMap) -> list[Float64]:
-    """Motions of the camera to try: none, and turns about itself and about what it sees."""
-    centre = np.eye(4)
-    centre[2, 3] = view.depth
-    motions = [np.eye(4)]
-    for angle in np.radians([-12, -6, 6, 12]):
-        for axis in (3, 4):
-            twist = np.zeros(6)
-            twist[axis] = angle
-            turn = se3.exp(twist)
-            motions += [turn, centre @ turn @ se3.inverse(centre)]
-    return motions
-
-
-def _registration(
-    aligned: Aligned, T_component_reference: Float64, covariance: Float64
-) -> Registration:
-    directions = aligned.unobservable * UNITS
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    information = np.asarray(np.linalg.inv(covariance), np.float64)
-    return Registration(
-        T_target_source=se3.inverse(T_component_reference) @ aligned.T_world_source,
-        converged=aligned.converged,
-        iterations=aligned.iterations,
-        correspondences=aligned.inliers,
-        points=max(aligned.compared, 1),
-        error=aligned.scale,
-        rms_m=aligned.rms_m,
-        information=information,
-        unobservable=directions / np.maximum(lengths, 1e-12),
-    )
+def _at_size(mask: Bool, frame: RangeFrame) -> Bool:
+    """A mask of the prepared view at the size of the frame's image."""
+    rows, columns = frame.valid.shape
+    step = columns // mask.shape[1]
+    large = np.kron(mask, np.ones((step, step), np.bool_))
+    out = np.zeros((rows, columns), np.bool_)
+    out[: large.shape[0], : large.shape[1]] = large[:rows, :columns]
+    return out

@@ -1,4 +1,4 @@
-"""From tracked frames in one frame of reference to a reconstruction: the steps at the end of a run."""
+"""From tracked frames in one frame of reference to a reconstruction."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tofuse.posegraph.outside import Told, told_by, with_outside
 from tofuse.posegraph.refinement import Refinement, Refiner
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.recordings.frames import RangeFrame
-from tofuse.results.verdict import ranked
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.results.verdict import ranked
 
 T = TypeVar("T")
 
@@ -224,7 +224,9 @@ class BackEnd:
                 closed.told.records,
                 components,
                 tuple((e.record.index, e.moving) for e in self._posed if e.moving > 0),
-                tuple(e.record.index for e in self._posed if e.step is not None and e.step.doubtful),
+                tuple(
+                    e.record.index for e in self._posed if e.step is not None and e.step.doubtful
+                ),
             )
             verdict, reasons = judge(evidence)
         return Reconstruction(

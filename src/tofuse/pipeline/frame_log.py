@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.posegraph.joining import Stretch
 from tofuse.posegraph.outside import Sensed
 from tofuse.posegraph.views import ViewStore
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.verification import Link
 from tofuse.results.types import FrameRecord
 
@@ -166,17 +166,17 @@ class FrameLog:
         return Sensed(np.array(ids, np.intp), odometry, gravity, parts)
 
 
-def poses_in_world(
-    log: FrameLog, T_world_component: Mapping[int, Float64]
-) -> dict[int, Float64]:
+def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> dict[int, Float64]:
     """(4, 4) T_world_camera by index, the first of them the identity, of the given components."""
     found: dict[int, Float64] = {}
     T_first: Float64 | None = None
     for entry in log.posed:
-        assert entry.step is not None
-        if entry.step.component not in T_world_component:
+        step = entry.step
+        if step is None or step.T_component_camera is None:
             continue
-        T = T_world_component[entry.step.component] @ entry.step.T_component_camera
+        if step.component not in T_world_component:
+            continue
+        T = T_world_component[step.component] @ step.T_component_camera
         if T_first is None:
             T_first = se3.inverse(T)
         found[entry.record.index] = np.asarray(T_first @ T, np.float64)

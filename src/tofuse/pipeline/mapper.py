@@ -18,6 +18,7 @@ from tofuse.odometry.motion import Moment
 from tofuse.pipeline.backend import BackEnd
 from tofuse.pipeline.behind import Behind
 from tofuse.pipeline.checkpoint import NotKept, Stages
+from tofuse.pipeline.components import numbered_components
 from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.pipeline.live import LiveLoops
@@ -25,17 +26,13 @@ from tofuse.pipeline.memory import give_back
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
-from tofuse.posegraph.joining import Group
+from tofuse.posegraph.joining import Group, Join
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.results.ranges import runs
 from tofuse.results.samples import FrameSample, FrameSamples
-from tofuse.results.types import Component, FrameRecord, Reconstruction
+from tofuse.results.types import FrameRecord, Reconstruction
 
 Float64 = NDArray[np.float64]
-
-# A component of fewer frames that nothing connects gets no model of its own.
-_WORTH_A_MODEL = 5
 
 
 class Mapper:
@@ -180,12 +177,15 @@ class Mapper:
         )
         self._log.add(record, step, T_odometry, gravity)
         lost = step.T_component_camera is None
+        if step.moving is not None:
+            ready = replace(ready, clean=ready.clean.keep(~step.moving))
         filtered, clean = ready.filtered, ready.clean
         if not lost:
             with self.watch.timing("loops"):
                 self._kept.add(ready, step)
             with self.watch.timing("fusion"):
-                self._behind.do(lambda: self._kept.add_to_model(frame, clean, step))
+                add = self._kept.add_to_model
+                self._behind.do(lambda: add(frame, clean, step))
         if (
             isinstance(frame, RangeFrame)
             and isinstance(filtered, RangeFrame)
@@ -289,10 +289,9 @@ class Mapper:
         stages = stages or NotKept()
         with threads(self.threads):
             groups = self._join(stages)
-            log, components = self._components(groups)
-            main = groups[0]
-            poses = poses_in_world(log, dict(main.T_group_component))
-            result = self._back_end(log, poses, main.joins).run(stages, components)
+            log, components = numbered_components(self._log, groups, self._reconstruct_alone)
+            poses = poses_in_world(log, groups[0].T_group_component)
+            result = self._back_end(log, poses, groups[0].joins).run(stages, components)
         return replace(
             result,
             diagnostics=replace(
@@ -319,44 +318,14 @@ class Mapper:
         stages.save("joining", (groups, dict(self.watch.seconds)))
         return groups
 
-    def _components(self, groups: Sequence[Group]) -> tuple[FrameLog, tuple[Component, ...]]:
-        """The log with the final numbers of components, and these; the main one is number 0."""
-        main = groups[0]
-        how = {}
-        for join in main.joins:
-            if join.needed:
-                for frame in (join.link.i, join.link.j):
-                    c = self._log.step_of(frame).component
-                    how[c] = "motion" if join.how == "motion" else how.get(c, "links")
-        parts: list[tuple[tuple[int, ...], Float64 | None, Group]] = []
-        first = next(iter(main.T_group_component))
-        T_first = main.T_group_component[first]
-        for c, T in main.T_group_component.items():
-            parts.append(((c,), se3.inverse(T_first) @ T, main))
-        parts += [(tuple(g.T_group_component), None, g) for g in groups[1:]]
-        parts[1:] = sorted(parts[1:], key=lambda part: min(part[0]))
-        number = {c: k for k, part in enumerate(parts) for c in part[0]}
-        log = self._log.numbered(number)
-        components = []
-        for k, (members, T_main, group) in enumerate(parts):
-            frames = [e.record.index for e in log.posed if e.record.component == k]
-            result = None
-            if T_main is None and group.frames > _WORTH_A_MODEL:
-                own = self._log.of(frames)
-                poses = poses_in_world(own, dict(group.T_group_component))
-                result = self._back_end(own, poses, group.joins).run(NotKept(), ())
-                result = replace(result, seed=self.seed, threads=self.threads)
-            joined = None if k == 0 or T_main is None else how.get(members[0], "links")
-            ranges = runs(
-                [e.record.index for e in log.entries],
-                [e.record.component == k and e.has_pose for e in log.entries],
-            )
-            components.append(Component(ranges, T_main, joined, result))
-        return log, tuple(components)
+    def _reconstruct_alone(
+        self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
+    ) -> Reconstruction:
+        """Make the model of a component that is not connected with the main one."""
+        result = self._back_end(log, poses, joins).run(NotKept(), ())
+        return replace(result, seed=self.seed, threads=self.threads)
 
-    def _back_end(
-        self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Any]
-    ) -> BackEnd:
+    def _back_end(self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]) -> BackEnd:
         return BackEnd(
             self.config,
             log,

@@ -11,6 +11,7 @@ that nothing joins stays one of its own.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -45,15 +46,17 @@ View = PosedView[SurfaceMap]
 
 # Pairs of neighbouring views from which is learnt how views of this camera fit.
 _LEARN = 16
-# View pairs that verify a join, beside those of the links; and the least overlap that says anything.
+# View pairs that verify a join, beside those of the links; and the overlap that says something.
 _VERIFY, _OVERLAP = 8, 0.2
+# Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
+_IN_SIGHT = 1.2
 # Contradiction is unusual beyond so many standard deviations above the median of neighbours.
 _SIGMAS, _LEAST_SPREAD = 3.0, 0.02
 # By which fraction of their path components may have drifted in themselves; how far a link may be
 # off, and an alignment can follow: fractions of the depth, and rad.
 _DRIFT, _LINK_ERROR, _FOLLOWED = 0.05, 0.02, 0.1
 # Lengths and turns of the path on either side of a gap say how fast the camera is: it may go on
-# three times as fast, and is somewhere near where it was in any case (a fraction of the depth, rad).
+# three times as fast, and somewhere near where it was in any case (a fraction of the depth, rad).
 _AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
 # A gap may be bridged by motion alone where its standard deviation is at most this: fraction of the
 # depth, and rad.
@@ -130,11 +133,18 @@ class Group:
         What joins them.
     frames
         How many frames they have.
+    bridged
+        Components that are connected with the first one by extrapolated motion only.
     """
 
     T_group_component: Mapping[int, Float64]
     joins: tuple[Join, ...]
     frames: int
+    bridged: frozenset[int] = frozenset()
+
+    def joined(self, component: int) -> How:
+        """How a component is connected with the first one."""
+        return "motion" if component in self.bridged else "links"
 
 
 @dataclass(frozen=True)
@@ -198,16 +208,12 @@ class _Joiner:
         self._stretches = {s.component: s for s in stretches}
         self._component_of = {int(f): s.component for s in stretches for f in s.frames}
         self._views = {v.index: v for s in stretches for v in s.views}
-        self._poses = {
-            int(f): T for s in stretches for f, T in zip(s.frames, s.poses, strict=True)
-        }
+        self._poses = {int(f): T for s in stretches for f, T in zip(s.frames, s.poses, strict=True)}
         self._islands = [_Island({s.component: np.eye(4)}) for s in stretches]
         self._links: list[Link] = []
         self._refused: set[tuple[int, ...]] = set()
         total = sum(len(s.frames) for s in stretches)
-        self._searches = (
-            options.searches + len(stretches) + int(options.searches_per_frame * total)
-        )
+        self._searches = options.searches + len(stretches) + int(options.searches_per_frame * total)
         self._alignments = _ALIGNMENTS * len(stretches)
         self._usual = UsualFit()
         self._contradiction = options.belief.contradiction
@@ -268,7 +274,7 @@ class _Joiner:
     def bridge_gaps(self) -> None:
         """Connect what comes right after a short gap by the motion before and after it."""
         ordered = sorted(self._stretches.values(), key=lambda s: int(s.frames[0]))
-        for before, after in zip(ordered, ordered[1:], strict=False):
+        for before, after in itertools.pairwise(ordered):
             a, b = self._island_of(before.component), self._island_of(after.component)
             if a is b or before.recording != after.recording:
                 continue
@@ -282,17 +288,36 @@ class _Joiner:
         for island in self._islands:
             first = min(island.T, key=lambda c: int(self._stretches[c].frames[0]))
             to_first = se3.inverse(island.T[first])
-            frames = sum(len(self._stretches[c].frames) for c in island.T)
-            T = {c: to_first @ island.T[c] for c in sorted(island.T)}
-            found.append((-frames, int(self._stretches[first].frames[0]), T, island.joins))
-        found.sort(key=lambda f: f[:2])
-        return [Group(T, tuple(joins), -frames) for frames, _, T, joins in found]
+            order = sorted(island.T, key=lambda c: int(self._stretches[c].frames[0]))
+            found.append(
+                Group(
+                    {c: to_first @ island.T[c] for c in order},
+                    tuple(island.joins),
+                    sum(len(self._stretches[c].frames) for c in island.T),
+                    self._bridged_from(island, first),
+                )
+            )
+        began = [int(self._stretches[next(iter(g.T_group_component))].frames[0]) for g in found]
+        order = sorted(range(len(found)), key=lambda k: (-found[k].frames, began[k]))
+        return [found[k] for k in order]
+
+    def _bridged_from(self, island: _Island, first: int) -> frozenset[int]:
+        """Components that no chain of links connects with the first one."""
+        reached, grown = {first}, True
+        linked = [
+            {self._component_of[j.link.i], self._component_of[j.link.j]}
+            for j in island.joins
+            if j.how == "links"
+        ]
+        while grown:
+            more = {c for ends in linked if ends & reached for c in ends}
+            grown = not more <= reached
+            reached |= more
+        return frozenset(island.T) - reached
 
     def _learn_from_neighbours(self) -> None:
         """How do neighbouring views of one component fit, and contradict each other?"""
-        pairs = [
-            (a, b) for s in self._stretches.values() for a, b in zip(s.views, s.views[1:], strict=False)
-        ]
+        pairs = [(a, b) for s in self._stretches.values() for a, b in itertools.pairwise(s.views)]
         some = np.linspace(0, len(pairs) - 1, min(len(pairs), _LEARN)).round().astype(int)
         options = ProjectiveOptions(levels=PATIENT)
         seen = []
@@ -335,9 +360,7 @@ class _Joiner:
         i, j, T = link.i, link.j, link.T_i_j
         if self._component_of[i] not in a.T:
             i, j, T = j, i, se3.inverse(T)
-        return np.asarray(
-            self._T_island(a, i) @ T @ se3.inverse(self._T_island(b, j)), np.float64
-        )
+        return np.asarray(self._T_island(a, i) @ T @ se3.inverse(self._T_island(b, j)), np.float64)
 
     def _proposal(
         self, a: _Island, b: _Island, between: list[Link]
@@ -397,17 +420,14 @@ class _Joiner:
         nodes = {v.index for v in self._views.values() if self._component_of[v.index] in island.T}
         nodes |= {f for join in island.joins for f in (join.link.i, join.link.j)} | {start}
         nodes |= {
-            f
-            for link in self._links
-            for f in (link.i, link.j)
-            if self._component_of[f] in island.T
+            f for link in self._links for f in (link.i, link.j) if self._component_of[f] in island.T
         }
         order = sorted(nodes, key=lambda f: (self._component_of[f], f))
         T = np.stack([self._T_island(island, f) for f in order])
         row = {f: k for k, f in enumerate(order)}
         edges = [
             (row[f], row[g])
-            for f, g in zip(order, order[1:], strict=False)
+            for f, g in itertools.pairwise(order)
             if self._component_of[f] == self._component_of[g]
         ]
         edges += [(row[join.link.i], row[join.link.j]) for join in island.joins]
@@ -452,7 +472,7 @@ class _Joiner:
     def _overlapping(
         self, a: _Island, b: _Island, T_a_b: Float64
     ) -> list[tuple[View, View, Float64, Agreement]]:
-        """View pairs of both sides that overlap most under T_a_b, with T_i_j and their agreement."""
+        """View pairs of both sides that overlap most under T_a_b: T_i_j, and what both saw."""
         compare = self_scaled(self._usual)
         ours = [self._views[i] for i in self._views if self._component_of[i] in a.T]
         theirs = [self._views[i] for i in self._views if self._component_of[i] in b.T]
@@ -465,7 +485,7 @@ class _Joiner:
             between = se3.inverse(Ta[p]) @ Tb
             apart = np.linalg.norm(between[:, :3, 3], axis=1) / v.view.depth
             away = apart + np.asarray(se3.angle(between))
-            near += [(float(away[q]), p, q) for q in np.flatnonzero(away < 1.2)]
+            near += [(float(away[q]), p, int(q)) for q in np.flatnonzero(away < _IN_SIGHT)]
         found = []
         for _, p, q in sorted(near)[: 3 * _VERIFY]:
             T = se3.inverse(Ta[p]) @ Tb[q]
@@ -509,13 +529,9 @@ class _Joiner:
         """Whether two poses differ by no more than drift and what a single link is off by."""
         between = se3.inverse(T) @ other
         limit = drift + _LINK_ERROR
-        return bool(
-            np.linalg.norm(between[:3, 3]) <= limit * depth and se3.angle(between) <= limit
-        )
+        return bool(np.linalg.norm(between[:3, 3]) <= limit * depth and se3.angle(between) <= limit)
 
-    def _confirming(
-        self, a: _Island, b: _Island, T_a_b: Float64, known: list[Link]
-    ) -> list[Link]:
+    def _confirming(self, a: _Island, b: _Island, T_a_b: Float64, known: list[Link]) -> list[Link]:
         """Registrations of other view pairs that say the same as T_a_b."""
         seen = {frozenset((link.i, link.j)) for link in known}
         found = []

@@ -116,9 +116,7 @@ class LoopDetector(Protocol):
 
     part_kind: ClassVar[str] = "loops"
 
-    def start(
-        self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
-    ) -> Loops:
+    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
         """Begin a new recording.
 
         Parameters

@@ -63,9 +63,7 @@ class Nearby(LoopDetector):
         if self.per_frame < 0:
             raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
 
-    def start(
-        self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
-    ) -> Loops:
+    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
         """See `LoopDetector.start`. What a person gives takes the place of what is found."""
         return _NearbyLoops(self, seed, given)
 

@@ -130,9 +130,9 @@ class _Idle(Refiner):
 class Joint(Refining):
     """Moves all views until each agrees with all that it overlaps with (eq 2.8), see `refine`.
 
-    Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The outcome is
-    believed only if the views support each other at least as well as before, and views that lose
-    support stay where their neighbours had them.
+    Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The
+    outcome is believed only if the views support each other at least as well as before, and views
+    that lose support stay where their neighbours had them.
 
     Attributes
     ----------

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
-from tofuse.registration.likeness import look_of
 from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
 from tofuse.posegraph.graph import LoopRecord
@@ -27,6 +26,7 @@ from tofuse.posegraph.loops import (
 )
 from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import Frame
+from tofuse.registration.likeness import look_of
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import Match, search
 from tofuse.registration.uncertainty import covariance
@@ -125,9 +125,7 @@ class Revisits(LoopDetector):
         if not (self.both_ways_m > 0 and self.both_ways_rad > 0):
             raise ValueError("both_ways_m and both_ways_rad must be above 0")
 
-    def start(
-        self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
-    ) -> Loops:
+    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
         """See `LoopDetector.start`. There is nothing random in it."""
         return _RevisitLoops(self, given, views)
 
@@ -225,9 +223,7 @@ class _RevisitLoops(Loops):
     def _views(self, posed: Sequence[PosedView[SurfaceMap]]) -> list[KeptView]:
         """The same views as `overlaps` takes them, made once."""
         known = self._kept
-        self._kept = {
-            p.index: known.get(p.index) or KeptView.of(p.view, _POINTS) for p in posed
-        }
+        self._kept = {p.index: known.get(p.index) or KeptView.of(p.view, _POINTS) for p in posed}
         return list(self._kept.values())
 
     def _learn(self, posed: Sequence[PosedView[SurfaceMap]]) -> None:

@@ -1,0 +1,183 @@
+"""Alignments of a view with the last keyframe and the last frame, the likeliest first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.keyframe_map import Keyframe
+from tofuse.registration.projective import Aligned, ProjectiveOptions, Target, align
+from tofuse.registration.verification import PATIENT, Assessment, UsualFit
+
+Float64 = NDArray[np.float64]
+
+# A turn must explain more than standing still does: a flat wall fits any.
+CLEARLY = 1.03
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A keyframe, and its view as it is aligned with: without what has moved since."""
+
+    keyframe: Keyframe
+    target: Target
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """An alignment of the view with a keyframe, and how it compares with usual ones.
+
+    Attributes
+    ----------
+    view
+        What was aligned: the view without what moves by itself.
+    predicted
+        Whether it began where the motion leads.
+    how
+        In words, where that is out of the ordinary.
+    """
+
+    aligned: Aligned
+    view: SurfaceMap
+    reference: Reference
+    predicted: bool
+    how: str
+    assessment: Assessment
+
+    @property
+    def keyframe(self) -> Keyframe:
+        """What the view was aligned with."""
+        return self.reference.keyframe
+
+    @property
+    def T_component_camera(self) -> Float64:
+        """(4, 4) pose of the view."""
+        return self.aligned.T_world_source
+
+    @property
+    def T_keyframe_camera(self) -> Float64:
+        """(4, 4) the same in the frame of the keyframe."""
+        T = se3.inverse(self.keyframe.T_component_camera) @ self.T_component_camera
+        return np.asarray(T, np.float64)
+
+
+class Attempts:
+    """Attempts that are made when they are asked for, and kept.
+
+    Parameters
+    ----------
+    view
+        Without what moves by itself.
+    references
+        To align with, the likeliest first.
+    expected, steady
+        (4, 4) where the camera is expected, where alignments begin; and where degenerate directions
+        stay. None where nothing is expected.
+    T_last
+        (4, 4) where the camera was.
+    """
+
+    def __init__(
+        self,
+        view: SurfaceMap,
+        references: Sequence[Reference],
+        expected: Float64 | None,
+        steady: Float64 | None,
+        T_last: Float64,
+        options: ProjectiveOptions,
+        usual: UsualFit,
+    ) -> None:
+        self._view, self._references = view, references
+        self._expected, self._steady, self._T_last = expected, steady, T_last
+        self._options, self._usual = options, usual
+        self._coming = self._make()
+        self._made: list[Attempt] = []
+
+    def __iter__(self) -> Iterator[Attempt]:
+        yield from self._made
+        for attempt in self._coming:
+            self._made.append(attempt)
+            yield attempt
+
+    @property
+    def objection(self) -> str:
+        """What speaks against the likeliest one, in words."""
+        for attempt in self._made:
+            if attempt.assessment.reason:
+                return attempt.assessment.reason
+        return "it is far from where the motion leads" if self._made else ""
+
+    def again(self, attempt: Attempt, view: SurfaceMap, reference: Reference) -> Attempt:
+        """Align once more from an attempt's outcome: other pixels take part now."""
+        T = attempt.T_component_camera
+        return self._attempt(
+            align(view, [reference.target], T, self._options, usual_scale=self._usual.noise_scale),
+            view,
+            reference,
+            attempt.how,
+            predicted=attempt.predicted,
+        )
+
+    def _make(self) -> Iterator[Attempt]:
+        expected, view = self._expected, self._view
+        if expected is not None:
+            kept = expected if self._steady is None else self._steady
+            for r in self._references:
+                aligned = align(
+                    view,
+                    [r.target],
+                    kept,
+                    self._options,
+                    start=expected,
+                    usual_scale=self._usual.noise_scale,
+                )
+                yield self._attempt(aligned, view, r, "", predicted=True)
+        unknown = "nothing predicted it" if expected is None else "the prediction did not fit"
+        for r in self._references:
+            aligned, where = self._turned(r)
+            how = f"{unknown}: found from {where}"
+            yield self._attempt(aligned, view, r, how, predicted=False)
+
+    def _attempt(
+        self, aligned: Aligned, view: SurfaceMap, reference: Reference, how: str, *, predicted: bool
+    ) -> Attempt:
+        return Attempt(aligned, view, reference, predicted, how, self._usual.assess(aligned))
+
+    def _turned(self, reference: Reference) -> tuple[Aligned, str]:
+        """Align from where the camera was, or from the turn of it that fits best."""
+        view, target, scale = self._view, [reference.target], self._usual.noise_scale
+        coarse = replace(self._options, levels=PATIENT[:1])
+        motions = _turns(view)
+        still, *turned = [
+            align(view, target, self._T_last @ motion, coarse, usual_scale=scale)
+            for motion in motions
+        ]
+        best = max(range(len(turned)), key=lambda k: turned[k].score)
+        moves = turned[best].score > CLEARLY * still.score
+        chosen, where = (turned[best], "a turn") if moves else (still, "where the camera was")
+        if moves:
+            where += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
+        # With no prediction to keep to, what little the data says is the better guess.
+        how = replace(self._options, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
+        T = chosen.T_world_source if moves else self._T_last
+        start = chosen.T_world_source
+        return align(view, target, T, how, start=start, usual_scale=scale), where
+
+
+def _turns(view: SurfaceMap) -> list[Float64]:
+    """Motions of the camera to try: none, and turns about itself and about what it sees."""
+    centre = np.eye(4)
+    centre[2, 3] = view.depth
+    motions = [np.eye(4)]
+    for angle in np.radians([-12, -6, 6, 12]):
+        for axis in (3, 4):
+            twist = np.zeros(6)
+            twist[axis] = angle
+            turn = se3.exp(twist)
+            motions += [turn, centre @ turn @ se3.inverse(centre)]
+    return motions

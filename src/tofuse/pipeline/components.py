@@ -1,0 +1,76 @@
+"""The final numbers of components, and what becomes of those that nothing connects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.pipeline.frame_log import FrameLog, poses_in_world
+from tofuse.posegraph.joining import Group, How, Join
+from tofuse.results.ranges import runs
+from tofuse.results.types import Component, Reconstruction
+
+Float64 = NDArray[np.float64]
+# Reconstructs frames, given their poses in one frame and what joins their components.
+Reconstruct = Callable[[FrameLog, dict[int, Float64], Sequence[Join]], Reconstruction]
+
+# A component of fewer frames that nothing connects gets no model of its own.
+_WORTH_A_MODEL = 5
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What becomes one component: some of the tracker's, and where they are."""
+
+    members: tuple[int, ...]
+    group: Group
+    T_main_component: Float64 | None
+    joined: How | None
+
+
+def numbered_components(
+    log: FrameLog, groups: Sequence[Group], reconstruct: Reconstruct
+) -> tuple[FrameLog, tuple[Component, ...]]:
+    """Number components: the main one is 0, then in the order in which they began.
+
+    Parameters
+    ----------
+    groups
+        Of the tracker's components, the main one first. Those that are joined with each other, but
+        not with the main one, become one.
+    reconstruct
+        Makes the model of a component that is not connected with the main one.
+
+    Returns
+    -------
+    The log, whose records know their component now, and the components.
+    """
+    parts = _parts(groups)
+    log = log.numbered({c: k for k, part in enumerate(parts) for c in part.members})
+    components = []
+    for k, part in enumerate(parts):
+        mine = [e.has_pose and e.record.component == k for e in log.entries]
+        ranges = runs([e.record.index for e in log.entries], mine)
+        result = None
+        if part.T_main_component is None and part.group.frames > _WORTH_A_MODEL:
+            own = log.of([e.record.index for e in log.posed if e.record.component == k])
+            poses = poses_in_world(own, part.group.T_group_component)
+            result = reconstruct(own, poses, part.group.joins)
+        components.append(Component(ranges, part.T_main_component, part.joined, result))
+    return log, tuple(components)
+
+
+def _parts(groups: Sequence[Group]) -> list[_Part]:
+    main = groups[0]
+    first = next(iter(main.T_group_component))
+    to_first = se3.inverse(main.T_group_component[first])
+    parts = [
+        _Part((c,), main, to_first @ T, None if c == first else main.joined(c))
+        for c, T in main.T_group_component.items()
+    ]
+    parts += [_Part(tuple(g.T_group_component), g, None, None) for g in groups[1:]]
+    return [parts[0], *sorted(parts[1:], key=lambda part: min(part.members))]
