@@ -265,6 +265,8 @@ class BackEnd:
         replaced = {index for edge in again for index in (edge.i, edge.j)}
         place = {index: k for k, index in enumerate(ids)}
         sigma = prediction_sigma(tracked, [e.record.unobservable for e in self._posed])
+        times = {e.record.index: e.record.timestamp for e in self._posed}
+        interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
         sequence = []
         for entry in self._posed:
             step, index = entry.step, entry.record.index
@@ -273,9 +275,12 @@ class BackEnd:
             if {step.reference, index} <= replaced:
                 continue
             r = step.registration
-            # What was predicted frame by frame since then adds up.
+            # What was predicted frame by frame since then adds up; over longer intervals than usual
+            # errors of the velocity grow with the square of the time.
             frames = abs(place[index] - place[step.reference])
-            predicted = (sigma[0] * frames, sigma[1] * frames)
+            elapsed = abs(times[index] - times[step.reference])
+            longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
+            predicted = (sigma[0] * frames * longer**2, sigma[1] * frames * longer**2)
             information = with_prediction(r.information, r.unobservable, predicted)
             sequence.append(Measured(step.reference, index, r.T_target_source, information))
         needed = [

@@ -50,18 +50,19 @@ def numbered_components(
     The log, whose records know their component now, and the components.
     """
     parts = _parts(groups)
-    log = log.numbered({c: k for k, part in enumerate(parts) for c in part.members})
+    numbered = log.numbered({c: k for k, part in enumerate(parts) for c in part.members})
     components = []
     for k, part in enumerate(parts):
-        mine = [e.has_pose and e.record.component == k for e in log.entries]
+        mine = [e.has_pose and e.record.component == k for e in numbered.entries]
         ranges = runs([e.record.index for e in log.entries], mine)
         result = None
         if part.T_main_component is None and part.group.frames > _WORTH_A_MODEL:
-            own = log.of([e.record.index for e in log.posed if e.record.component == k])
+            frames = [e.record.index for e in numbered.posed if e.record.component == k]
+            own = log.of(frames)  # in its own model it is no component of another one
             poses = poses_in_world(own, part.group.T_group_component)
             result = reconstruct(own, poses, part.group.joins)
         components.append(Component(ranges, part.T_main_component, part.joined, result))
-    return log, tuple(components)
+    return numbered, tuple(components)
 
 
 def _parts(groups: Sequence[Group]) -> list[_Part]:

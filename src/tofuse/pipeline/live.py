@@ -1,12 +1,25 @@
-"""Loops that are closed while frames arrive: later than the frame, but always equally late."""
+"""Poses while frames arrive: components that were connected so far, and loops that closed.
+
+A loop counts later than its frame, but always equally late.
+"""
 
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
 from tofuse.kernels.threads import side_threads
+from tofuse.odometry.base import Step
+from tofuse.pipeline.frame_log import FrameLog
+from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, Loops
+from tofuse.registration.verification import Link
+
+Float64 = NDArray[np.float64]
 
 # A job begins at one frame and counts this many frames later, however soon it was done: the poses
 # are then the same on every machine. A slow machine waits there.
@@ -69,3 +82,59 @@ class LiveLoops:
         if self._pool is not None:
             self._pool.shutdown()
         self._pool, self._job = None, None
+
+
+class LivePoses:
+    """Where the camera is in the frame of the first component, as known so far.
+
+    The end decides anew which components are connected, and closes all loops.
+    """
+
+    def __init__(self, loops: Loops) -> None:
+        self._loops = LiveLoops(loops)
+        self._component = 0
+        # Of the components that are connected to the first one, and what loops that closed on the
+        # way have moved in the present one.
+        self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
+        self._T_closed_tracked = np.eye(4)
+
+    def follow(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
+        """Take the next frame; returns the loops of its component if new ones count now."""
+        if step.component != self._component:
+            self._component, self._T_closed_tracked = step.component, np.eye(4)
+        for link in step.links:
+            self._connect(link, log)
+        if step.T_component_camera is None or not self._loops.step():
+            return []
+        here = {e.record.index for e in log.of_component(step.component).posed}
+        return [c for c in self._loops.closed if {c.record.i, c.record.j} <= here]
+
+    def close(self, tracked: PoseGraph, optimised: PoseGraph) -> None:
+        """Move what follows by as much as loops moved the last pose of a graph."""
+        self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
+
+    def pose(self, step: Step) -> Float64 | None:
+        """T_world_camera (4, 4); None where it is lost, or not connected to the first component."""
+        T_world_component = self._T_world_component.get(step.component)
+        if step.T_component_camera is None or T_world_component is None:
+            return None
+        T = T_world_component @ self._T_closed_tracked @ step.T_component_camera
+        return np.asarray(T, np.float64)
+
+    def _connect(self, link: Link, log: FrameLog) -> None:
+        a, b = log.step_of(link.i), log.step_of(link.j)
+        known = self._T_world_component
+        if not link.certain or a.component not in known or b.component in known:
+            return
+        assert a.T_component_camera is not None
+        assert b.T_component_camera is not None
+        T_a_b = a.T_component_camera @ link.T_i_j @ se3.inverse(b.T_component_camera)
+        known[b.component] = known[a.component] @ T_a_b
+
+    def wait(self) -> None:
+        """Wait for loops that are being measured."""
+        self._loops.wait()
+
+    def finish(self) -> None:
+        """Wait, and let the thread go."""
+        self._loops.finish()

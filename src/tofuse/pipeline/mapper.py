@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count, threads, undivided
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
@@ -19,9 +18,10 @@ from tofuse.pipeline.backend import BackEnd
 from tofuse.pipeline.behind import Behind
 from tofuse.pipeline.checkpoint import NotKept, Stages
 from tofuse.pipeline.components import numbered_components
-from tofuse.pipeline.config import Config, ViewKind, check_views, from_method, kind_of
+from tofuse.pipeline.config import Config, check_views, from_method, kind_of
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
-from tofuse.pipeline.live import LiveLoops
+from tofuse.pipeline.intake import Intake
+from tofuse.pipeline.live import LivePoses
 from tofuse.pipeline.memory import give_back
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
@@ -73,11 +73,10 @@ class Mapper:
         self.watch = Stopwatch()
         self._given = tuple(loops)
         self._progress = progress or Silent()
-        self._kind: ViewKind | None = None
+        self._intake = Intake()
         self._log = FrameLog()
         self._samples = FrameSamples()
         self._behind = Behind()
-        self._before: RangeFrame | None = None  # as the camera gave it
         self._ended = self._finished = False
         self._begin()
 
@@ -85,12 +84,8 @@ class Mapper:
         self._preparation = Preparation(self.config)
         self._tracker = self.config.odometry.start(self.seed)
         self._kept = Observations(self.config, self.seed, self._given)
-        self._live = LiveLoops(self._kept.loops)
+        self._live = LivePoses(self._kept.loops)
         self._component = 0
-        # Of the components that are connected to the first one so far; and what loops that closed
-        # on the way have moved in the present one.
-        self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
-        self._T_closed_tracked = np.eye(4)
 
     def push(
         self,
@@ -130,7 +125,9 @@ class Mapper:
             can't work on, or its index does not grow.
         """
         self._check(frame)
-        repeated = self._is_repeated(frame)
+        repeated = self._intake.is_repeated(frame)
+        if repeated:
+            self._log.repeated.append(frame.index)
         # A search for a lost camera is worth dividing, while those who prepare frames are waiting.
         busy = prepared is not None and prepared.ready is not None
         with threads(self.threads), undivided(busy):
@@ -156,7 +153,6 @@ class Mapper:
         if step.component != self._component:
             self._component = step.component
             self._preparation.begin_component()
-            self._T_closed_tracked = np.eye(4)
         if step.status == "tracked" and step.T_component_camera is not None:
             self._preparation.placed(ready.filtered, step.T_component_camera)
         return step
@@ -196,40 +192,19 @@ class Mapper:
 
     def _close_loops(self, step: Step) -> None:
         """Let loops that were found some frames ago count in the present component."""
-        for link in step.links:
-            self._connect(link.i, link.j, link.T_i_j, certain=link.certain)
-        if step.T_component_camera is None:
-            return
         with self.watch.timing("loops"):
-            if not self._live.step():
-                return
-            log = self._log.of_component(step.component)
-            poses = poses_in_world(log, {step.component: np.eye(4)})
-            closed = [c for c in self._live.closed if {c.record.i, c.record.j} <= poses.keys()]
-            graph = self._back_end(log, poses, ()).graph(closed)
-            moved = self.config.optimiser.optimise(graph).graph
-            self._T_closed_tracked = moved.poses[-1] @ se3.inverse(graph.poses[-1])
-
-    def _connect(self, i: int, j: int, T_i_j: Float64, *, certain: bool) -> None:
-        """Place a component beside the one that a link connects it with, until the end decides."""
-        a, b = self._log.step_of(i), self._log.step_of(j)
-        known = self._T_world_component
-        if not certain or a.component not in known or b.component in known:
-            return
-        assert a.T_component_camera is not None
-        assert b.T_component_camera is not None
-        T_a_b = a.T_component_camera @ T_i_j @ se3.inverse(b.T_component_camera)
-        known[b.component] = known[a.component] @ T_a_b
+            loops = self._live.follow(step, self._log)
+            if loops:
+                log = self._log.of_component(step.component)
+                poses = poses_in_world(log, {step.component: np.eye(4)})
+                graph = self._back_end(log, poses, ()).graph(loops)
+                self._live.close(graph, self.config.optimiser.optimise(graph).graph)
 
     def _report(self, ready: Ready, step: Step) -> Float64 | None:
         self._progress.advance(self._log.entries[-1].record)
-        T_world_component = self._T_world_component.get(step.component)
-        if step.T_component_camera is None or T_world_component is None:
-            return None
-        T_world_camera = np.asarray(
-            T_world_component @ self._T_closed_tracked @ step.T_component_camera, np.float64
-        )
-        self._progress.placed(ready.clean, T_world_camera)
+        T_world_camera = self._live.pose(step)
+        if T_world_camera is not None:
+            self._progress.placed(ready.clean, T_world_camera)
         return T_world_camera
 
     def prepare(self, frame: Frame) -> Prepared | None:
@@ -242,7 +217,8 @@ class Mapper:
 
     def skip(self, index: int, timestamp: float, reason: str) -> None:
         """Say that a frame could not be read; InputError if its index does not grow."""
-        self._check_order(index)
+        self._check_open()
+        self._intake.check_order(index)
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
         self._progress.advance(self._log.entries[-1].record)
 
@@ -254,7 +230,7 @@ class Mapper:
     def end(self) -> None:
         """Say that no frame follows: what only they would ask for need not be kept any longer."""
         if not self._ended:
-            self._before = None
+            self._intake.end()
             self._ended = True
             give_back()
 
@@ -337,44 +313,20 @@ class Mapper:
             self.watch,
         )
 
-    def _is_repeated(self, frame: Frame) -> bool:
-        """Whether an image is the one before: a camera that hangs, as noise never repeats."""
-        if not isinstance(frame, RangeFrame):
-            return False
-        before, self._before = self._before, frame
-        if before is None or not np.array_equal(before.depth[0], frame.depth[0]):
-            return False  # most differ there already
-        if not np.array_equal(before.depth, frame.depth) or not len(frame):
-            return False
-        self._log.repeated.append(frame.index)
-        return True
-
     def _check(self, frame: Frame) -> None:
-        self._check_order(frame.index)
+        self._check_open()
+        self._intake.check_order(frame.index)
+        if not self._intake.check_kind(frame):
+            return
         kind = kind_of(frame)
-        if self._kind and kind != self._kind:
-            raise InputError(
-                f"is a {kind} view among {self._kind} views",
-                where=f"frame {frame.index}",
-                remedy="give images only, or clouds only",
-            )
-        if self._kind is None:
-            if self._method is not None and kind == "cloud":
-                self.config = from_method(self._method, kind)
-                self._begin()
-            check_views(self.config, kind)
-            self._kind = kind
+        if self._method is not None and kind == "cloud":
+            self.config = from_method(self._method, kind)
+            self._begin()
+        check_views(self.config, kind)
 
-    def _check_order(self, index: int) -> None:
+    def _check_open(self) -> None:
         if self._finished or self._ended:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
-        entries = self._log.entries
-        if entries and index <= entries[-1].record.index:
-            raise InputError(
-                f"comes after frame {entries[-1].record.index}",
-                where=f"frame {index}",
-                remedy="number the frames in the order in which they are pushed",
-            )
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but who hears of it, so that a copy can go on elsewhere."""
