@@ -3,8 +3,9 @@
 The simulated recordings have exact truth. They are taken without multipath and, but for the quick
 turns, without smear (which take most of the time and nothing of the difficulty), and kept in
 `out/recordings/robustness`. Raw amplitude is freed of its falloff towards the corners, as a
-calibrated camera would give it; what comes of it if it is not is a case of its own. Which frames can be connected at all is found from the truth: two
-frames are tied where each sees at least 35 % of the other.
+calibrated camera would give it; what comes of it if it is not is a case of its own. Which frames
+can be connected at all is found from the truth: two frames are tied where each sees at least 35 %
+of the other.
 """
 
 from __future__ import annotations
