@@ -10,6 +10,8 @@ that is joined to it, or a component of its own), against true poses:
 - It is *marked* if its frame is not called tracked; or the error is within three sigma of the
   covariance that the frame states; or what is left of the error without the directions that the
   frame calls unobservable is no longer wrong; or a reason of the run names its frame.
+  Covariances are relative to the first frame, errors to where most frames are right: a pose that is
+  well known beside its neighbours but not beside the rest has to say so.
 - Frames are tied where their relative pose is off by no more than 5 cm and 3 degrees, and what
   hangs together by ties is a *side*, which drift does not break. A *join is wrong* where two sides
   of three or more frames of one part are off against each other by more than 20 cm or 10 degrees

@@ -2,8 +2,10 @@
 
 The simulated recordings have exact truth. They are taken without multipath and, but for the quick
 turns, without smear (which take most of the time and nothing of the difficulty), and kept in
-`out/recordings/robustness`. Which frames can be connected at all is found from the truth: two
-frames are tied where each sees at least 35 % of the other.
+`out/recordings/robustness`. Raw amplitude is freed of its falloff towards the corners, as a
+calibrated camera would give it; what comes of it if it is not is a case of its own. Which frames
+can be connected at all is found from the truth: two frames are tied where each sees at least 35 %
+of the other.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from tofuse.geometry import se3
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.models import camera_model
 from tofuse.simulation import paths
 from tofuse.simulation import scene as simulated
 from tofuse.simulation.effects import Effects
@@ -117,6 +120,7 @@ def take(
     motion: str = "",
     other: tuple[str, int] | None = None,
     frames: int | None = None,
+    falloff: bool = False,
 ) -> Take:
     """Simulate a recording, or read it if it was made before.
 
@@ -128,6 +132,8 @@ def take(
         "quick turns", "close-up", or nothing: as the scene has it.
     other
         Another scene and first raw frame, with the same camera.
+    falloff
+        Whether raw amplitude falls off towards the corners.
     """
     name, first = other or (scene.name, scene.first)
     count = frames or scene.frames
@@ -160,8 +166,20 @@ def take(
         unfinished.rename(folder)
     recording = open_recording(folder)
     images = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
+    if not falloff:
+        images = tuple(evenly_lit(frame, made.model.transmission) for frame in images)
     poses = made.sequence.T_room_camera(start) @ made.poses
     return Take(images, poses, dict(recording.metadata))
+
+
+def evenly_lit(frame: RangeFrame, transmission: Float64) -> RangeFrame:
+    """Divide raw amplitude by what lens and lamp leave of it in each pixel (H, W)."""
+    light = frame.amplitude_image
+    if light is None or frame.amplitude_kind != "raw":
+        return frame
+    even = light / np.where(transmission > 0, transmission, 1.0)
+    even = np.where(light >= SATURATED_AMPLITUDE, light, np.minimum(even, SATURATED_AMPLITUDE - 1))
+    return replace(frame, amplitude_image=even.astype(np.float32))
 
 
 def quick_turns(path: paths.Path, start: float) -> paths.Path:
@@ -415,6 +433,11 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
             made[name] = lambda rng: make(rng, name)
 
     add("as it is", lambda rng, name: as_case(scene.name, name, base()))
+    if camera_model(scene.camera).amplitude_kind == "raw":
+        add(
+            "amplitude falls off to corners",
+            lambda rng, name: as_case(scene.name, name, take(scene, seed, falloff=True)),
+        )
     for seconds in durations:
         for how in ("lid", "hand"):
 

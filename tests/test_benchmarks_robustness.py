@@ -273,6 +273,17 @@ def test_amplitude_and_range_change_as_said(stress) -> None:
     np.testing.assert_allclose(stress.farther(radial, 0.05).depth, 2.05, atol=1e-6)
 
 
+def test_falloff_is_taken_out_of_raw_amplitude_only(stress) -> None:
+    frame = flat_wall(0, 0.0)
+    frame.amplitude_image[0, 0] = 65535
+    transmission = np.full((30, 40), 0.5)
+    even = stress.evenly_lit(frame, transmission).amplitude_image
+    assert even[0, 0] == 65535
+    assert (even[1:] == 2000).all()
+    other = replace(frame, amplitude_kind="range_compensated")
+    assert stress.evenly_lit(other, transmission) is other
+
+
 def test_two_places_go_on_in_time_and_twice_does_not(stress) -> None:
     took, other = made_take(stress), made_take(stress, 20)
     away = other.poses.copy()
