@@ -27,9 +27,6 @@ from tofuse.registration.verification import Link, UsualFit, comparable, self_sc
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
-# From one frame to the next: what moves further without a prediction is a large step, which has
-# rivals. rad, and fraction of the depth.
-_LARGE = 0.35
 # Moving objects are looked for in every n-th frame, and wherever something indicates them: what
 # fits worse than usual, so many points in free space, or objects in the frame before.
 _LOOK_EVERY, _IN_FRONT = 4, 0.005
@@ -144,24 +141,42 @@ class KeyframeTracker(Tracker):
         return np.asarray(last.T_component_camera @ se3.inverse(before) @ T_odometry, np.float64)
 
     def _first_usual(self, attempts: Attempts, now: Moment) -> Attempt | None:
-        """The first alignment that fits as usual, and that the camera's motion allows."""
+        """The first alignment that fits as usual, and that the camera's motion allows.
+
+        While it is not known what is usual for the camera, both images must agree as well.
+        """
         for attempt in attempts:
-            if attempt.assessment.usual and self._is_possible(attempt, now):
+            if not attempt.assessment.usual or not self._is_possible(attempt, now):
+                continue
+            if self._usual.is_known or self._agreement(attempt) > 0:
                 return attempt
         return None
 
+    def _agreement(self, attempt: Attempt) -> float:
+        """Support less contradiction, of both images, for an alignment."""
+        target = attempt.reference.target.view
+        compare = self_scaled(self._usual)
+        return agreement(attempt.view, target, attempt.T_keyframe_camera, compare).score
+
     def _is_possible(self, attempt: Attempt, now: Moment) -> bool:
-        """Whether the camera may have moved like this; without a prediction by no large step."""
+        """Whether the camera may have moved like this.
+
+        Without a prediction, a step that is not small has rivals: a search must find the same.
+        """
         assert self._last is not None
         if self._motion.surprise(attempt.T_component_camera, now):
             return False
         between = se3.inverse(self._last.T_component_camera) @ attempt.T_component_camera
         if attempt.predicted or is_small(between):
             return True
-        far = np.linalg.norm(between[:3, 3]) > _LARGE * self._last.depth
-        if far or se3.angle(between) > _LARGE:
+        if not attempt.aligned.converged or len(attempt.aligned.unobservable):
             return False
-        return attempt.aligned.converged and not len(attempt.aligned.unobservable)
+        k = attempt.keyframe
+        adjacent = k.view.index == self._last.view.index
+        link = self._relocalizer.link(attempt.view, k, self._usual, adjacent=adjacent)
+        if link is None or not link.certain:
+            return False
+        return not self._options.belief.search.differ(link.T_i_j, attempt.T_keyframe_camera)
 
     def _unrivalled(self, view: SurfaceMap, attempts: Attempts, now: Moment) -> Attempt | None:
         """The alignment that explains the view best, unless both images contradict even that.
@@ -170,7 +185,6 @@ class KeyframeTracker(Tracker):
         """
         if self._last is None or now.index - self._last.view.index > 1:
             return None
-        compare = self_scaled(self._usual)
         best, best_score = None, 0.0
         for attempt in attempts:
             if not np.isfinite(attempt.aligned.rms_m) or not self._is_possible(attempt, now):
@@ -180,9 +194,9 @@ class KeyframeTracker(Tracker):
                 attempt = self._without_moving(view, attempt, moving, attempts)
                 if attempt.assessment.usual and self._is_possible(attempt, now):
                     return attempt
-            score = agreement(
-                attempt.view, attempt.reference.target.view, attempt.T_keyframe_camera, compare
-            ).score
+            if attempt.assessment.conflict and len(attempt.aligned.unobservable):
+                continue  # the motion model, on which it relies, explains the view badly
+            score = self._agreement(attempt)
             # Of equals the likeliest, which comes first.
             if score > CLEARLY * best_score:
                 best, best_score = attempt, score

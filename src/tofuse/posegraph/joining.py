@@ -51,7 +51,8 @@ _VERIFY, _OVERLAP = 8, 0.2
 # Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
 _IN_SIGHT = 1.2
 # Contradiction is unusual beyond so many standard deviations above the median of neighbours.
-_SIGMAS, _LEAST_SPREAD = 3.0, 0.02
+# Wrong poses within one scene contradict by more than the last number, whatever neighbours do.
+_SIGMAS, _LEAST_SPREAD, _MAX_CONTRADICTION = 3.0, 0.02, 0.2
 # By which fraction of their path components may have drifted in themselves; how far a link may be
 # off, and an alignment can follow: fractions of the depth, and rad.
 _DRIFT, _LINK_ERROR, _FOLLOWED = 0.05, 0.02, 0.1
@@ -333,7 +334,7 @@ class _Joiner:
             middle = float(np.median(seen))
             spread = 1.48 * float(np.median(np.abs(np.array(seen) - middle)))
             limit = middle + _SIGMAS * max(spread, _LEAST_SPREAD)
-            self._contradiction = max(self._contradiction, limit)
+            self._contradiction = max(self._contradiction, min(limit, _MAX_CONTRADICTION))
 
     def _registered(self, first: View, second: View) -> Link | None:
         """Register two views that look alike: from the identity if that does, else by a search."""
