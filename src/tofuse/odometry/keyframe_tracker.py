@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -146,7 +147,9 @@ class KeyframeTracker(Tracker):
         While it is not known what is usual for the camera, both images must agree as well.
         """
         for attempt in attempts:
-            if not attempt.assessment.usual or not self._is_possible(attempt, now):
+            if not attempt.assessment.usual or self._is_surprising(attempt, now):
+                continue
+            if not attempt.predicted and not self._is_verified(attempt):
                 continue
             if self._usual.is_known or self._agreement(attempt) > 0:
                 return attempt
@@ -158,19 +161,22 @@ class KeyframeTracker(Tracker):
         compare = self_scaled(self._usual)
         return agreement(attempt.view, target, attempt.T_keyframe_camera, compare).score
 
-    def _is_possible(self, attempt: Attempt, now: Moment) -> bool:
-        """Whether the camera may have moved like this.
+    def _is_surprising(self, attempt: Attempt, now: Moment) -> bool:
+        """Whether the camera can hardly have moved like this."""
+        return bool(self._motion.surprise(attempt.T_component_camera, now))
 
-        Without a prediction, a step that is not small has rivals: a search must find the same.
-        """
+    def _is_small(self, attempt: Attempt) -> bool:
+        """Whether the camera hardly moved, which needs no prediction."""
         assert self._last is not None
-        if self._motion.surprise(attempt.T_component_camera, now):
-            return False
-        between = se3.inverse(self._last.T_component_camera) @ attempt.T_component_camera
-        if attempt.predicted or is_small(between):
+        return is_small(se3.inverse(self._last.T_component_camera) @ attempt.T_component_camera)
+
+    def _is_verified(self, attempt: Attempt) -> bool:
+        """Whether a step that nothing predicted is small, or a search finds the same."""
+        if self._is_small(attempt):
             return True
         if not attempt.aligned.converged or len(attempt.aligned.unobservable):
             return False
+        assert self._last is not None
         k = attempt.keyframe
         adjacent = k.view.index == self._last.view.index
         link = self._relocalizer.link(attempt.view, k, self._usual, adjacent=adjacent)
@@ -186,14 +192,13 @@ class KeyframeTracker(Tracker):
         if self._last is None or now.index - self._last.view.index > 1:
             return None
         best, best_score = None, 0.0
-        for attempt in attempts:
-            if not np.isfinite(attempt.aligned.rms_m) or not self._is_possible(attempt, now):
+        for attempt in (*self._with_segmentation(view, attempts), *attempts):
+            if not np.isfinite(attempt.aligned.rms_m) or self._is_surprising(attempt, now):
                 continue
-            moving = self._segment(view, attempt, learn=False)
-            if moving.reliable and moving.fraction > _NOTICED:
-                attempt = self._without_moving(view, attempt, moving, attempts)
-                if attempt.assessment.usual and self._is_possible(attempt, now):
-                    return attempt
+            if not (attempt.predicted or self._is_small(attempt)):
+                continue
+            if attempt.assessment.usual:
+                return attempt
             if attempt.assessment.conflict and len(attempt.aligned.unobservable):
                 continue  # the motion model, on which it relies, explains the view badly
             score = self._agreement(attempt)
@@ -202,19 +207,44 @@ class KeyframeTracker(Tracker):
                 best, best_score = attempt, score
         return best
 
-    def _segment(self, view: SurfaceMap, attempt: Attempt, *, learn: bool = True) -> Moving:
-        k = attempt.keyframe
-        return self._moving.update(
-            view, attempt.T_component_camera, k.view, k.T_component_camera, learn=learn
-        )
+    def _with_segmentation(self, view: SurfaceMap, attempts: Attempts) -> Iterator[Attempt]:
+        """Alignments without what moves by itself, if the camera is where motion or a fit has it.
+
+        What moves may fill so much of the view that the alignment follows it: then the prediction
+        is the better guess.
+        """
+        poses = [(attempts.expected, r, True) for r in attempts.references[:1]]
+        made = list(attempts)
+        for T, r, predicted in [
+            *poses,
+            *((a.T_component_camera, a.reference, a.predicted) for a in made),
+        ]:
+            if T is None:
+                continue
+            moving = self._segment(view, T, r.keyframe, learn=False)
+            if moving.reliable and moving.fraction > _NOTICED:
+                yield self._without_moving(view, T, r.keyframe, moving, attempts, predicted)
+
+    def _segment(
+        self, view: SurfaceMap, T: Float64, keyframe: Keyframe, *, learn: bool = True
+    ) -> Moving:
+        k = keyframe
+        return self._moving.update(view, T, k.view, k.T_component_camera, learn=learn)
 
     def _without_moving(
-        self, view: SurfaceMap, attempt: Attempt, moving: Moving, attempts: Attempts
+        self,
+        view: SurfaceMap,
+        T: Float64,
+        keyframe: Keyframe,
+        moving: Moving,
+        attempts: Attempts,
+        predicted: bool,
     ) -> Attempt:
-        """Align once more without what moves by itself."""
-        k = attempt.keyframe
+        """Align once more, from T, without what moves by itself."""
+        k = keyframe
         target = Target(moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera))
-        return attempts.again(attempt, moving.applied(view), Reference(k, target))
+        reference = Reference(k, target)
+        return attempts.again(T, moving.applied(view), reference, predicted=predicted)
 
     def _followed(
         self, view: SurfaceMap, found: Attempt, attempts: Attempts
@@ -229,15 +259,16 @@ class KeyframeTracker(Tracker):
         )
         if not look:
             return found, None
-        moving = self._segment(view, found)
-        new = moving.fraction - float(
-            (found.view.planes[..., 3] == 0).mean() - (view.planes[..., 3] == 0).mean()
+        T, k = found.T_component_camera, found.keyframe
+        moving = self._segment(view, T, k)
+        left_out = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
+            found.view.planes[..., 3]
         )
-        if moving.reliable and new > _NOTICED:
-            again = self._without_moving(view, found, moving, attempts)
+        if moving.reliable and moving.fraction - left_out / view.pixels > _NOTICED:
+            again = self._without_moving(view, T, k, moving, attempts, found.predicted)
             if again.assessment.usual or not found.assessment.usual:
                 found = again
-                moving = self._segment(view, found)
+                moving = self._segment(view, again.T_component_camera, k)
         self._moved = moving.fraction > 0
         return found, moving
 
