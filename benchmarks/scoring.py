@@ -8,6 +8,7 @@ that is joined to it, or a component of its own), against true poses:
   broke in two is aligned to its larger piece, not to something between. As covariances are relative
   to the first frame, the motion that fits the piece with the first frame is tried as well, and the
   one with fewer unmarked wrong poses counts: what is said of the later piece covers the break.
+  The stricter count, with the larger piece alone, is given beside it.
 - A pose is *wrong* if it is then off by more than 5 cm or 3 degrees.
 - It is *marked* if its frame is not called tracked; or the error is within three sigma of the
   covariance that the frame states; or what is left of the error without the directions that the
@@ -81,6 +82,8 @@ class Score:
         Frames that overlap others, and those of them that are in one part with their group.
     wrong, unmarked
         Wrong poses of all parts, and those that nothing marks.
+    unmarked_strict
+        Those that nothing marks where parts are aligned to their larger piece alone.
     by_reason
         Wrong poses that only a reason of the run marks.
     joins, joins_by_motion
@@ -95,6 +98,7 @@ class Score:
     covered: int
     wrong: int
     unmarked: int
+    unmarked_strict: int
     by_reason: int
     joins: int
     joins_by_motion: int
@@ -314,7 +318,7 @@ class Truth:
 def score(parts: list[Part], truth: Truth) -> Score:
     """Compare the parts of a result with the truth."""
     known = np.isfinite(truth.poses).all((1, 2))
-    wrong = unmarked = by_reason = joins = by_motion = 0
+    wrong = unmarked = strict = by_reason = joins = by_motion = 0
     ate = np.nan
     for number, part in enumerate(parts):
         at = np.flatnonzero(part.posed & known)
@@ -328,6 +332,7 @@ def score(parts: list[Part], truth: Truth) -> Score:
             found = [marks(part, int(at[k]), off[k], truth.tolerance) for k in far]
             bare = sum(not marked for marked in found)
             tried.append((bare, len(far), sum(marked == {"reason"} for marked in found), off))
+        strict += tried[0][0]
         bare, far_count, alone, off = min(tried, key=lambda one: one[:2])
         unmarked, wrong, by_reason = unmarked + bare, wrong + far_count, by_reason + alone
         if number == 0:
@@ -346,6 +351,7 @@ def score(parts: list[Part], truth: Truth) -> Score:
         covered=covered,
         wrong=wrong,
         unmarked=unmarked,
+        unmarked_strict=strict,
         by_reason=by_reason,
         joins=joins,
         joins_by_motion=by_motion,

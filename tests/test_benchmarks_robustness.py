@@ -146,6 +146,7 @@ def test_a_stated_break_marks_the_later_piece_even_if_it_is_larger(scoring) -> N
             [scoring.Part(estimate, records)], scoring.Truth(truth, np.zeros(30, np.intp))
         )
         assert score.unmarked == unmarked
+        assert score.unmarked_strict == 10  # the first ten say nothing
         assert score.joins == 1
 
 
