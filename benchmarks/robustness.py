@@ -239,8 +239,8 @@ def stress_line(row: Row) -> str:
     share = f"{s.covered / s.overlapping:.0%}" if s.overlapping else "-"
     return (
         f"{row.group:10} {row.name:31} {row.method:15} {s.frames:6} {s.main / s.frames:5.0%}"
-        f" {share:>8} {row.components:6} {s.wrong:6} {s.unmarked:8} {s.unmarked_strict:6} {s.by_reason:17}"
-        f" {s.joins:12}  {1000 * s.ate_m:6.0f}  {row.verdict:8} {row.seconds:6.1f}"
+        f" {share:>8} {row.components:6} {s.wrong:6} {s.unmarked:8} {s.unmarked_strict:6}"
+        f" {s.by_reason:17} {s.joins:12}  {1000 * s.ate_m:6.0f}  {row.verdict:8} {row.seconds:6.1f}"
         f"  {row.problem}"
     ).rstrip()
 
