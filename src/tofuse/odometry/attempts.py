@@ -121,6 +121,26 @@ class Attempts:
         aligned = align(view, [reference.target], T, self._options, usual_scale=scale)
         return self._attempt(aligned, view, reference, "", predicted=predicted)
 
+    def converged(self, attempt: Attempt) -> Attempt:
+        """The attempt after as many iterations as it takes: few do for small motions alone."""
+        if attempt.aligned.converged:
+            return attempt
+        patient = replace(self._options, levels=PATIENT)
+        T = attempt.T_component_camera
+        kept = T if self._steady is None or not attempt.predicted else self._steady
+        aligned = align(
+            attempt.view,
+            [attempt.reference.target],
+            kept,
+            patient,
+            start=T,
+            usual_scale=self._usual.noise_scale,
+        )
+        made = self._attempt(
+            aligned, attempt.view, attempt.reference, attempt.how, predicted=attempt.predicted
+        )
+        return made if aligned.score >= attempt.aligned.score else attempt
+
     def _make(self) -> Iterator[Attempt]:
         expected, view = self.expected, self._view
         if expected is not None:

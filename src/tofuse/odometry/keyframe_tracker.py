@@ -298,7 +298,7 @@ class KeyframeTracker(Tracker):
     def _continue_component(
         self, frame: RangeFrame, view: SurfaceMap, found: Attempt, attempts: Attempts
     ) -> Step:
-        found, moving = self._followed(view, found, attempts)
+        found, moving = self._followed(view, attempts.converged(found), attempts)
         aligned, keyframe, T = found.aligned, found.keyframe, found.T_component_camera
         self._usual.learn(aligned, view.depth)
         notes = [found.how, found.assessment.reason]
