@@ -204,7 +204,7 @@ def test_the_number_of_threads_does_not_change_the_poses():
     for count in (1, 2):
         with threads(count):
             tracker = Sequential(algorithm_1(points=5000)).start(7)
-            results.append([tracker.push(v).T_world_camera.tobytes() for v in views])
+            results.append([tracker.push(v).T_component_camera.tobytes() for v in views])
     assert results[0] == results[1]
 
 
@@ -216,7 +216,7 @@ def test_peaks_is_followed_at_low_noise_and_drifts_at_high():
         for seed in range(2):
             views, T = peaks_views(sigma, seed)
             tracker = Sequential(algorithm_1(1.0, None), "previous").start(seed)
-            poses = np.array([tracker.push(v).T_world_camera for v in views])
+            poses = np.array([tracker.push(v).T_component_camera for v in views])
             errors.append(np.linalg.norm(poses[:, :3, 3] - T[:, :3, 3], axis=1).mean())
         return np.mean(errors)
 
