@@ -137,8 +137,10 @@ def _statistics(a: Aligned) -> Float64:
 
 def _in_words(k: int, found: float, usual: float) -> str:
     if k < 2:
-        shares = [1 / (1 + np.exp(-x)) for x in (found, usual)]
-        return f"{shares[0]:.0%} {_NAMES[k]}, usually {shares[1]:.0%}"
+        floor = _ODDS_FLOOR[k]
+        odds = np.exp([found, usual])
+        fractions = np.clip((odds * (1 + floor) - floor) / (1 + odds), 0, 1)
+        return f"{fractions[0]:.0%} {_NAMES[k]}, usually {fractions[1]:.0%}"
     return f"{_NAMES[k]} {np.exp(found - usual):.1f} times as large as usual"
 
 
