@@ -136,14 +136,15 @@ def test_views_of_two_scenes_stay_apart(three, elsewhere) -> None:
 
 
 def test_a_stretch_of_another_scene_does_not_keep_the_others_apart(three, elsewhere) -> None:
-    parts = [three[0], elsewhere, three[2]]
+    path = [*PATH[:22], *PATH[4:14]]
+    parts = [three[0], elsewhere, stretch(2, range(22, 32), path)]
     groups = SPARSELY.join(parts, [])
     assert members(groups) == [[0, 2], [1]]
-    assert_joined(groups[0], parts)
+    assert_joined(groups[0], parts, path)
 
 
 def test_the_largest_group_comes_first(elsewhere, three) -> None:
-    strange = stretch(0, range(0, 4), **STRANGE)
+    strange = stretch(0, range(4), **STRANGE)
     groups = SPARSELY.join([strange, three[1], three[2]], [])
     assert members(groups) == [[1, 2], [0]]
     assert [group.frames for group in groups] == [20, 4]

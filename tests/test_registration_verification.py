@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -361,6 +363,18 @@ def test_a_wall_holds_no_alignment():
     bare = {"boxes": (), "spots": 0}
     views = [surface(seen(at(x, 1.0, 0.0, pitch=0.0), k, **bare)) for k, x in enumerate((0, 0.1))]
     assert aligned_link(views[1], views[0], np.eye(4), UsualFit()) is None
+
+
+@pytest.mark.parametrize("adjacent", [False, True])
+def test_the_largest_overlap_along_a_wall_is_no_evidence(adjacent):
+    """Any place along it fits; the one where the views cover each other has the most points."""
+    views = []
+    for k, x in enumerate((0.0, 0.2)):
+        frame = seen(at(x, 1.0, 0.0, pitch=0.0), k, boxes=(), spots=0)
+        views.append(surface(replace(frame, amplitude_image=None)))
+    link, why = searched_link(views[1], views[0], Belief(), UsualFit(), adjacent=adjacent)
+    assert link is None
+    assert "degenerate" in why
 
 
 def test_what_the_other_view_saw_through_is_no_link(target):
