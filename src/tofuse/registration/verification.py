@@ -270,12 +270,10 @@ def searched_link(
     at = [Target(target, np.eye(4))]
     aligned = align(source, at, match.T_target_source, _AFTER_SEARCH)
     T = aligned.T_world_source
-    doubt = belief.objection(match, alone=True)
+    doubt = "" if adjacent else belief.objection(match, alone=True)
     if doubt and len(aligned.unobservable):
         # All poses along it fit, and the one with most overlap leads: that is no evidence.
         return None, f"{len(aligned.unobservable)} directions are degenerate, and {doubt}"
-    if adjacent:
-        doubt = ""
     if doubt:
         near = aligned_link(source, target, np.eye(4), usual)
         if near is not None and not belief.search.differ(near.T_i_j, T):
