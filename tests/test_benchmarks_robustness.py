@@ -135,6 +135,21 @@ def test_reasons_mark_the_frames_that_they_name(scoring) -> None:
         assert (score.wrong, score.unmarked, score.by_reason) == (3, unmarked, 3 - unmarked)
 
 
+def test_a_stated_break_marks_the_later_piece_even_if_it_is_larger(scoring) -> None:
+    truth = walk()
+    estimate = truth.copy()
+    estimate[10:] = se3.exp(np.array([0.5, 0, 0, 0, 0, 0])) @ truth[10:]
+    unsure = np.diag([0.3**2] * 3 + [0.1**2] * 3)
+    for stated, unmarked in ((range(10, 30), 0), (range(15, 30), 5), (range(0), 10)):
+        records = tuple(record(k, covariance=unsure if k in stated else None) for k in range(30))
+        score = scoring.score(
+            [scoring.Part(estimate, records)], scoring.Truth(truth, np.zeros(30, np.intp))
+        )
+        assert score.unmarked == unmarked
+        assert score.unmarked_strict == 10  # the first ten say nothing
+        assert score.joins == 1
+
+
 def test_drift_is_no_wrong_join_but_a_seam_is(scoring) -> None:
     truth = walk(60)
     drifting = np.array([T @ se3.exp([0.01 * k, 0, 0, 0, 0, 0]) for k, T in enumerate(truth)])

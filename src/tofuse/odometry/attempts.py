@@ -92,8 +92,9 @@ class Attempts:
         options: ProjectiveOptions,
         usual: UsualFit,
     ) -> None:
-        self._view, self._references = view, references
-        self._expected, self._steady, self._T_last = expected, steady, T_last
+        self._view = view
+        self.expected, self.references = expected, references
+        self._steady, self._T_last = steady, T_last
         self._options, self._usual = options, usual
         self._coming = self._make()
         self._made: list[Attempt] = []
@@ -112,22 +113,19 @@ class Attempts:
                 return attempt.assessment.reason
         return "it is far from where the motion leads" if self._made else ""
 
-    def again(self, attempt: Attempt, view: SurfaceMap, reference: Reference) -> Attempt:
-        """Align once more from an attempt's outcome: other pixels take part now."""
-        T = attempt.T_component_camera
-        return self._attempt(
-            align(view, [reference.target], T, self._options, usual_scale=self._usual.noise_scale),
-            view,
-            reference,
-            attempt.how,
-            predicted=attempt.predicted,
-        )
+    def again(
+        self, T: Float64, view: SurfaceMap, reference: Reference, *, predicted: bool
+    ) -> Attempt:
+        """Align once more from a pose T (4, 4): other pixels take part now."""
+        scale = self._usual.noise_scale
+        aligned = align(view, [reference.target], T, self._options, usual_scale=scale)
+        return self._attempt(aligned, view, reference, "", predicted=predicted)
 
     def _make(self) -> Iterator[Attempt]:
-        expected, view = self._expected, self._view
+        expected, view = self.expected, self._view
         if expected is not None:
             kept = expected if self._steady is None else self._steady
-            for r in self._references:
+            for r in self.references:
                 aligned = align(
                     view,
                     [r.target],
@@ -138,7 +136,7 @@ class Attempts:
                 )
                 yield self._attempt(aligned, view, r, "", predicted=True)
         unknown = "nothing predicted it" if expected is None else "the prediction did not fit"
-        for r in self._references:
+        for r in self.references:
             aligned, where = self._turned(r)
             how = f"{unknown}: found from {where}"
             yield self._attempt(aligned, view, r, how, predicted=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -27,9 +28,6 @@ from tofuse.registration.verification import Link, UsualFit, comparable, self_sc
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
-# From one frame to the next: what moves further without a prediction is a large step, which has
-# rivals. rad, and fraction of the depth.
-_LARGE = 0.35
 # Moving objects are looked for in every n-th frame, and wherever something indicates them: what
 # fits worse than usual, so many points in free space, or objects in the frame before.
 _LOOK_EVERY, _IN_FRONT = 4, 0.005
@@ -144,24 +142,47 @@ class KeyframeTracker(Tracker):
         return np.asarray(last.T_component_camera @ se3.inverse(before) @ T_odometry, np.float64)
 
     def _first_usual(self, attempts: Attempts, now: Moment) -> Attempt | None:
-        """The first alignment that fits as usual, and that the camera's motion allows."""
+        """The first alignment that fits as usual, and that the camera's motion allows.
+
+        While it is not known what is usual for the camera, both images must agree as well.
+        """
         for attempt in attempts:
-            if attempt.assessment.usual and self._is_possible(attempt, now):
+            if not attempt.assessment.usual or self._is_surprising(attempt, now):
+                continue
+            if not attempt.predicted and not self._is_verified(attempt):
+                continue
+            if self._usual.is_known or self._agreement(attempt) > 0:
                 return attempt
         return None
 
-    def _is_possible(self, attempt: Attempt, now: Moment) -> bool:
-        """Whether the camera may have moved like this; without a prediction by no large step."""
+    def _agreement(self, attempt: Attempt) -> float:
+        """Support less contradiction, of both images, for an alignment."""
+        target = attempt.reference.target.view
+        compare = self_scaled(self._usual)
+        return agreement(attempt.view, target, attempt.T_keyframe_camera, compare).score
+
+    def _is_surprising(self, attempt: Attempt, now: Moment) -> bool:
+        """Whether the camera can hardly have moved like this."""
+        return bool(self._motion.surprise(attempt.T_component_camera, now))
+
+    def _is_small(self, attempt: Attempt) -> bool:
+        """Whether the camera hardly moved, which needs no prediction."""
         assert self._last is not None
-        if self._motion.surprise(attempt.T_component_camera, now):
-            return False
-        between = se3.inverse(self._last.T_component_camera) @ attempt.T_component_camera
-        if attempt.predicted or is_small(between):
+        return is_small(se3.inverse(self._last.T_component_camera) @ attempt.T_component_camera)
+
+    def _is_verified(self, attempt: Attempt) -> bool:
+        """Whether a step that nothing predicted is small, or a search finds the same."""
+        if self._is_small(attempt):
             return True
-        far = np.linalg.norm(between[:3, 3]) > _LARGE * self._last.depth
-        if far or se3.angle(between) > _LARGE:
+        if not attempt.aligned.converged or len(attempt.aligned.unobservable):
             return False
-        return attempt.aligned.converged and not len(attempt.aligned.unobservable)
+        assert self._last is not None
+        k = attempt.keyframe
+        adjacent = k.view.index == self._last.view.index
+        link = self._relocalizer.link(attempt.view, k, self._usual, adjacent=adjacent)
+        if link is None or not link.certain:
+            return False
+        return not self._options.belief.search.differ(link.T_i_j, attempt.T_keyframe_camera)
 
     def _unrivalled(self, view: SurfaceMap, attempts: Attempts, now: Moment) -> Attempt | None:
         """The alignment that explains the view best, unless both images contradict even that.
@@ -170,37 +191,60 @@ class KeyframeTracker(Tracker):
         """
         if self._last is None or now.index - self._last.view.index > 1:
             return None
-        compare = self_scaled(self._usual)
         best, best_score = None, 0.0
-        for attempt in attempts:
-            if not np.isfinite(attempt.aligned.rms_m) or not self._is_possible(attempt, now):
+        for attempt in (*self._with_segmentation(view, attempts), *attempts):
+            if not np.isfinite(attempt.aligned.rms_m) or self._is_surprising(attempt, now):
                 continue
-            moving = self._segment(view, attempt, learn=False)
-            if moving.reliable and moving.fraction > _NOTICED:
-                attempt = self._without_moving(view, attempt, moving, attempts)
-                if attempt.assessment.usual and self._is_possible(attempt, now):
-                    return attempt
-            score = agreement(
-                attempt.view, attempt.reference.target.view, attempt.T_keyframe_camera, compare
-            ).score
+            if not (attempt.predicted or self._is_small(attempt)):
+                continue
+            if attempt.assessment.usual:
+                return attempt
+            if attempt.assessment.conflict and len(attempt.aligned.unobservable):
+                continue  # the motion model, on which it relies, explains the view badly
+            score = self._agreement(attempt)
             # Of equals the likeliest, which comes first.
             if score > CLEARLY * best_score:
                 best, best_score = attempt, score
         return best
 
-    def _segment(self, view: SurfaceMap, attempt: Attempt, *, learn: bool = True) -> Moving:
-        k = attempt.keyframe
-        return self._moving.update(
-            view, attempt.T_component_camera, k.view, k.T_component_camera, learn=learn
-        )
+    def _with_segmentation(self, view: SurfaceMap, attempts: Attempts) -> Iterator[Attempt]:
+        """Alignments without what moves by itself, if the camera is where motion or a fit has it.
+
+        What moves may fill so much of the view that the alignment follows it: then the prediction
+        is the better guess.
+        """
+        poses = [(attempts.expected, r, True) for r in attempts.references[:1]]
+        made = list(attempts)
+        for T, r, predicted in [
+            *poses,
+            *((a.T_component_camera, a.reference, a.predicted) for a in made),
+        ]:
+            if T is None:
+                continue
+            moving = self._segment(view, T, r.keyframe, learn=False)
+            if moving.reliable and moving.fraction > _NOTICED:
+                yield self._without_moving(view, T, r.keyframe, moving, attempts, predicted)
+
+    def _segment(
+        self, view: SurfaceMap, T: Float64, keyframe: Keyframe, *, learn: bool = True
+    ) -> Moving:
+        k = keyframe
+        return self._moving.update(view, T, k.view, k.T_component_camera, learn=learn)
 
     def _without_moving(
-        self, view: SurfaceMap, attempt: Attempt, moving: Moving, attempts: Attempts
+        self,
+        view: SurfaceMap,
+        T: Float64,
+        keyframe: Keyframe,
+        moving: Moving,
+        attempts: Attempts,
+        predicted: bool,
     ) -> Attempt:
-        """Align once more without what moves by itself."""
-        k = attempt.keyframe
+        """Align once more, from T, without what moves by itself."""
+        k = keyframe
         target = Target(moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera))
-        return attempts.again(attempt, moving.applied(view), Reference(k, target))
+        reference = Reference(k, target)
+        return attempts.again(T, moving.applied(view), reference, predicted=predicted)
 
     def _followed(
         self, view: SurfaceMap, found: Attempt, attempts: Attempts
@@ -215,15 +259,16 @@ class KeyframeTracker(Tracker):
         )
         if not look:
             return found, None
-        moving = self._segment(view, found)
-        new = moving.fraction - float(
-            (found.view.planes[..., 3] == 0).mean() - (view.planes[..., 3] == 0).mean()
+        T, k = found.T_component_camera, found.keyframe
+        moving = self._segment(view, T, k)
+        left_out = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
+            found.view.planes[..., 3]
         )
-        if moving.reliable and new > _NOTICED:
-            again = self._without_moving(view, found, moving, attempts)
+        if moving.reliable and moving.fraction - left_out / view.pixels > _NOTICED:
+            again = self._without_moving(view, T, k, moving, attempts, found.predicted)
             if again.assessment.usual or not found.assessment.usual:
                 found = again
-                moving = self._segment(view, found)
+                moving = self._segment(view, again.T_component_camera, k)
         self._moved = moving.fraction > 0
         return found, moving
 

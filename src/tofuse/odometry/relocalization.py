@@ -25,6 +25,7 @@ class Relocalizer:
     def __init__(self, belief: Belief | None) -> None:
         self._belief = belief
         self._left = float(_FREE)
+        self._last: tuple[tuple[int, int], Link | None] | None = None  # what was searched last
 
     def count_frame(self) -> None:
         """Say that a frame was processed, which adds to the budget."""
@@ -50,13 +51,23 @@ class Relocalizer:
             candidates.append(alike)
         found = []
         for keyframe in candidates:
-            if self._belief is None or self._left < 1:
-                break
-            self._left -= 1
-            adjacent = keyframe.view.index == last
-            link, _ = searched_link(view, keyframe.view, self._belief, usual, adjacent=adjacent)
+            link = self.link(view, keyframe, usual, adjacent=keyframe.view.index == last)
             if link is not None:
                 found.append(link)
                 if link.certain:
                     break
         return tuple(found)
+
+    def link(
+        self, view: SurfaceMap, keyframe: Keyframe, usual: UsualFit, *, adjacent: bool
+    ) -> Link | None:
+        """Register a view to a keyframe, if the budget allows; the same pair is searched once."""
+        pair = view.index, keyframe.view.index
+        if self._last is not None and self._last[0] == pair:
+            return self._last[1]
+        if self._belief is None or self._left < 1:
+            return None
+        self._left -= 1
+        link, _ = searched_link(view, keyframe.view, self._belief, usual, adjacent=adjacent)
+        self._last = pair, link
+        return link

@@ -51,18 +51,24 @@ _VERIFY, _OVERLAP = 8, 0.2
 # Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
 _IN_SIGHT = 1.2
 # Contradiction is unusual beyond so many standard deviations above the median of neighbours.
-_SIGMAS, _LEAST_SPREAD = 3.0, 0.02
+# Wrong poses within one scene contradict by more than the last number, whatever neighbours do.
+_SIGMAS, _LEAST_SPREAD, _MAX_CONTRADICTION = 3.0, 0.02, 0.2
 # By which fraction of their path components may have drifted in themselves; how far a link may be
 # off, and an alignment can follow: fractions of the depth, and rad.
 _DRIFT, _LINK_ERROR, _FOLLOWED = 0.05, 0.02, 0.1
 # Lengths and turns of the path on either side of a gap say how fast the camera is: it may go on
 # three times as fast, and somewhere near where it was in any case (a fraction of the depth, rad).
 _AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
+# Times the speed that nine of ten motions stay below; where the camera had no time to get out of
+# sight, the two sides see the same place unless more than this fraction of the overlap contradicts.
+_HARDLY, _SAME_PLACE = 2.0, 0.3
 # A gap may be bridged by motion alone where its standard deviation is at most this: fraction of the
 # depth, and rad.
 _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
 # Links that say something else than those that are believed must weigh less than this.
 _RIVAL = 0.5
+# View pairs that are tried between the same two components.
+_TRIES = 4
 # How many alignments from the identity are tried for each component, beside the searches.
 _ALIGNMENTS = 6
 _SHIFT = 0.35
@@ -217,6 +223,12 @@ class _Joiner:
         self._alignments = _ALIGNMENTS * len(stretches)
         self._usual = UsualFit()
         self._contradiction = options.belief.contradiction
+        steps = [_speeds(s, end=True) for s in stretches]
+        known = np.concatenate(steps)
+        # (2,) m and rad by the unit of time that the camera hardly exceeds.
+        self._speed = (
+            _HARDLY * np.quantile(known, 0.9, axis=0) if len(known) else np.full(2, np.inf)
+        )
         self._learn_from_neighbours()
 
     def add(self, link: Link) -> None:
@@ -259,11 +271,16 @@ class _Joiner:
         i, j = np.nonzero(np.triu(component[:, None] != component))
         order = np.lexsort((j, i, far[i, j]))
         tried = {(link.i, link.j) for link in self._links}
+        between: dict[tuple[int, int], int] = {}
         for k in order.tolist():
             if self._searches < 1 or len(self._islands) < 2:
                 return
             first, second = views[i[k]], views[j[k]]
             if (first.index, second.index) in tried or self._is_joined(first, second):
+                continue
+            ends = (int(component[i[k]]), int(component[j[k]]))
+            between[ends] = between.get(ends, 0) + 1
+            if between[ends] > _TRIES:
                 continue
             tried.add((first.index, second.index))
             link = self._registered(first, second)
@@ -333,7 +350,7 @@ class _Joiner:
             middle = float(np.median(seen))
             spread = 1.48 * float(np.median(np.abs(np.array(seen) - middle)))
             limit = middle + _SIGMAS * max(spread, _LEAST_SPREAD)
-            self._contradiction = max(self._contradiction, limit)
+            self._contradiction = max(self._contradiction, min(limit, _MAX_CONTRADICTION))
 
     def _registered(self, first: View, second: View) -> Link | None:
         """Register two views that look alike: from the identity if that does, else by a search."""
@@ -523,7 +540,29 @@ class _Joiner:
                     seen = min(seen, near, key=lambda found: found.contradiction)
             overlap += seen.overlap
             against += seen.violation + seen.clash
-        return overlap > 0 and against / overlap > self._contradiction
+        limit = self._contradiction
+        if self._is_same_place(
+            a, b
+        ):  # what contradicts there has moved, or is an error of the pose
+            limit = max(limit, _SAME_PLACE)
+        return overlap > 0 and against / overlap > limit
+
+    def _is_same_place(self, a: _Island, b: _Island) -> bool:
+        """Whether the camera had no time to get out of sight between the two sides."""
+        for c in a.T:
+            for d in b.T:
+                before, after = self._in_time(c, d)
+                elapsed = float(after.times[0] - before.times[-1])
+                if before.recording != after.recording or elapsed < 0:
+                    continue
+                reach = self._speed * elapsed
+                if reach[0] < _NEAR * before.depth and reach[1] < _NEAR:
+                    return True
+        return False
+
+    def _in_time(self, c: int, d: int) -> tuple[Stretch, Stretch]:
+        first, second = self._stretches[c], self._stretches[d]
+        return (first, second) if first.frames[0] < second.frames[0] else (second, first)
 
     def _drifted(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
         """Whether two poses differ by no more than drift and what a single link is off by."""

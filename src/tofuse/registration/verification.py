@@ -27,15 +27,18 @@ Float64 = NDArray[np.float64]
 
 # Statistics of an alignment, all logarithms: odds of an outlier, odds of a point in free space, the
 # noise scale, and the standard deviation of the log albedo.
+_NOISE = 2
 _NAMES = ("outliers", "free-space violations", "noise", "albedo differences")
 # Fractions below these are never evidence: mixed pixels at edges, and quantisation.
 _ODDS_FLOOR = np.array([0.02, 0.01])
 # What is expected of a camera that is not known yet: mean and standard deviation of the statistics
 # (15 % outliers, 2 % in free space, four times the stated sigmas, 5 % of the albedo), and how many
-# alignments this counts for.
+# alignments this counts for; from how many on the camera is known.
 _PRIOR_MEAN = np.array([np.log(0.17 / 0.87), np.log(0.03 / 0.98), np.log(4.0), np.log(0.05)])
-_PRIOR_SIGMA = np.array([0.6, 0.9, 1.5, 0.7])
-_PRIOR_COUNT = 5.0
+_PRIOR_SIGMA = np.array([0.6, 0.9, 1.5, 0.45])
+_PRIOR_COUNT, _KNOWN = 2.0, 10
+# Of what views of this camera usually differ by, this many standard deviations are no conflict.
+_NO_CONFLICT = 2.0
 # However alike the views of a recording, the next one may be of another kind.
 _LEAST_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
 _WINDOW = 200
@@ -58,11 +61,14 @@ class Assessment:
         Sum of the logarithms by which statistics exceed their usual value; 0 for a usual fit.
     reason
         Which statistic is out of range, and what is usual; empty for a usual fit.
+    conflict
+        Whether it is one that says that the views conflict, and not only that they are noisier.
     """
 
     usual: bool
     excess: float
     reason: str
+    conflict: bool = False
 
 
 class UsualFit:
@@ -86,7 +92,17 @@ class UsualFit:
     @property
     def noise_scale(self) -> float:
         """Usual noise scale, in the sigmas that views claim; 0 while it is not known."""
-        return float(np.exp(self._mean[2])) if len(self._seen) >= _PRIOR_COUNT else 0.0
+        return float(np.exp(self._mean[_NOISE])) if self.is_known else 0.0
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough alignments were seen to say what is usual."""
+        return len(self._seen) >= _KNOWN
+
+    @property
+    def albedo(self) -> float:
+        """Usual standard deviation of the difference in log albedo."""
+        return float(np.exp(self._mean[3]))
 
     @property
     def rms_share(self) -> float:
@@ -115,7 +131,7 @@ class UsualFit:
         """Compare an alignment with what is usual."""
         if aligned.inliers < _LEAST_INLIERS:
             words = f"{aligned.inliers} inliers are too few to determine a pose"
-            return Assessment(False, np.inf, words)
+            return Assessment(False, np.inf, words, True)
         found = _statistics(aligned)
         over = np.where(np.isfinite(found), found - self._mean, 0.0)
         worst = int(np.argmax(over / self._sigma))
@@ -123,7 +139,8 @@ class UsualFit:
             return Assessment(True, 0.0, "")
         excess = float(np.maximum(over, 0).sum())
         words = _in_words(worst, float(found[worst]), float(self._mean[worst]))
-        return Assessment(False, excess, words)
+        conflict = np.delete(over > self._sigmas * self._sigma, _NOISE).any()
+        return Assessment(False, excess, words, bool(conflict))
 
 
 def _statistics(a: Aligned) -> Float64:
@@ -352,7 +369,11 @@ def aligned_link(
 def self_scaled(usual: UsualFit) -> AgreementOptions:
     """How images of this camera are compared: distances that it usually errs by are no conflict."""
     plain = AgreementOptions()
-    return replace(plain, floor_share=max(plain.floor_share, 2 * usual.rms_share))
+    return replace(
+        plain,
+        floor_share=max(plain.floor_share, _NO_CONFLICT * usual.rms_share),
+        albedo=max(plain.albedo, _NO_CONFLICT * usual.albedo),
+    )
 
 
 # From one place no view is so many times deeper than another of the same scene.
