@@ -34,6 +34,8 @@ OTHER: tuple[Box, ...] = (
     ((-1.6, 0.2, -0.8), (0.25, 0.9, 0.3), 0.5),
     ((0.4, 0.9, -1.4), (0.4, 0.2, 0.3), 0.9),
     ((0.6, 0.9, 1.2), (0.15, 0.2, 0.3), 0.4),
+    ((0.1, 0.7, 0.9), (0.15, 0.4, 0.2), 0.7),
+    ((1.2, 0.6, 1.5), (0.3, 0.5, 0.2), 0.3),
 )
 
 
@@ -61,13 +63,17 @@ def seen(
     rays = np.dstack([CAMERA.rays(), np.ones((rows, columns))]).reshape(-1, 3)
     origin, d = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = ((np.sign(d) * half - origin) / d).min(1)
+        walls = (np.sign(d) * half - origin) / d
+        z, across = walls.min(1), np.take_along_axis(d, walls.argmin(1)[:, None], 1)[:, 0]
         for centre, size, turn in boxes:
             R = se3.so3_exp([0, turn, 0])
             o, e = (origin - np.array(centre)) @ R, d @ R
             a, b = (-np.array(size) - o) / e, (np.array(size) - o) / e
-            near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-            z = np.where((near < far) & (near > 0) & (near < z), near, z)
+            first = np.minimum(a, b)
+            near, far = first.max(1), np.maximum(a, b).min(1)
+            hit = (near < far) & (near > 0) & (near < z)
+            side = np.take_along_axis(e, first.argmax(1)[:, None], 1)[:, 0]
+            z, across = np.where(hit, near, z), np.where(hit, side, across)
     p = origin + z[:, None] * d
     rng = np.random.default_rng(scene)
     albedo = np.ones(len(p))
@@ -80,7 +86,8 @@ def seen(
         albedo[((p - spot) ** 2).sum(1) < size**2] = level
     rng = np.random.default_rng([4, index])
     z = z * (1 + noise * rng.standard_normal(len(z)))
-    light = 1000 * albedo * (1 + 0.02 * rng.standard_normal(len(z)))
+    cosine = np.abs(across) / np.linalg.norm(d, axis=1)
+    light = 1000 * albedo * cosine * (1 + 0.02 * rng.standard_normal(len(z)))
     depth, light = (x.reshape(rows, columns).astype(np.float32) for x in (z, light))
     return RangeFrame(
         index,

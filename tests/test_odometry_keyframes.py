@@ -475,5 +475,7 @@ def test_a_box_that_turns_by_half_a_corner_is_not_taken_for_its_other_sides():
     scene = Sequence("box", range(0, 4 * 72, 72))
     steps = run([f.keep(f.z < 1.8) for f in scene.frames])
     assert_right(steps, scene.poses)
-    # Between neighbours the search has an answer, which joins them all.
-    assert certain_links(steps) == [(0, 1), (1, 2), (2, 3)]
+    # Between neighbours the search has an answer: each goes on from the last one, or is linked.
+    linked = certain_links(steps)
+    for k in (1, 2, 3):
+        assert steps[k].component == steps[k - 1].component or (k - 1, k) in linked

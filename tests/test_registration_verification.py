@@ -69,7 +69,7 @@ def taught(count=60, seed=0, spread=0.15, **usual):
         {"outliers": 0.35},
         {"in_front": 0.08},
         {"noise": 30.0},
-        {"albedo": 0.2},
+        {"albedo": 0.1},
         {"albedo": 0.0},
     ],
 )
