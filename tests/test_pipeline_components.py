@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from dataclasses import replace
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from made_rooms import OTHER, at, seen
+from test_pipeline_checkpoint import Kept
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
+from tofuse.pipeline import checkpoint
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Silent
@@ -134,7 +137,8 @@ def test_a_copy_in_the_middle_goes_on_to_the_same(there_and_back, joined, after)
     mapper = Mapper(CONFIG, threads=1)
     for frame in frames[:after]:
         mapper.push(frame)
-    copy = pickle.loads(pickle.dumps(mapper, 5))
+    # As checkpoints do, which load types of the package only.
+    copy = checkpoint._OwnTypes(io.BytesIO(pickle.dumps(mapper, 5))).load()
     copy.go_on(1, Silent())
     for frame in frames[after:]:
         copy.push(frame)
@@ -142,6 +146,24 @@ def test_a_copy_in_the_middle_goes_on_to_the_same(there_and_back, joined, after)
     assert again.trajectory.tobytes() == result.trajectory.tobytes()
     assert [c.frames for c in again.components] == [c.frames for c in result.components]
     assert again.cloud.points.tobytes() == result.cloud.points.tobytes()
+
+
+def test_the_end_goes_on_after_any_stage(there_and_back, joined) -> None:
+    """What was decided about components is kept with the other stages."""
+    result, _ = joined
+    whole = Kept(0)
+    states = []
+    for stages in (whole, None):
+        mapper = Mapper(CONFIG, threads=1)
+        for frame in there_and_back[1]:
+            mapper.push(frame)
+        if stages is None:  # joining and loops are known, what follows is not
+            stages = Kept(0)
+            stages.states = {k: whole.states[k] for k in ("joining", "loops")}
+        states.append(mapper.finish(stages))
+    for again in states:
+        assert again.trajectory.tobytes() == result.trajectory.tobytes()
+        assert [c.frames for c in again.components] == [c.frames for c in result.components]
 
 
 def test_blank_frames_in_the_middle_leave_one_model() -> None:
