@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from tofuse.filters.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
-from tofuse.odometry.keyframes import Acceptance
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import covariance
+from tofuse.registration.verification import UsualFit
 from tofuse.sensor.models import camera_model
 from tofuse.simulation import sensor
 from tofuse.simulation.effects import Effects
@@ -110,7 +110,7 @@ def outcome(
     off = np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, np.radians(0.5), 3)])
     targets = [Target(views[a], np.eye(4))]
     aligned = align(views[b], targets, truth @ se3.exp(off), options)
-    if Acceptance().objection(aligned):
+    if not UsualFit().assess(aligned).usual:
         return None
     plain: Float64 = np.linalg.inv(aligned.information + np.diag(1e-6 / UNITS**2))
     return Outcome(

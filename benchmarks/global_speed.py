@@ -30,7 +30,7 @@ import sequences
 from tofuse.fusion.options import Fusion
 from tofuse.kernels.threads import run_chunks, threads
 from tofuse.maps.surface_map import SurfaceMap, surface_map
-from tofuse.odometry.keyframes import Keyframes, Recovery
+from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Stopwatch
@@ -38,6 +38,7 @@ from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.search import search
+from tofuse.registration.verification import Belief
 from tofuse.results.types import Reconstruction
 
 
@@ -77,16 +78,16 @@ def mapped(frames: list[RangeFrame], count: int) -> tuple[Reconstruction, BothTi
 def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     """Align and verify pairs of views that overlap by a half, as if they were loops."""
     closer = Revisits(spacing=Spacing(0.03, 0.015, 200))
-    loops = closer.start(0)
     store: ViewStore[SurfaceMap] = ViewStore(closer.spacing)
+    loops = closer.start(0, (), store)
     poses = result.diagnostics.sequential
     options = Keyframes().surface
     for k, frame in enumerate(there_and_back(frames, len(frames))):
         if result.has_pose[k]:
             surface = surface_map(frame, options).thinned(200)
-            loops.push(frame, poses[k], surface)
             store.push(surface, poses[k])
-    views = [KeptView.of(surface, 600) for surface in store.views]
+            loops.push(frame, poses[k])
+    views = [KeptView.of(posed.view, 600) for posed in store.views]
     at = np.array([view.surface.index for view in views])
     found = overlaps(views, poses[at], 0.5)[0]
     chosen = found[np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).astype(int))]
@@ -144,7 +145,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         mapped(frames, 30)
         ends = [surface_map(frames[k], Keyframes().surface) for k in (0, -1)]
-        search(ends[0], ends[1], Recovery().search)
+        search(ends[0], ends[1], Belief().search)
         for count in options.frames:
             result, watch = mapped(frames, count)
             print(row(result, watch), flush=True)

@@ -31,13 +31,13 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
-from tofuse.odometry.keyframes import Recovery
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.features import Features
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.plane_sets import PlaneSets
 from tofuse.registration.search import SearchOptions, search
+from tofuse.registration.verification import Belief
 
 Float64 = NDArray[np.float64]
 
@@ -134,7 +134,8 @@ def look(
     right = False
     if true is not None:
         right = is_right(found.T_target_source, true)
-    return Outcome(right, found.score, found.margin, Recovery().believes(found), seconds)
+    believed = not Belief().objection(found, alone=False)
+    return Outcome(right, found.score, found.margin, believed, seconds)
 
 
 def neighbours(taken: Views, options: SearchOptions) -> list[Outcome]:
@@ -202,7 +203,7 @@ def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
     """The pose that the exhaustive search finds, if it is believed."""
     options = SurfaceOptions()
     found = search(surface_map(source, options), surface_map(target, options))
-    believed = found is not None and Recovery().believes(found)
+    believed = found is not None and not Belief().objection(found, alone=False)
     return found.T_target_source if found is not None and believed else None
 
 

@@ -142,7 +142,7 @@ def timed(tracker: Any, frames: Iterator[RangeFrame]) -> tuple[Float64, int]:
         start = time.perf_counter()
         step = tracker.push(frame)
         seconds.append(time.perf_counter() - start)
-        posed += step.T_world_camera is not None
+        posed += step.T_component_camera is not None and step.component == 0
     return np.array(seconds), posed
 
 

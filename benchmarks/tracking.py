@@ -85,6 +85,9 @@ class TofuseSession:
         self.statuses: list[str] = []
         self.unheld: list[int] = []
         self.reasons: list[str] = []
+        # Of components that are connected with the first one; and of frames, where they are.
+        self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
+        self._T_world_camera: dict[int, Float64] = {}
 
     def prepare(self, frame: RangeFrame) -> RangeFrame:
         # A new frame: nothing that another method derived from it is kept.
@@ -95,7 +98,16 @@ class TofuseSession:
         self.statuses.append(step.status)
         self.reasons.append(step.reason)
         self.unheld.append(len(step.registration.unobservable) if step.registration else 0)
-        return step.T_world_camera
+        T = step.T_component_camera
+        for link in step.links:
+            if link.certain and T is not None and link.i in self._T_world_camera:
+                T_world = self._T_world_camera[link.i] @ link.T_i_j @ se3.inverse(T)
+                self._T_world_component.setdefault(step.component, T_world)
+        if T is None or step.component not in self._T_world_component:
+            return None
+        found: Float64 = self._T_world_component[step.component] @ T
+        self._T_world_camera[prepared.index] = found
+        return found
 
 
 @dataclass(frozen=True, eq=False)

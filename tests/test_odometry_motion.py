@@ -1,4 +1,4 @@
-"""How cameras move: what goes on is expected, what comes out of nowhere has to be confirmed."""
+"""How cameras move: what goes on is expected, what comes out of nowhere is a surprise."""
 
 from __future__ import annotations
 
@@ -11,6 +11,15 @@ from tofuse.odometry.motion import Moment, Motion, is_small, jumps
 STEP = se3.exp(np.array([0.03, 0, 0.01, 0, 0.04, 0.01]))
 
 
+def counted(k):
+    """A frame of which no time is known."""
+    return Moment(k, float(k))
+
+
+def timed(rate):
+    return lambda k: Moment(k, 100.0 + k / rate)
+
+
 def walk(count, start=None, step=STEP):
     poses = [np.eye(4) if start is None else start]
     while len(poses) < count:
@@ -18,11 +27,11 @@ def walk(count, start=None, step=STEP):
     return poses
 
 
-def followed(poses):
+def followed(poses, when=counted):
     motion = Motion()
-    for T in poses:
-        assert not motion.surprise(T, motion.expected)
-        assert not motion.follow(T)
+    for k, T in enumerate(poses):
+        assert not motion.surprise(T, when(k))
+        motion.follow(T, when(k))
     return motion
 
 
@@ -30,21 +39,34 @@ def elsewhere(T, metres=0.3, angle=0.0):
     return T @ se3.exp(np.array([metres, 0, 0, 0, 0, angle]))
 
 
-def test_the_last_motion_goes_on_over_lost_frames() -> None:
+@pytest.mark.parametrize("when", [counted, timed(15.0)])
+def test_the_last_motion_goes_on_over_frames_without_a_pose(when) -> None:
     poses = walk(9)
     motion = Motion()
-    assert motion.expected is None
-    motion.follow(poses[0])
-    assert motion.expected is None
-    for T in poses[1:5]:
-        motion.follow(T)
-    np.testing.assert_allclose(motion.expected, poses[5], atol=1e-12)
-    motion.miss()
-    motion.miss()
-    np.testing.assert_allclose(motion.expected, poses[7], atol=1e-12)
-    assert not motion.surprise(poses[7], motion.expected)
-    motion.follow(poses[7])
-    np.testing.assert_allclose(motion.expected, poses[8], atol=1e-12)
+    assert motion.expected(when(0)) is None
+    motion.follow(poses[0], when(0))
+    assert motion.expected(when(1)) is None
+    for k in range(1, 5):
+        motion.follow(poses[k], when(k))
+    np.testing.assert_allclose(motion.expected(when(5)), poses[5], atol=1e-12)
+    np.testing.assert_allclose(motion.expected(when(7)), poses[7], atol=1e-12)
+    assert not motion.surprise(poses[7], when(7))
+    motion.follow(poses[7], when(7))
+    np.testing.assert_allclose(motion.expected(when(8)), poses[8], atol=1e-12)
+
+
+def test_uneven_times_are_no_surprise() -> None:
+    """A camera moves evenly; frames are missing, and come late."""
+    rng = np.random.default_rng(2)
+    twist = np.array([0.6, 0, 0.2, 0, 0.9, 0.3])  # per second
+    motion, t = Motion(), 0.0
+    for k in range(30):
+        t += rng.uniform(0.03, 0.15)
+        T, now = se3.exp(t * twist), Moment(k, t)
+        assert not motion.surprise(T, now)
+        if k > 1:
+            np.testing.assert_allclose(motion.expected(now), T, atol=1e-9)
+        motion.follow(T, now)
 
 
 def test_the_mean_motion_goes_on_more_steadily() -> None:
@@ -52,76 +74,78 @@ def test_the_mean_motion_goes_on_more_steadily() -> None:
     true = walk(40)
     noise = np.array([0.004] * 3 + [0.005] * 3)
     motion, last, mean = Motion(), [], []
-    assert motion.steadily is None
+    assert motion.steadily(counted(0)) is None
     for k, T in enumerate(true):
-        motion.follow(T @ se3.exp(noise * rng.standard_normal(6)))
+        motion.follow(T @ se3.exp(noise * rng.standard_normal(6)), counted(k))
         if k >= 8:
-            back = se3.inverse(true[k] @ STEP)
-            last.append(se3.log(back @ motion.expected) / noise)
-            mean.append(se3.log(back @ motion.steadily) / noise)
+            back, then = se3.inverse(true[k] @ STEP), counted(k + 1)
+            last.append(se3.log(back @ motion.expected(then)) / noise)
+            mean.append(se3.log(back @ motion.steadily(then)) / noise)
     last, mean = (np.sqrt(np.mean(np.square(off))) for off in (last, mean))
     # Of both ends of one motion, and of the newest place, beside hardly more than the latter.
     assert 1.9 < last < 2.6
     assert mean < 0.65 * last
     motion.interrupt()
-    assert motion.steadily is None
+    assert motion.steadily(counted(40)) is None
 
 
 def test_a_jump_hardly_counts_in_the_mean() -> None:
     poses = walk(9)
     motion = followed(poses[:8])
     there = elsewhere(poses[8], 0.5, 0.6)
-    motion.follow(there)
-    off = se3.log(se3.inverse(there @ STEP) @ motion.steadily)
+    motion.follow(there, counted(8))
+    off = se3.log(se3.inverse(there @ STEP) @ motion.steadily(counted(9)))
     assert 0.0 < np.linalg.norm(off[:3]) < 0.02
     assert np.linalg.norm(off[3:]) < np.radians(1.3)
 
 
 @pytest.mark.parametrize(("metres", "angle"), [(0.3, 0.0), (0.0, 0.2)])
-def test_a_place_out_of_nowhere_is_a_surprise(metres, angle) -> None:
+@pytest.mark.parametrize("when", [counted, timed(30.0)])
+def test_a_place_out_of_nowhere_is_a_surprise(metres, angle, when) -> None:
+    poses = walk(9)
+    motion = followed(poses[:7], when)
+    words = motion.surprise(elsewhere(poses[7], metres, angle), when(7))
+    assert f"{metres:.2f} m and {np.degrees(angle):.0f} degrees" in words
+    # What was expected is still expected after it.
+    assert not motion.surprise(elsewhere(poses[8], 0.02), when(8))
+
+
+def test_a_surprise_differs_by_more_than_is_allowed() -> None:
     poses = walk(8)
     motion = followed(poses[:7])
-    words = motion.surprise(elsewhere(poses[7], metres, angle), motion.expected)
-    assert f"{metres:.2f} m and {np.degrees(angle):.0f} degrees" in words
-    # What was expected is still believed after it.
-    motion.miss()
-    nearly = elsewhere(walk(9)[8], 0.02)
-    assert not motion.surprise(nearly, motion.expected)
-    assert not motion.follow(nearly)
+    far, angle = motion.allowed(counted(7))
+    assert not motion.surprise(elsewhere(poses[7], 0.99 * far), counted(7))
+    assert motion.surprise(elsewhere(poses[7], 1.01 * far), counted(7))
+    assert not motion.surprise(elsewhere(poses[7], 0.0, 0.99 * angle), counted(7))
+    assert motion.surprise(elsewhere(poses[7], 0.0, 1.01 * angle), counted(7))
 
 
-def test_what_goes_on_from_a_surprise_confirms_it() -> None:
+def test_what_goes_on_from_a_jump_is_expected() -> None:
     poses = walk(12)
     motion = followed(poses[:6])
     jumped = [elsewhere(poses[5], 0.5) @ se3.inverse(poses[5]) @ T for T in poses]
-    assert motion.surprise(jumped[6], motion.expected)
-    motion.miss()
-    assert not motion.surprise(jumped[7], motion.expected)
-    assert motion.follow(jumped[7])
-    np.testing.assert_allclose(motion.expected, jumped[8], atol=1e-12)
-    assert not motion.surprise(jumped[8], motion.expected)
-    assert not motion.follow(jumped[8])
+    assert motion.surprise(jumped[6], counted(6))
+    motion.interrupt()
+    for k in (6, 7, 8, 9):
+        assert not motion.surprise(jumped[k], counted(k))
+        motion.follow(jumped[k], counted(k))
+    np.testing.assert_allclose(motion.expected(counted(10)), jumped[10], atol=1e-12)
 
 
-def test_what_moves_otherwise_from_a_surprise_does_not() -> None:
-    """A mirrored image turns the other way."""
-    turn = se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))
-    motion = followed(walk(6, step=turn))
-    mirrored = walk(8, elsewhere(walk(6, step=turn)[-1], 0.0, 1.0), se3.inverse(turn))
-    assert motion.surprise(mirrored[1], motion.expected)
-    motion.miss()
-    assert motion.surprise(mirrored[2], motion.expected)
-
-
-def test_after_a_long_loss_the_camera_may_be_anywhere() -> None:
+def test_after_a_long_loss_of_unknown_time_the_camera_may_be_anywhere() -> None:
     motion = followed(walk(6))
-    for _ in range(3):
-        motion.miss()
-    assert motion.expected is None
     far = elsewhere(np.eye(4), 5.0, 2.0)
-    assert not motion.surprise(far, walk(10)[9])
-    assert not motion.follow(far)
-    assert motion.expected is None
+    assert motion.surprise(far, counted(6))
+    assert not motion.surprise(far, counted(12))
+    assert np.isinf(motion.allowed(counted(12))).all()
+
+
+def test_after_an_interruption_it_may_be_anywhere() -> None:
+    motion = followed(walk(6))
+    motion.interrupt()
+    assert motion.expected(counted(6)) is None
+    assert np.isinf(motion.allowed(counted(6))).all()
+    assert not motion.surprise(elsewhere(np.eye(4), 5.0, 2.0), counted(6))
 
 
 def test_a_restless_camera_may_be_restless() -> None:
@@ -134,47 +158,51 @@ def test_a_restless_camera_may_be_restless() -> None:
 
 
 def test_jumps_of_a_whole_path() -> None:
-    poses = walk(20)
-    assert jumps(poses) == []
+    poses, moments = walk(20), [counted(k) for k in range(20)]
+    assert jumps(poses, moments) == []
     shift = elsewhere(np.eye(4), 0.4)
     broken = [*poses[:8], None, *(shift @ T for T in poses[9:])]
-    found = jumps(broken)
+    found = jumps(broken, moments)
     assert [k for k, _ in found] == [9]
     assert "0.40 m" in found[0][1]
-    assert jumps(broken, {9}) == []
+    assert jumps(broken, moments, {9}) == []
     spike = [*poses[:8], shift @ poses[8], *poses[9:]]
-    assert [k for k, _ in jumps(spike)] == [8, 9]
+    assert jumps(spike, moments)[0][0] == 8
 
 
 @pytest.mark.parametrize(
-    ("seconds", "believed"), [(None, False), (0.1, False), (0.2, False), (0.45, True), (2.0, True)]
+    ("seconds", "usual"), [(None, False), (0.1, False), (0.2, False), (0.45, True), (2.0, True)]
 )
-def test_the_longer_between_frames_the_further_a_motion_may_change(seconds, believed) -> None:
+def test_the_longer_between_frames_the_further_a_motion_may_change(seconds, usual) -> None:
     """0.2 m: what 3 m/s^2 lead to in 0.37 s."""
     poses = walk(8)
-    motion = followed(poses[:7])
-    words = motion.surprise(elsewhere(poses[7], 0.2), motion.expected, seconds)
-    assert (words == "") == believed
+    when = counted if seconds is None else timed(1 / seconds)
+    motion = followed(poses[:7], when)
+    words = motion.surprise(elsewhere(poses[7], 0.2), when(7))
+    assert (words == "") == usual
 
 
 def test_after_the_longest_time_not_everything_is_believed() -> None:
-    poses = walk(8)
-    motion = followed(poses[:7])
-    assert motion.surprise(elsewhere(poses[7], 1.5), motion.expected, 60.0)
+    poses, when = walk(8), timed(1 / 60.0)
+    motion = followed(poses[:7], when)
+    assert motion.surprise(elsewhere(poses[7], 1.5), when(7))
 
 
-def test_the_time_over_a_lost_frame_is_that_of_two() -> None:
-    poses = walk(9)
-    motion = followed(poses[:7])
-    motion.miss()
-    assert motion.surprise(elsewhere(poses[8], 0.2), motion.expected, 0.4)
-    assert not motion.surprise(elsewhere(poses[8], 0.2), motion.expected, 0.9)
+def test_over_a_lost_frame_the_motion_may_change_more() -> None:
+    poses, when = walk(9), timed(1 / 0.25)
+    motion = followed(poses[:7], when)
+    assert motion.surprise(elsewhere(poses[7], 0.2), when(7))
+    assert not motion.surprise(elsewhere(poses[8], 0.2), when(8))
 
 
 def test_frames_that_are_only_counted_have_no_time() -> None:
     assert Moment(5, 0.5).seconds_since(Moment(3, 0.3)) == pytest.approx(0.2)
     assert Moment(5, 5.0).seconds_since(Moment(3, 3.0)) is None
-    assert Moment(5, 0.5).seconds_since(None) is None
+    assert Moment(5, 5.0).since(Moment(3, 3.0)) == 2
+    assert Moment(5, 0.5).since(Moment(3, 0.3)) == pytest.approx(0.2)
+    # Times that stand still say nothing.
+    assert Moment(5, 0.3).seconds_since(Moment(3, 0.3)) is None
+    assert Moment(5, 0.3).since(Moment(3, 0.3)) == 2
 
 
 def test_jumps_know_the_time() -> None:
@@ -182,7 +210,7 @@ def test_jumps_know_the_time() -> None:
     broken = [*poses[:8], *(elsewhere(np.eye(4), 0.3) @ T for T in poses[8:])]
     for rate, found in ((30.0, [8]), (2.0, [])):
         moments = [Moment(k, k / rate) for k in range(20)]
-        assert [k for k, _ in jumps(broken, (), moments)] == found
+        assert [k for k, _ in jumps(broken, moments)] == found
 
 
 def test_small_motions() -> None:

@@ -54,15 +54,15 @@ def test_motions_are_chained_by_equations_3_1_and_3_2():
     tracker = Sequential(Scripted(list(MOTIONS))).start(0)
     steps = [tracker.push(cloud(k)) for k in range(7)]
     R, t = np.eye(3), np.zeros(3)
-    np.testing.assert_array_equal(steps[0].T_world_camera, np.eye(4))
+    np.testing.assert_array_equal(steps[0].T_component_camera, np.eye(4))
     assert steps[0].reference is None
     assert steps[0].registration is None
     for k, (step, new) in enumerate(zip(steps[1:], MOTIONS, strict=True)):
         t = R @ new[:3, 3] + t  # (3.1)
         R = R @ new[:3, :3]  # (3.2)
         assert (step.status, step.reason, step.reference) == ("tracked", "", k)
-        np.testing.assert_allclose(step.T_world_camera[:3, :3], R, atol=1e-12)
-        np.testing.assert_allclose(step.T_world_camera[:3, 3], t, atol=1e-12)
+        np.testing.assert_allclose(step.T_component_camera[:3, :3], R, atol=1e-12)
+        np.testing.assert_allclose(step.T_component_camera[:3, 3], t, atol=1e-12)
         np.testing.assert_array_equal(step.registration.T_target_source, new)
 
 
@@ -109,12 +109,12 @@ def test_a_lost_frame_has_a_reason_and_the_next_is_registered_to_the_last_tracke
     tracker = Sequential(registrar, minimum_share=0.02).start(0)
     steps = [tracker.push(cloud(k)) for k in range(5)]
     assert [s.status for s in steps] == ["tracked", "tracked", "lost", "lost", "tracked"]
-    assert steps[2].T_world_camera is None
+    assert steps[2].T_component_camera is None
     assert steps[2].reason == "not registered to frame 1: no overlap"
-    assert steps[3].T_world_camera is None
+    assert steps[3].T_component_camera is None
     assert "1.9%" in steps[3].reason
     assert steps[4].reference == 1
-    np.testing.assert_allclose(steps[4].T_world_camera, MOTIONS[0] @ MOTIONS[2], atol=1e-12)
+    np.testing.assert_allclose(steps[4].T_component_camera, MOTIONS[0] @ MOTIONS[2], atol=1e-12)
 
 
 def test_frames_without_points_are_lost_and_raise_nothing():
@@ -129,11 +129,11 @@ def test_frames_without_points_are_lost_and_raise_nothing():
             step = tracker.push(frame)
             assert step.status == "lost"
             assert step.reason == f"{len(frame)} valid points, 10 are needed"
-            assert step.T_world_camera is None
+            assert step.T_component_camera is None
         if first == 4:
             step = tracker.push(cloud(first, points=2000))
             assert step.status == "tracked"
-            np.testing.assert_array_equal(step.T_world_camera, np.eye(4))
+            np.testing.assert_array_equal(step.T_component_camera, np.eye(4))
 
 
 def test_registrations_that_fix_no_motion_lose_the_frame():
@@ -169,7 +169,7 @@ def test_rotations_stay_rotations_over_long_sequences():
     frame = cloud(0)
     for _ in range(3000):
         step = tracker.push(frame)
-    R = step.T_world_camera[:3, :3]
+    R = step.T_component_camera[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
@@ -193,7 +193,7 @@ def test_it_follows_a_camera(guess):
     for view, truth in zip(views, T, strict=True):
         step = tracker.push(view)
         assert step.status == "tracked"
-        xi = se3.log(se3.inverse(truth) @ step.T_world_camera)
+        xi = se3.log(se3.inverse(truth) @ step.T_component_camera)
         assert np.linalg.norm(xi[:3]) < 0.03
         assert np.linalg.norm(xi[3:]) < 0.02
 
@@ -204,7 +204,7 @@ def test_the_number_of_threads_does_not_change_the_poses():
     for count in (1, 2):
         with threads(count):
             tracker = Sequential(algorithm_1(points=5000)).start(7)
-            results.append([tracker.push(v).T_world_camera.tobytes() for v in views])
+            results.append([tracker.push(v).T_component_camera.tobytes() for v in views])
     assert results[0] == results[1]
 
 
@@ -216,7 +216,7 @@ def test_peaks_is_followed_at_low_noise_and_drifts_at_high():
         for seed in range(2):
             views, T = peaks_views(sigma, seed)
             tracker = Sequential(algorithm_1(1.0, None), "previous").start(seed)
-            poses = np.array([tracker.push(v).T_world_camera for v in views])
+            poses = np.array([tracker.push(v).T_component_camera for v in views])
             errors.append(np.linalg.norm(poses[:, :3, 3] - T[:, :3, 3], axis=1).mean())
         return np.mean(errors)
 

@@ -75,7 +75,7 @@ def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> 
     config = changed(from_method("default"), {"corrections": kept_as_it_is}, where="test")
     never = Kept(0)
     whole = reconstruct.reconstruct(recording, config, seed=3, stages=never)
-    assert never.saved == ["tracking"] * 4 + ["loops", "refinement", "fusion"]
+    assert never.saved == ["tracking"] * 4 + ["joining", "loops", "refinement", "fusion"]
     assert told(reconstruct.reconstruct(recording, config, seed=3)) == told(whole)
     read = recording.source.read
     for stop_at in (2, 4, 6):

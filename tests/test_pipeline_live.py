@@ -108,7 +108,7 @@ def scripted(pairs):
     class Scripted:
         asked = 0
 
-        def push(self, view, T_world_camera, surface=None):
+        def push(self, view, T_component_camera):
             """Nothing to remember."""
 
         def look(self):
@@ -119,7 +119,7 @@ def scripted(pairs):
             record = LoopRecord(*here[0], True, "")
             return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
 
-        def finish(self):
+        def finish(self, poses):
             return []
 
     return Scripted()

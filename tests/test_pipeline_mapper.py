@@ -345,16 +345,15 @@ def test_the_model_before_optimisation_is_kept_where_a_loop_moved_it() -> None:
     assert len(closed.cloud) != len(before)
 
 
-def test_a_frame_gets_its_pose_when_the_next_one_shows_that_it_was_right(frames) -> None:
-    """The camera jumps back: that is a surprise, until it goes on from there."""
+def test_a_camera_that_jumps_back_is_followed(frames) -> None:
     mapper = Mapper("default")
     again = [replace(f, index=k) for k, f in enumerate([*frames[:6], *frames[:4]])]
-    poses = [mapper.push(frame) for frame in again]
-    assert [k for k, T in enumerate(poses) if T is None] == [6]
+    for frame in again:
+        mapper.push(frame)
     result = mapper.finish()
     assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 10
     assert [f.index for f in result.diagnostics.frames] == list(range(10))
     assert list(result.graph.ids) == list(range(10))
-    apart = se3.inverse(result.diagnostics.sequential[0]) @ result.diagnostics.sequential[6]
-    assert np.linalg.norm(apart[:3, 3]) < 0.02
-    assert result.diagnostics.frames[6].covariance is not None
+    for k in range(4):
+        apart = se3.inverse(result.trajectory[k]) @ result.trajectory[6 + k]
+        assert np.linalg.norm(apart[:3, 3]) < 0.02

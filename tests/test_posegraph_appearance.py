@@ -11,17 +11,17 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.odometry.keyframes import Recovery
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.views import Spacing
+from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.search import SearchOptions
+from tofuse.registration.verification import Belief
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
 ALL = Spacing(angle=0, distance=0)
-QUICK = Recovery(search=SearchOptions("full", full_candidates=15, photo_candidates=5))
+QUICK = Belief(search=SearchOptions("full", full_candidates=15, photo_candidates=5))
 # Boxes (centre, half size, turned about y by rad) in a room of 5 x 2.4 x 4 m, y down.
 BOXES = [
     ((1.3, 0.9, 1.2), (0.3, 0.5, 0.25), 0.3),
@@ -89,11 +89,13 @@ def drifted(truth, degrees):
 
 
 def found_in(views, poses, **options):
-    loops = Revisits(spacing=ALL, recovery=QUICK, **options).start(0)
+    store = ViewStore(ALL)
+    loops = Revisits(spacing=ALL, belief=QUICK, **options).start(0, (), store)
     frame = room(0.0, 0)
     for view, T in zip(views, poses, strict=True):
-        loops.push(replace(frame, index=view.index), T, view)
-    return loops.finish()
+        store.push(view, T)
+        loops.push(replace(frame, index=view.index), T)
+    return loops.finish(dict(enumerate(poses)))
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
 from tofuse.posegraph.given import read_loops
 from tofuse.posegraph.loops import Confirmation, GivenLoop, LoopDetector, mean_error
 from tofuse.posegraph.nearby import Nearby, yaw
+from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.icp import algorithm_1
@@ -176,11 +177,12 @@ def test_every_candidate_is_recorded_and_what_a_person_gives_counts():
     confirmation = Confirmation((Scripted(motion),))
     by_hand = pose(0.05)
     given = [GivenLoop(0, 20, by_hand), GivenLoop(5, 21), GivenLoop(3, 17)]
-    loops = Nearby(max_yaw_rad=0.01, min_gap=8, confirmation=confirmation).start(0, given)
+    loops = Nearby(max_yaw_rad=0.01, min_gap=8, confirmation=confirmation)
+    loops = loops.start(0, given, ViewStore(Spacing()))
     for k in range(22):
         if k != 5:  # lost
             loops.push(view(k), poses[k])
-    closed = loops.finish()
+    closed = loops.finish({k: poses[k] for k in range(22) if k != 5})
     pairs = {(c.record.i, c.record.j): c for c in closed}
     assert list(pairs) == [(3, 17), (0, 20), (1, 21), (5, 21)]
     np.testing.assert_array_equal(pairs[0, 20].T_i_j, by_hand)

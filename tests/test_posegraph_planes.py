@@ -14,6 +14,7 @@ from tofuse.kernels import planes as kernels
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.common_planes import PlaneOptions, refine_clouds
 from tofuse.posegraph.planes import Planes
+from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
 from tofuse.simulation.peaks import peaks_views
 
@@ -139,9 +140,9 @@ def test_the_planes_are_eliminated_exactly():
 
 
 def refined(part, views, poses):
-    out = part.start()
+    out = part.start(ViewStore(Spacing()))
     for view, T in zip(views, poses, strict=True):
-        out.push(view, None, T)
+        out.push(view, T)
     return out.finish([v.index for v in views], poses)
 
 

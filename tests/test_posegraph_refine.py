@@ -161,9 +161,11 @@ def test_frames_in_between_follow():
 
 
 def refiner(part, views, poses):
-    out = part.start()
+    store = ViewStore(Spacing())
+    out = part.start(store)
     for view, T in zip(views, poses, strict=True):
-        out.push(corner(T), view, T)
+        store.push(view, T)
+        out.push(corner(T), T)
     return out.finish(list(range(len(poses))), poses)
 
 
@@ -221,7 +223,7 @@ def test_the_store_never_holds_more_than_it_may():
     for k in range(400):
         store.push(replace(view, index=k), se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])))
         assert len(store.views) <= 10
-    kept = [s.index for s in store.views]
+    kept = [v.index for v in store.views]
     assert kept[0] == 0
     assert kept[-1] > 300
     assert max(np.diff(kept)) <= 2 * min(np.diff(kept))

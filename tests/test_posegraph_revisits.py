@@ -13,9 +13,10 @@ from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph import revisits
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.views import Spacing
+from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.search import Candidate, Match
+from tofuse.registration.verification import Assessment
 
 ALL = Spacing(angle=0, distance=0)
 DRIFT = se3.exp(np.array([0.004, -0.003, 0.004, 0.002, -0.003, 0.002]))
@@ -46,15 +47,17 @@ def turn():
 
 
 def pushed(options, frames, poses, given=()):
-    loops = options.start(0, given)
+    store = ViewStore(ALL)
+    loops = options.start(0, given, store)
     for frame, T in zip(frames, poses, strict=True):
-        loops.push(frame, T, surface_map(frame, SurfaceOptions(radii=(2,))))
-    return loops
+        store.push(surface_map(frame, SurfaceOptions(radii=(2,))), T)
+        loops.push(frame, T)
+    return loops.finish({f.index: T for f, T in zip(frames, poses, strict=True)})
 
 
 def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
     frames, truth, start = turn
-    found = pushed(Revisits(spacing=ALL, searches=0), frames, start).finish()
+    found = pushed(Revisits(spacing=ALL, searches=0), frames, start)
     closed = [c for c in found if c.record.accepted]
     assert closed
     assert any(c.record.i == 0 and c.record.j >= 11 for c in closed)
@@ -72,10 +75,10 @@ def test_a_place_seen_again_is_measured_in_spite_of_the_drift(turn):
 def test_views_that_never_left_each_other_are_no_loop(turn):
     frames, _truth, start = turn
     half = 6
-    assert pushed(Revisits(spacing=ALL), frames[:half], start[:half]).finish() == []
+    assert pushed(Revisits(spacing=ALL), frames[:half], start[:half]) == []
     # Standing still sees the same all the time, and never left it.
     still = [replace(frames[0], index=k) for k in range(5)]
-    assert pushed(Revisits(spacing=ALL), still, np.stack([np.eye(4)] * 5)).finish() == []
+    assert pushed(Revisits(spacing=ALL), still, np.stack([np.eye(4)] * 5)) == []
 
 
 def test_a_view_of_something_else_is_refused_with_a_reason(turn):
@@ -89,7 +92,7 @@ def test_a_view_of_something_else_is_refused_with_a_reason(turn):
         ),
     ]
     options = Revisits(spacing=ALL, overlap=0.15, searches=0)
-    found = pushed(options, strange, start).finish()
+    found = pushed(options, strange, start)
     late = [c for c in found if c.record.j >= 11]
     assert late
     for c in late:
@@ -102,7 +105,7 @@ def test_what_a_person_gives_counts(turn):
     frames, truth, start = turn
     T = se3.inverse(truth[0]) @ truth[12]
     given = [GivenLoop(0, 12, T), GivenLoop(1, 11), GivenLoop(0, 99)]
-    found = pushed(Revisits(spacing=ALL, per_view=0), frames, start, given).finish()
+    found = pushed(Revisits(spacing=ALL, per_view=0), frames, start, given)
     by_pair = {(c.record.i, c.record.j): c for c in found}
     assert list(by_pair) == [(1, 11), (0, 12), (0, 99)]
     np.testing.assert_array_equal(by_pair[0, 12].T_i_j, T)
@@ -149,8 +152,10 @@ def test_searched_loops_lead_clearly_or_agree(turn, monkeypatch, leads, wrong, a
 
     monkeypatch.setattr(revisits, "search", scripted)
     # Nothing fits from the drifted pose, so all is left to the search.
-    refuse = replace(options.acceptance, inliers=10**6)
-    found = pushed(replace(options, acceptance=refuse), frames, start).finish()
+    monkeypatch.setattr(
+        revisits.UsualFit, "assess", lambda *_: Assessment(False, np.inf, "does not fit")
+    )
+    found = pushed(options, frames, start)
     assert len(asked) >= 2
     assert sum(c.record.accepted for c in found) == accepted
     for c in found:

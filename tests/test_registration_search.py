@@ -13,13 +13,14 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.odometry.keyframes import Keyframes, Recovery
+from tofuse.odometry.keyframes import Keyframes
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import AgreementOptions, agreement
 from tofuse.registration.floor import FloorOptions, find_floor, find_floors
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import SearchOptions, search
+from tofuse.registration.verification import Belief
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate_recording
 
@@ -414,7 +415,7 @@ def test_views_of_different_places_have_little_in_common(pair):
     elsewhere = view(camera(0.0, 0.2, 0.9), boxes=other)
     found = search(elsewhere, pair[1], SearchOptions(mode="both"))
     assert found.score < 0.8 * agreement(*pair, TRUE).score
-    assert not Recovery().believes(found, lost=True)
+    assert Belief().objection(found, alone=True)
 
 
 def test_the_answer_does_not_depend_on_the_number_of_threads(pair):
@@ -457,15 +458,22 @@ def test_a_view_of_nothing_is_not_searched(pair):
     assert search(pair[0], empty) is None
 
 
-def test_the_tracker_follows_a_large_step():
-    """What it loses without the search."""
+def test_the_tracker_connects_a_view_after_a_large_step_by_a_search():
+    """It goes on, or is linked to the view before; without searches it begins a component."""
     frames = [seen(A, seed=0), seen(B, seed=1)]
-    for keyframes in (0, 1):
-        tracker = Keyframes(recovery=Recovery(keyframes=keyframes)).start(0)
+    for searches in (False, True):
+        tracker = Keyframes(searches=searches).start(0)
         step = [tracker.push(frame) for frame in frames][1]
-        if not keyframes:
-            assert step.status == "lost"
-    metres, degrees = error(step.T_world_camera, TRUE)
+        if not searches:
+            assert step.component == 1
+            assert step.links == ()
+    found = step.T_component_camera
+    if step.component == 1:
+        (link,) = step.links
+        assert (link.i, link.j) == (0, 1)
+        assert link.certain
+        found = link.T_i_j
+    metres, degrees = error(found, TRUE)
     assert metres < 0.02
     assert degrees < 0.5
 

@@ -32,8 +32,7 @@ class Intake:
                 where=f"frame {frame.index}",
                 remedy="give images only, or clouds only",
             )
-        first, self.kind = self.kind is None, kind
-        return first
+        return self.kind is None
 
     def check_order(self, index: int) -> None:
         """Raise InputError if the index of the next frame does not grow."""
@@ -43,7 +42,11 @@ class Intake:
                 where=f"frame {index}",
                 remedy="number the frames in the order in which they are pushed",
             )
+
+    def accept(self, index: int, kind: ViewKind | None = None) -> None:
+        """Take note of a frame that passed all checks; its kind is None if it was not read."""
         self._index = index
+        self.kind = self.kind or kind
 
     def is_repeated(self, frame: Frame) -> bool:
         """Whether an image is the one before: a camera that hangs, as noise never repeats."""

@@ -219,6 +219,7 @@ class Mapper:
         """Say that a frame could not be read; InputError if its index does not grow."""
         self._check_open()
         self._intake.check_order(index)
+        self._intake.accept(index)
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
         self._progress.advance(self._log.entries[-1].record)
 
@@ -316,13 +317,13 @@ class Mapper:
     def _check(self, frame: Frame) -> None:
         self._check_open()
         self._intake.check_order(frame.index)
-        if not self._intake.check_kind(frame):
-            return
         kind = kind_of(frame)
-        if self._method is not None and kind == "cloud":
-            self.config = from_method(self._method, kind)
-            self._begin()
-        check_views(self.config, kind)
+        if self._intake.check_kind(frame):
+            if self._method is not None and kind == "cloud":
+                self.config = from_method(self._method, kind)
+                self._begin()
+            check_views(self.config, kind)
+        self._intake.accept(frame.index, kind)
 
     def _check_open(self) -> None:
         if self._finished or self._ended:

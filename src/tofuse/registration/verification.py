@@ -154,8 +154,10 @@ def _statistics(a: Aligned) -> Float64:
 
 def _in_words(k: int, found: float, usual: float) -> str:
     if k < 2:
-        shares = [1 / (1 + np.exp(-x)) for x in (found, usual)]
-        return f"{shares[0]:.0%} {_NAMES[k]}, usually {shares[1]:.0%}"
+        floor = _ODDS_FLOOR[k]
+        odds = np.exp([found, usual])
+        fractions = np.clip((odds * (1 + floor) - floor) / (1 + odds), 0, 1)
+        return f"{fractions[0]:.0%} {_NAMES[k]}, usually {fractions[1]:.0%}"
     return f"{_NAMES[k]} {np.exp(found - usual):.1f} times as large as usual"
 
 
@@ -286,6 +288,9 @@ def searched_link(
     aligned = align(source, at, match.T_target_source, _AFTER_SEARCH)
     T = aligned.T_world_source
     doubt = "" if adjacent else belief.objection(match, alone=True)
+    if doubt and len(aligned.unobservable):
+        # All poses along it fit, and the one with most overlap leads: that is no evidence.
+        return None, f"{len(aligned.unobservable)} directions are degenerate, and {doubt}"
     if doubt:
         near = aligned_link(source, target, np.eye(4), usual)
         if near is not None and not belief.search.differ(near.T_i_j, T):

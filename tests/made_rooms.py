@@ -1,0 +1,105 @@
+"""Views of a furnished, textured room from anywhere in it, whose poses are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
+from tofuse.recordings.frames import RangeFrame
+
+Float64 = NDArray[np.float64]
+Box = tuple[tuple[float, float, float], tuple[float, float, float], float]
+
+CAMERA = Pinhole(128, 96, 92.0, 92.0, 63.5, 47.5)
+# A room of 4 x 2.2 x 3.6 m, y down, with boxes (centre, half size, turned about y by rad).
+HALF = (2.0, 1.1, 1.8)
+BOXES: tuple[Box, ...] = (
+    ((1.2, 0.7, 1.2), (0.3, 0.4, 0.25), 0.3),
+    ((-1.4, 0.4, 1.3), (0.2, 0.7, 0.3), 0.9),
+    ((-1.2, 0.7, -1.2), (0.4, 0.4, 0.2), 1.2),
+    ((1.5, 0.5, -0.9), (0.2, 0.6, 0.4), 0.1),
+    ((0.1, 0.8, 1.3), (0.25, 0.3, 0.2), 0.6),
+    ((1.5, 0.8, 0.2), (0.25, 0.3, 0.2), 1.0),
+    ((-1.5, 0.8, 0.1), (0.3, 0.25, 0.25), 0.4),
+    ((0.2, 0.75, -1.4), (0.3, 0.35, 0.2), 0.8),
+)
+OTHER: tuple[Box, ...] = (
+    ((1.5, 0.3, 0.8), (0.2, 0.8, 0.2), 1.1),
+    ((-0.6, 0.7, 1.4), (0.5, 0.4, 0.15), 0.2),
+    ((-1.6, 0.2, -0.8), (0.25, 0.9, 0.3), 0.5),
+    ((0.4, 0.9, -1.4), (0.4, 0.2, 0.3), 0.9),
+    ((0.6, 0.9, 1.2), (0.15, 0.2, 0.3), 0.4),
+    ((0.1, 0.7, 0.9), (0.15, 0.4, 0.2), 0.7),
+    ((1.2, 0.6, 1.5), (0.3, 0.5, 0.2), 0.3),
+)
+
+
+def at(x: float, z: float, yaw: float, pitch: float = 0.3, y: float = 0.0) -> Float64:
+    """T_world_camera (4, 4) of a camera that has turned by `yaw` and looks down by `pitch`."""
+    T = np.eye(4)
+    T[:3, :3] = se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([-pitch, 0, 0])
+    T[:3, 3] = x, y, z
+    return T
+
+
+def seen(
+    T_world_camera: Float64,
+    index: int,
+    *,
+    half: tuple[float, float, float] = HALF,
+    boxes: Sequence[Box] = BOXES,
+    spots: int = 60,
+    scene: int = 3,
+    noise: float = 0.004,
+    rate: float = 10.0,
+) -> RangeFrame:
+    """What a camera sees of walls and boxes with spots of another albedo; `scene` places these."""
+    rows, columns = CAMERA.height, CAMERA.width
+    rays = np.dstack([CAMERA.rays(), np.ones((rows, columns))]).reshape(-1, 3)
+    origin, d = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls = (np.sign(d) * half - origin) / d
+        z, across = walls.min(1), np.take_along_axis(d, walls.argmin(1)[:, None], 1)[:, 0]
+        for centre, size, turn in boxes:
+            R = se3.so3_exp([0, turn, 0])
+            o, e = (origin - np.array(centre)) @ R, d @ R
+            a, b = (-np.array(size) - o) / e, (np.array(size) - o) / e
+            first = np.minimum(a, b)
+            near, far = first.max(1), np.maximum(a, b).min(1)
+            hit = (near < far) & (near > 0) & (near < z)
+            side = np.take_along_axis(e, first.argmax(1)[:, None], 1)[:, 0]
+            z, across = np.where(hit, near, z), np.where(hit, side, across)
+    p = origin + z[:, None] * d
+    rng = np.random.default_rng(scene)
+    albedo = np.ones(len(p))
+    for spot, size, level in zip(
+        rng.uniform(-1, 1, (spots, 3)) * half,
+        rng.uniform(0.1, 0.35, spots),
+        rng.uniform(0.4, 1.6, spots),
+        strict=True,
+    ):
+        albedo[((p - spot) ** 2).sum(1) < size**2] = level
+    rng = np.random.default_rng([4, index])
+    z = z * (1 + noise * rng.standard_normal(len(z)))
+    cosine = np.abs(across) / np.linalg.norm(d, axis=1)
+    light = 1000 * albedo * cosine * (1 + 0.02 * rng.standard_normal(len(z)))
+    depth, light = (x.reshape(rows, columns).astype(np.float32) for x in (z, light))
+    return RangeFrame(
+        index,
+        index / rate,
+        CAMERA,
+        depth,
+        "z",
+        amplitude_image=light,
+        amplitude_kind="range_compensated",
+    )
+
+
+def surface(frame: RangeFrame) -> SurfaceMap:
+    """The view as the tests prepare it: small windows for small images."""
+    return surface_map(frame, SurfaceOptions(radii=(2,)))

@@ -1,0 +1,192 @@
+"""Which keyframes are kept, and how often lost views are searched for among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_rooms import OTHER, at, seen, surface
+from tofuse.geometry import se3
+from tofuse.odometry import keyframe_map, relocalization
+from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
+from tofuse.odometry.relocalization import Relocalizer
+from tofuse.registration.verification import Belief, UsualFit
+
+VIEW = surface(seen(at(0, 0.3, 0), 0))
+
+
+def along(x, index, component=0):
+    """A keyframe `x` m to the right; what it sees does not matter."""
+    T = np.eye(4)
+    T[0, 3] = x
+    return Keyframe(replace(VIEW, index=index), T, component)
+
+
+def turned(angle, index, component=0):
+    return Keyframe(replace(VIEW, index=index), se3.exp([0, 0, 0, 0, angle, 0]), component)
+
+
+def kept(keyframes):
+    return [k.view.index for k in keyframes._keyframes]
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(keyframe_map, "CAPACITY", 4)
+    return KeyframeMap(0.2, 0.1)
+
+
+def test_memory_stays_flat_and_the_newest_stays(small) -> None:
+    for k in range(30):
+        small.add(along(0.3 * k, k))
+        assert len(small) == min(k + 1, 4)
+        assert small.newest.view.index == k
+
+
+def test_there_are_no_more_than_so_many() -> None:
+    keyframes = KeyframeMap(0.2, 0.1)
+    for k in range(keyframe_map.CAPACITY + 10):
+        keyframes.add(along(0.3 * k, k))
+    assert len(keyframes) == keyframe_map.CAPACITY
+
+
+def test_of_two_that_are_near_the_later_one_goes(small) -> None:
+    """There and back again: frames 0 to 4 cover the way, what came later lies on them."""
+    for n, place in enumerate([0, 1, 2, 3, 4, 3, 2, 1]):
+        small.add(along(0.3 * place + 0.001 * n, n))
+    found = kept(small)
+    assert found[-1] == 7
+    assert len({min(n, 8 - n) for n in found}) == 4  # no place twice
+
+
+def test_turns_count_like_motions(small) -> None:
+    for index, angle in enumerate([0.0, 1.0, 1.05, 2.0, 3.0]):
+        small.add(turned(angle, index))
+    assert kept(small) == [0, 1, 3, 4]
+
+
+def test_places_of_other_components_are_elsewhere(small) -> None:
+    """Poses are comparable within a component only."""
+    for index, (x, component) in enumerate([(0.0, 0), (0.5, 0), (0.01, 1), (0.6, 1), (0.0, 2)]):
+        small.add(along(x, index, component))
+    # Of each component two or one: the nearest two of one component are 0 and 1.
+    assert kept(small) == [0, 2, 3, 4]
+
+
+def test_the_only_keyframe_of_a_component_outlives_many_of_another(small) -> None:
+    small.add(along(0.0, 0, 0))
+    for k in range(1, 12):
+        small.add(along(0.3 * k, k, 1))
+    assert kept(small)[0] == 0
+
+
+def test_of_components_of_one_keyframe_the_oldest_goes(small) -> None:
+    for k in range(7):
+        small.add(along(0.0, k, k))
+    assert kept(small) == [3, 4, 5, 6]
+
+
+def test_a_view_becomes_a_keyframe_by_its_motion() -> None:
+    keyframes = KeyframeMap(0.2, 0.1)
+    first = along(0.0, 0)
+    keyframes.add(first)
+    step = 0.1 * VIEW.depth
+    assert not keyframes.is_far(along(0.9 * step, 1).T_component_camera, first)
+    assert keyframes.is_far(along(1.1 * step, 1).T_component_camera, first)
+    assert not keyframes.is_far(turned(0.19, 1).T_component_camera, first)
+    assert keyframes.is_far(turned(0.21, 1).T_component_camera, first)
+
+
+@pytest.fixture(scope="module")
+def around():
+    """Keyframes of two components that look different ways."""
+    keyframes = KeyframeMap(0.2, 0.1)
+    poses = [at(0, 0.3, 0.7 * k) for k in range(6)]
+    for k, T in enumerate(poses):
+        keyframes.add(Keyframe(surface(seen(T, k)), T, k // 3))
+    return keyframes, poses
+
+
+def test_the_one_that_looks_most_alike_is_found(around) -> None:
+    keyframes, poses = around
+    for k, T in enumerate(poses):
+        near = surface(seen(T @ se3.exp([0.02, 0, 0, 0, 0.05, 0]), 9))
+        assert keyframes.alike(near, 9).view.index == k
+        # Of its own component none is asked for.
+        other = keyframes.alike(near, k // 3)
+        assert other.component != k // 3
+    only = KeyframeMap(0.2, 0.1)
+    assert only.alike(VIEW, 0) is None
+    only.add(along(0.0, 0, 2))
+    assert only.alike(VIEW, 2) is None
+
+
+# The budget of searches
+
+
+def counted(monkeypatch, found=(None, "")):
+    """Searches that find the same each time; the frames that were asked for."""
+    asked = []
+
+    def search(view, target, belief, usual, *, adjacent):
+        asked.append((view.index, target.index, adjacent))
+        return found
+
+    monkeypatch.setattr(relocalization, "searched_link", search)
+    return asked
+
+
+def test_searches_are_few_at_first_and_more_with_the_frames(around, monkeypatch) -> None:
+    keyframes, _ = around
+    asked = counted(monkeypatch)
+    relocalizer, lost = Relocalizer(Belief()), surface(seen(at(0, 0.3, 0.7), 7))
+    for _ in range(100):
+        relocalizer.links(lost, keyframes, 9, UsualFit())
+    at_first = len(asked)
+    assert 0 < at_first <= 60
+    for _ in range(1000):
+        relocalizer.count_frame()
+        relocalizer.links(lost, keyframes, 9, UsualFit())
+    # A search costs as much as tracking some tens of frames.
+    assert 10 <= len(asked) - at_first <= 50
+
+
+def test_the_newest_and_the_likest_keyframe_are_searched(around, monkeypatch) -> None:
+    keyframes, _ = around
+    asked = counted(monkeypatch)
+    lost = surface(seen(at(0, 0.3, 0.72), 7))
+    assert Relocalizer(Belief()).links(lost, keyframes, 2, UsualFit(), 5) == ()
+    assert asked == [(7, 5, True), (7, 1, False)]
+    # Not in its own component, and each once.
+    asked.clear()
+    Relocalizer(Belief()).links(lost, keyframes, 1, UsualFit())
+    assert [j for _, j, _ in asked] == [1]
+    asked.clear()
+    last = surface(seen(at(0, 0.3, 3.52), 7))
+    Relocalizer(Belief()).links(last, keyframes, 2, UsualFit())
+    assert [j for _, j, _ in asked] == [5]
+
+
+def test_without_belief_nothing_is_searched(around, monkeypatch) -> None:
+    asked = counted(monkeypatch)
+    assert Relocalizer(None).links(VIEW, around[0], 9, UsualFit()) == ()
+    assert asked == []
+
+
+def test_a_lost_view_is_linked_where_it_is(around) -> None:
+    keyframes, poses = around
+    T = poses[1] @ se3.exp([0.05, 0, 0, 0, 0.1, 0])
+    links = Relocalizer(Belief()).links(surface(seen(T, 7)), keyframes, 9, UsualFit())
+    link = links[-1]
+    assert link.certain
+    assert (link.i, link.j) == (1, 7)
+    off = se3.inverse(se3.inverse(poses[1]) @ T) @ link.T_i_j
+    assert np.linalg.norm(off[:3, 3]) < 0.01
+
+
+def test_a_view_of_another_scene_is_linked_to_nothing_for_certain(around) -> None:
+    frame = seen(at(0.1, 0, 2.0), 7, boxes=OTHER, half=(2.3, 1.2, 2.2), scene=9)
+    links = Relocalizer(Belief()).links(surface(frame), around[0], 9, UsualFit())
+    assert not any(link.certain for link in links)

@@ -1,0 +1,280 @@
+"""Components of one recording, joined by what links between them say together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_rooms import OTHER, at, seen, surface
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.posegraph import joining
+from tofuse.posegraph.joining import Joining, Stretch
+from tofuse.posegraph.views import PosedView
+from tofuse.registration.agreement import agreement
+from tofuse.registration.verification import Belief, Link, UsualFit, aligned_link, searched_link
+
+RATE = 10.0
+SPARSELY = Joining(searches=2, searches_per_frame=0, bridge=False)
+# A camera that walks round and turns.
+PATH = [at(0.3 * np.sin(0.2 * k), 0.3 * np.cos(0.2 * k), 0.08 * k) for k in range(40)]
+STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}
+
+
+def stretch(component, frames, path=PATH, every=3, dark=False, late=0.0, **scene):
+    """A component with exact poses in a frame of its own, and every so many-th view."""
+    frames = list(frames)
+    poses = np.stack([se3.inverse(path[frames[0]]) @ path[k] for k in frames])
+    views = []
+    for k, T in list(zip(frames, poses, strict=True))[::every]:
+        frame = seen(path[k], k, **scene)
+        if dark:
+            frame = replace(frame, amplitude_image=None)
+        views.append(PosedView(surface(frame), T, component))
+    times = np.array(frames) / RATE + late
+    return Stretch(component, np.array(frames), times, poses, tuple(views))
+
+
+def linked(first, second, certain=True, off=None):
+    """A true link between frames of two stretches, or one that is off by a motion."""
+    a, b = first.views[-1], second.views[0]
+    T = se3.inverse(PATH[a.index]) @ PATH[b.index]
+    return link_of(a, b, T if off is None else T @ off, certain)
+
+
+def link_of(a, b, T, certain=True):
+    said = replace(agreement(b.view, a.view, T), support=0.5)
+    margin = 0.3 if certain else None
+    return Link(a.index, b.index, T, np.diag([1e4] * 6), said, margin, certain, "made")
+
+
+@pytest.fixture(scope="module")
+def three():
+    return [stretch(c, range(12 * c, 12 * c + 10)) for c in range(3)]
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    return stretch(1, range(12, 22), **STRANGE)
+
+
+def assert_joined(group, stretches, path=PATH, metres=0.02, degrees=0.5):
+    """Components of a group are where they are, in the frame of the first one."""
+    first, *_ = group.T_group_component
+    np.testing.assert_allclose(group.T_group_component[first], np.eye(4), atol=1e-12)
+    began = {s.component: int(s.frames[0]) for s in stretches}
+    assert began[first] == min(began[c] for c in group.T_group_component)
+    for c, T in group.T_group_component.items():
+        off = se3.inverse(se3.inverse(path[began[first]]) @ path[began[c]]) @ T
+        assert np.linalg.norm(off[:3, 3]) < metres
+        assert np.degrees(se3.angle(off)) < degrees
+
+
+def members(groups):
+    return [sorted(group.T_group_component) for group in groups]
+
+
+def test_one_component_is_a_group(three) -> None:
+    (group,) = Joining().join(three[:1], [])
+    np.testing.assert_array_equal(group.T_group_component[0], np.eye(4))
+    assert (group.frames, group.joins, group.bridged) == (10, (), frozenset())
+    assert group.joined(0) == "links"
+
+
+def test_stretches_of_one_path_are_joined_without_links(three) -> None:
+    (group,) = Joining().join(three, [])
+    assert group.frames == 30
+    assert_joined(group, three)
+    assert not group.bridged
+    assert [group.joined(c) for c in range(3)] == ["links"] * 3
+    # Each join hangs on one link; the others say the same.
+    assert sum(join.needed for join in group.joins) == 2
+    assert len(group.joins) > 2
+    for join in group.joins:
+        assert join.how == "links"
+        true = se3.inverse(PATH[join.link.i]) @ PATH[join.link.j]
+        off = se3.inverse(true) @ join.link.T_i_j
+        assert np.linalg.norm(off[:3, 3]) < 0.02
+
+
+def test_links_that_are_given_are_used(three) -> None:
+    links = [linked(three[0], three[1]), linked(three[1], three[2])]
+    (group,) = Joining().join(three, links)
+    assert_joined(group, three)
+    assert {(j.link.i, j.link.j) for j in group.joins} >= {(x.i, x.j) for x in links}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_links_does_not_matter(three, seed) -> None:
+    links = [linked(three[0], three[1]), linked(three[1], three[2]), linked(three[0], three[2])]
+    links += [linked(three[0], three[1], certain=False, off=se3.exp([0.7, 0, 0, 0, 0.4, 0]))]
+    (expected,) = SPARSELY.join(three, links)
+    order = np.random.default_rng(seed).permutation(len(links))
+    (group,) = SPARSELY.join(three, [links[k] for k in order])
+    assert group.T_group_component.keys() == expected.T_group_component.keys()
+    for c, T in expected.T_group_component.items():
+        np.testing.assert_allclose(group.T_group_component[c], T, atol=1e-9)
+    assert_joined(group, three)
+
+
+def test_threads_change_nothing(three) -> None:
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            (group,) = SPARSELY.join(three, [])
+        found.append([T.tobytes() for T in group.T_group_component.values()])
+    assert found[0] == found[1]
+
+
+def test_views_of_two_scenes_stay_apart(three, elsewhere) -> None:
+    both = [three[0], elsewhere]
+    groups = SPARSELY.join(both, [])
+    assert members(groups) == [[0], [1]]
+    assert all(not group.joins for group in groups)
+
+
+def test_a_stretch_of_another_scene_does_not_keep_the_others_apart(three, elsewhere) -> None:
+    path = [*PATH[:22], *PATH[4:14]]
+    parts = [three[0], elsewhere, stretch(2, range(22, 32), path)]
+    groups = SPARSELY.join(parts, [])
+    assert members(groups) == [[0, 2], [1]]
+    assert_joined(groups[0], parts, path)
+
+
+def test_the_largest_group_comes_first(elsewhere, three) -> None:
+    strange = stretch(0, range(4), **STRANGE)
+    groups = SPARSELY.join([strange, three[1], three[2]], [])
+    assert members(groups) == [[1, 2], [0]]
+    assert [group.frames for group in groups] == [20, 4]
+
+
+def test_a_wrong_link_is_outvoted_even_if_it_is_certain(three) -> None:
+    wrong = linked(three[0], three[1], off=se3.exp([0.8, 0, -0.5, 0, 0.5, 0]))
+    right = [
+        link_of(a, b, se3.inverse(PATH[a.index]) @ PATH[b.index], certain=False)
+        for a in three[0].views[1:]
+        for b in three[1].views[:3]
+    ]
+    groups = SPARSELY.join(three[:2], [wrong, *right])
+    assert members(groups) == [[0, 1]]
+    assert_joined(groups[0], three)
+    pairs = {(j.link.i, j.link.j): j.link for j in groups[0].joins}
+    assert all(link is not wrong for link in pairs.values())
+
+
+def test_two_certain_links_that_contradict_each_other_decide_nothing(three, monkeypatch) -> None:
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    wrong = linked(three[0], three[1], off=se3.exp([0.8, 0, -0.5, 0, 0.5, 0]))
+    right = linked(three[0], three[1])
+    assert members(SPARSELY.join(three[:2], [right])) == [[0, 1]]
+    assert members(SPARSELY.join(three[:2], [right, wrong])) == [[0], [1]]
+
+
+@pytest.mark.parametrize(
+    "off", [[0, 0, -0.5, 0, 0, 0], [0, 0, 0.5, 0, 0, 0], [0.4, 0, 0, 0, 0.3, 0]]
+)
+def test_a_link_that_free_space_contradicts_is_refused(three, off, monkeypatch) -> None:
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    wrong = linked(three[0], three[1], off=se3.exp(np.array(off)))
+    assert members(SPARSELY.join(three[:2], [wrong])) == [[0], [1]]
+
+
+def test_one_link_that_is_not_certain_needs_another_view_that_says_the_same(
+    three, elsewhere, monkeypatch
+) -> None:
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    (group,) = SPARSELY.join(three[:2], [linked(three[0], three[1], certain=False)])
+    assert_joined(group, three)
+    # Nothing else can be registered where the scene is another.
+    unlike = linked(three[0], elsewhere, certain=False)
+    assert members(SPARSELY.join([three[0], elsewhere], [unlike])) == [[0], [1]]
+
+
+def turned_back(late):
+    """A slow turn to the right, and a view from where it began, some time after its end."""
+    turn = [at(0.0, 0.2, 0.05 * k) for k in range(31)]
+    path = [*turn, *(at(0.0, 0.2, 0.05 * k) for k in range(8))]
+    before = stretch(0, range(31), path, every=5)
+    after = stretch(1, range(31, 39), path, late=late)
+    first, again = before.views[0], after.views[0]
+    return path, [before, after], link_of(first, again, np.eye(4))
+
+
+@pytest.mark.parametrize(("late", "joined"), [(0.0, False), (5.0, True)])
+def test_the_camera_must_have_been_able_to_get_there(late, joined, monkeypatch) -> None:
+    """It turned by 0.5 rad/s, and would have had to turn by 1.5 rad at once."""
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    path, parts, link = turned_back(late)
+    groups = SPARSELY.join(parts, [link])
+    assert members(groups) == ([[0, 1]] if joined else [[0], [1]])
+    if joined:
+        assert_joined(groups[0], parts, path)
+
+
+def test_between_recordings_no_motion_is_known(monkeypatch) -> None:
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    path, parts, link = turned_back(0.0)
+    (group,) = SPARSELY.join([parts[0], replace(parts[1], recording=1)], [link])
+    assert_joined(group, parts, path)
+
+
+BARE = {"boxes": (), "spots": 0, "dark": True}
+
+
+def along_a_wall(shake=0.0):
+    """A camera that goes along a bare wall, which no view can tell from any other place."""
+    rng = np.random.default_rng(4)
+    path = [
+        at(0.02 * k, 1.0, 0.0, pitch=0.0) @ se3.exp(shake * rng.standard_normal(6))
+        for k in range(24)
+    ]
+    return path, [stretch(0, range(10), path, **BARE), stretch(1, range(13, 24), path, **BARE)]
+
+
+def test_a_gap_in_a_steady_motion_is_bridged_and_says_so() -> None:
+    path, parts = along_a_wall()
+    (group,) = Joining(searches=0).join(parts, [])
+    assert_joined(group, parts, path)
+    assert group.bridged == {1}
+    assert (group.joined(0), group.joined(1)) == ("links", "motion")
+    (join,) = group.joins
+    assert (join.how, join.needed) == ("motion", True)
+    assert (join.link.i, join.link.j) == (9, 13)
+    assert not join.link.certain
+    assert np.linalg.eigvalsh(join.link.information).min() > 0
+
+
+def test_a_gap_is_not_bridged_where_the_motion_says_little() -> None:
+    _, parts = along_a_wall()
+    assert members(replace(SPARSELY, searches=0).join(parts, [])) == [[1], [0]]
+    _, restless = along_a_wall(shake=0.03)
+    assert members(Joining(searches=0).join(restless, [])) == [[1], [0]]
+    # Nor between recordings, nor over a long time.
+    apart = [parts[0], replace(parts[1], recording=1)]
+    assert members(Joining(searches=0).join(apart, [])) == [[1], [0]]
+
+
+def test_links_to_frames_without_a_pose_are_left_out(three) -> None:
+    stray = replace(linked(three[0], three[1]), j=999)
+    (group,) = SPARSELY.join(three[:2], [stray])
+    assert all(999 not in (join.link.i, join.link.j) for join in group.joins)
+
+
+def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
+    """As relocalization on the way finds them."""
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    a, b, c = three
+    searched, _ = searched_link(b.views[0].view, a.views[-1].view, Belief(), UsualFit())
+    aligned = aligned_link(c.views[0].view, b.views[-1].view, np.eye(4), UsualFit())
+    (group,) = SPARSELY.join(three, [searched, aligned])
+    assert_joined(group, three)
+
+
+@pytest.mark.parametrize(
+    "options", [{"searches": -1}, {"searches_per_frame": -0.1}, {"searches_per_frame": np.nan}]
+)
+def test_options_are_checked(options) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Joining(**options)
