@@ -249,9 +249,10 @@ def test_a_pixel_off_its_neighbours_plane_has_none():
 # --- albedo --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("falloff", [0.0, 4.0])
 @pytest.mark.parametrize("power", [0.0, 2.0])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_light_of_a_matte_plane_gives_one_albedo(power, camera):
+def test_light_of_a_matte_plane_gives_one_albedo(power, camera, falloff):
     rays = camera.rays().astype(float)
     w = plane_w(rays).astype(float)
     direction = np.concatenate([rays, np.ones((*w.shape, 1))], -1)
@@ -259,16 +260,14 @@ def test_light_of_a_matte_plane_gives_one_albedo(power, camera):
     cosine = (direction @ [A, B, C]) / length / np.linalg.norm([A, B, C])
     distance = length / w
     light = 0.4 * cosine / distance**power
-    if power:  # raw: natural vignetting is in it as well
-        light = light / length**4
-    light = light.astype(np.float32)
+    light = (light / length**falloff).astype(np.float32)
     planes = np.broadcast_to(np.float32([A, B, C, 0]), (*w.shape, 4)).copy()
     planes[..., 3] = w
     planes[3, 4] = 0
     light[5, 6] = 0
     light[5, 7] = np.nan
     out = np.zeros(w.shape, np.float32)
-    albedo_image(planes, camera.rays(), light, power > 0, True, out)
+    albedo_image(planes, camera.rays(), light, power > 0, True, falloff, out)
     holes = np.zeros(w.shape, bool)
     holes[[3, 5, 5], [4, 6, 7]] = True
     np.testing.assert_array_equal(np.isnan(out), holes)
@@ -281,7 +280,7 @@ def test_light_from_elsewhere_is_taken_as_it_is():
     planes[..., 3] = plane_w(rays)
     light = np.full(rays.shape[:2], 90, np.float32)
     out = np.zeros(light.shape, np.float32)
-    albedo_image(planes, rays, light, False, False, out)
+    albedo_image(planes, rays, light, False, False, 0.0, out)
     np.testing.assert_allclose(out, np.log(90), rtol=1e-6)
 
 
@@ -291,7 +290,7 @@ def test_a_surface_seen_along_itself_has_no_albedo():
     planes[..., 0], planes[..., 2] = 10.0, 1.0  # nearly contains the optical axis
     planes[..., 3] = np.maximum(plane_w(rays, 10, 0, 1), 0)
     out = np.zeros(rays.shape[:2], np.float32)
-    albedo_image(planes, rays, np.ones(out.shape, np.float32), False, True, out)
+    albedo_image(planes, rays, np.ones(out.shape, np.float32), False, True, 0.0, out)
     assert np.isnan(out[15, 20])
     assert np.isfinite(out[15, 39])
 

@@ -12,6 +12,7 @@ from scipy import ndimage
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.registration.view_points import landing_pixels
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -155,22 +156,3 @@ def _in_front(source: SurfaceMap, target: SurfaceMap, T_target_source: Float64) 
     image.ravel()[where[front]] = True
     opened: Bool = ndimage.binary_opening(image, np.ones((_WIDEST_EDGE,) * 2, bool))
     return float(np.count_nonzero(opened)) / compared
-
-
-def landing_pixels(view: SurfaceMap, points: Float64) -> NDArray[np.intp]:
-    """(N, 2) column and row of the pixels that points (N, 3) land on; -1 outside."""
-    lookup, (x0, y0, per_x, per_y) = view.projection.lookup, view.projection.frame
-    z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
-    a, b = (points[:, 0] / z - x0) * per_x, (points[:, 1] / z - y0) * per_y
-    rows, columns = lookup.shape[:2]
-    ok = (a >= 0) & (b >= 0) & (a < columns - 1) & (b < rows - 1)
-    a, b = np.where(ok, a, 0), np.where(ok, b, 0)
-    j, i = a.astype(np.intp), b.astype(np.intp)
-    f, g = (a - j)[:, None], (b - i)[:, None]
-    uv = (
-        lookup[i, j] * (1 - f) * (1 - g)
-        + lookup[i, j + 1] * f * (1 - g)
-        + lookup[i + 1, j] * (1 - f) * g
-        + lookup[i + 1, j + 1] * f * g
-    )
-    return np.where(ok[:, None], np.round(uv), -1).astype(np.intp)

@@ -262,14 +262,20 @@ def _add_row(w: Float32, rays: Float32, weight: Float32, above: Float64, below: 
 
 @kernel
 def albedo_image(
-    planes: Float32, rays: Float32, light: Float32, falls: bool, own_lamp: bool, out: Float32
+    planes: Float32,
+    rays: Float32,
+    light: Float32,
+    falls: bool,
+    own_lamp: bool,
+    falloff: float,
+    out: Float32,
 ) -> None:
     """Logarithm of the albedo, up to a constant: light * range^2 / cos(incidence).
 
-    Light `falls` with the square of the range, and with the fourth power of the cosine to the axis
-    (natural vignetting), unless the camera has compensated both. Without a lamp of its own a camera
-    sees surfaces as bright from any side, and the cosine is left out. NaN where there is no plane,
-    no light, or the surface is seen too slantwise.
+    Light `falls` with the square of the range unless that has been compensated, and with the power
+    `falloff` of the cosine to the axis. Without a lamp of its own a camera sees surfaces as bright
+    from any side, and the cosine of incidence is left out. NaN where there is no plane, no light,
+    or the surface is seen too slantwise.
     """
     rows, columns = light.shape
     one = np.float32(1)
@@ -290,9 +296,10 @@ def albedo_image(
             if cosine < np.float32(0.15):
                 continue
             shade = cosine if own_lamp else one
-            # The squared range, over the fourth power of the cosine to the axis.
-            apart = length2 * length2 * length2 / (v * v)
+            apart = length2 / (v * v)  # the squared range
             out[i, j] = np.log(light[i, j] / shade * (apart if falls else one))
+            if falloff != 0:
+                out[i, j] += np.float32(0.5 * falloff) * np.log(length2)
 
 
 @kernel

@@ -126,6 +126,9 @@ class SurfaceOptions:
         share of its squared spread.
     photo_radius
         Half width of the box that smooths the albedo, pixels.
+    falloff
+        Exponent of the cosine to the axis by which amplitude falls off towards the corners; None to
+        estimate it from the recording, 0 where there is none.
     smoothed
         What is different for views that have hardly any noise.
     """
@@ -140,6 +143,7 @@ class SurfaceOptions:
     fill: float = 0.7
     offset: float = 0.2
     photo_radius: int = 1
+    falloff: float | None = None
     smoothed: Smoothed = Smoothed()
 
     def __post_init__(self) -> None:
@@ -151,6 +155,8 @@ class SurfaceOptions:
         for name in ("edge_jump", "offset"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
+        if self.falloff is not None and not -20 <= self.falloff <= 20:
+            raise ValueError(f"falloff is {self.falloff}, not -20 to 20")
         if not 0 <= self.edge_sigmas < 1e3:
             raise ValueError(f"edge_sigmas is {self.edge_sigmas}, not 0 or more")
         if not 0 <= self.flatness <= 1:
@@ -396,7 +402,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         photo = np.full((rows, columns, 3), np.nan, np.float32)
         albedo = np.empty((rows, columns), np.float32)
         falls = lit and frame.amplitude_kind == "raw"
-        albedo_image(planes, rays, light, falls, lit, albedo)
+        albedo_image(planes, rays, light, falls, lit, options.falloff or 0.0, albedo)
         run_chunks(
             lambda a, b: smooth_and_slope(
                 albedo, planes, rays, options.photo_radius, 0.05, photo, a, b

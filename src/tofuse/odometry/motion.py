@@ -131,6 +131,10 @@ class Motion:
         self._velocity, self._interval = velocity, elapsed
         self._T, self._when = T, now
 
+    def jump(self, T: Float64, now: Moment) -> None:
+        """Take the pose of the next frame, but not the motion to it, which does not go on."""
+        self._T, self._when = T, now
+
     def interrupt(self) -> None:
         """Say that the camera may be anywhere by the next frame."""
         self._velocity = self._steady = self._T = self._when = None
@@ -167,8 +171,9 @@ def jumps(
         words = motion.surprise(T, now)
         if words:
             found.append((k, words))
-            motion.interrupt()  # from here the camera goes on as it will
-        motion.follow(T, now)
+            motion.jump(T, now)
+        else:
+            motion.follow(T, now)
     return found
 
 

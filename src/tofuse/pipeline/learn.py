@@ -11,8 +11,10 @@ from threadpoolctl import threadpool_limits
 from tofuse.filters.base import Filter
 from tofuse.filters.correction import Correction
 from tofuse.kernels.threads import threads as use_threads
+from tofuse.odometry.keyframes import Keyframes
 from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, check_views, kind_of
+from tofuse.pipeline.falloff import estimate_falloff
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.trial import Prepare, trial
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -30,7 +32,8 @@ def learnt(
 ) -> Config:
     """Return the configuration with what its corrections and filters learn from the recording.
 
-    Reads up to 30 frames, and only if a part learns at all. Corrections that are on trial are left
+    Reads up to 30 frames, and only if a part learns at all; and some more for the falloff of the
+    amplitude towards the corners. Corrections that are on trial are left
     out if views fit together worse with them (`trial`); that reads some tens more.
 
     Parameters
@@ -53,7 +56,20 @@ def learnt(
         for item in config.corrections:
             if item.on_trial:
                 config = _tried(config, item, recording, progress or Silent())
+        odometry = config.odometry
+        if isinstance(odometry, Keyframes) and odometry.surface.falloff is None:
+            falloff = 0.0
+            if _has_amplitude(recording):
+                falloff = estimate_falloff(recording, _prepared(config), odometry.surface)
+            surface = replace(odometry.surface, falloff=falloff)
+            config = replace(config, odometry=replace(odometry, surface=surface))
     return config
+
+
+def _has_amplitude(recording: Recording) -> bool:
+    """Whether its images come with amplitude; colour cameras compensate their vignetting."""
+    frame = recording.first_readable()
+    return isinstance(frame, RangeFrame) and frame.amplitude_image is not None
 
 
 def _taught(config: Config, recording: Recording) -> Config:
