@@ -50,6 +50,7 @@ class KeyframeTracker(Tracker):
         self._connected = True  # whether a certain link joins the component to an earlier one
         self._last: Keyframe | None = None  # the last frame of the component
         self._T_odometry: Float64 | None = None
+        self._in_sequence = False  # whether the frame just before has a pose in the component
 
     def prepare(self, frame: Frame) -> SurfaceMap | None:
         """See `Tracker.prepare`."""
@@ -65,10 +66,10 @@ class KeyframeTracker(Tracker):
             raise InputError("is a cloud; this tracker needs images", where=f"frame {frame.index}")
         self._relocalizer.count_frame()
         if surface is None and (reason := self._unfit(frame)):
-            return Step("lost", reason, None)
+            return self._lose(reason)
         view = surface_map(frame, self._options.surface) if surface is None else surface
         if np.count_nonzero(view.planes[..., 3] > 0) < self._options.minimum_points:
-            return Step("lost", "too few pixels have a surface", None)
+            return self._lose("too few pixels have a surface")
         now = Moment(frame.index, frame.timestamp)
         attempts = self._attempts(view, now, T_odometry)
         found = self._first_usual(attempts, now) or self._unrivalled(view, attempts, now)
@@ -80,7 +81,12 @@ class KeyframeTracker(Tracker):
         self._last = Keyframe(view, step.T_component_camera, self._component)
         self._motion.follow(step.T_component_camera, now)
         self._T_odometry = T_odometry
+        self._in_sequence = True
         return step
+
+    def _lose(self, reason: str) -> Step:
+        self._in_sequence = False
+        return Step("lost", reason, None)
 
     def expected(self, now: Moment) -> Float64 | None:
         """See `Tracker.expected`."""
@@ -89,7 +95,7 @@ class KeyframeTracker(Tracker):
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
         self._motion.interrupt()
-        self._last = None
+        self._last, self._in_sequence = None, False
 
     def _unfit(self, frame: RangeFrame) -> str:
         """Why nothing can be made of a frame; empty if something can."""
@@ -176,20 +182,15 @@ class KeyframeTracker(Tracker):
             return True
         if not attempt.aligned.converged or len(attempt.aligned.unobservable):
             return False
-        assert self._last is not None
-        k = attempt.keyframe
-        adjacent = k.view.index == self._last.view.index
-        link = self._relocalizer.link(attempt.view, k, self._usual, adjacent=adjacent)
-        if link is None or not link.certain:
-            return False
-        return not self._options.belief.search.differ(link.T_i_j, attempt.T_keyframe_camera)
+        k, T = attempt.keyframe, attempt.T_keyframe_camera
+        return self._agreement(attempt) > 0 and self._relocalizer.confirms(attempt.view, k, T)
 
     def _unrivalled(self, view: SurfaceMap, attempts: Attempts, now: Moment) -> Attempt | None:
         """The alignment that explains the view best, unless both images contradict even that.
 
         A poor fit is believed in sequence only, where the motion leads; never after a gap.
         """
-        if self._last is None or now.index - self._last.view.index > 1:
+        if self._last is None or not self._in_sequence:
             return None
         best, best_score = None, 0.0
         for attempt in (*self._with_segmentation(view, attempts), *attempts):
@@ -276,7 +277,7 @@ class KeyframeTracker(Tracker):
         """Start anew with a view that can't be connected, and look for where it may belong."""
         self._component += 1
         last = None if self._last is None else self._last.view.index
-        adjacent = last if last is not None and view.index - last == 1 else None
+        adjacent = last if self._in_sequence else None
         links = self._relocalizer.links(
             view, self._keyframes, self._component, self._usual, adjacent
         )

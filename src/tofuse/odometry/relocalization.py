@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
-from tofuse.registration.verification import Belief, Link, UsualFit, searched_link
+from tofuse.registration.search import Match, search
+from tofuse.registration.verification import Belief, Link, UsualFit, comparable, link_of
+
+Float64 = NDArray[np.float64]
 
 # A search costs about as much as tracking so many frames. With one search for so many frames, being
 # lost costs no more than tracking does; some are free, as short recordings may be all large steps.
@@ -25,7 +31,7 @@ class Relocalizer:
     def __init__(self, belief: Belief | None) -> None:
         self._belief = belief
         self._left = float(_FREE)
-        self._last: tuple[tuple[int, int], Link | None] | None = None  # what was searched last
+        self._last: tuple[tuple[int, int], Match | None] | None = None  # what was searched last
 
     def count_frame(self) -> None:
         """Say that a frame was processed, which adds to the budget."""
@@ -61,13 +67,30 @@ class Relocalizer:
     def link(
         self, view: SurfaceMap, keyframe: Keyframe, usual: UsualFit, *, adjacent: bool
     ) -> Link | None:
-        """Register a view to a keyframe, if the budget allows; the same pair is searched once."""
+        """Register a view to a keyframe, if the budget allows."""
+        match = self._match(view, keyframe)
+        if match is None or self._belief is None:
+            return None
+        return link_of(match, view, keyframe.view, self._belief, usual, adjacent=adjacent)[0]
+
+    def confirms(self, view: SurfaceMap, keyframe: Keyframe, T_keyframe_camera: Float64) -> bool:
+        """Whether a search finds nothing better than a pose (4, 4) that an alignment found.
+
+        Two methods that agree need not lead by much.
+        """
+        match = self._match(view, keyframe)
+        if match is None or self._belief is None:
+            return False
+        return not self._belief.search.differ(match.T_target_source, T_keyframe_camera)
+
+    def _match(self, view: SurfaceMap, keyframe: Keyframe) -> Match | None:
+        """Search a view in a keyframe, if the budget allows; the same pair is searched once."""
         pair = view.index, keyframe.view.index
         if self._last is not None and self._last[0] == pair:
             return self._last[1]
-        if self._belief is None or self._left < 1:
+        known = comparable(view.depth, keyframe.depth)
+        if self._belief is None or self._left < 1 or not known:
             return None
         self._left -= 1
-        link, _ = searched_link(view, keyframe.view, self._belief, usual, adjacent=adjacent)
-        self._last = pair, link
-        return link
+        self._last = pair, search(view, keyframe.view, self._belief.search)
+        return self._last[1]

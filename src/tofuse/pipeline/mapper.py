@@ -141,7 +141,9 @@ class Mapper:
         self, frame: Frame, history: Sequence[Frame] | None, prepared: Prepared | None
     ) -> Ready:
         with self.watch.timing("filters"):
-            expected = self._tracker.expected(Moment(frame.index, frame.timestamp))
+            expected = None
+            if self._log.entries and self._log.entries[-1].has_pose:
+                expected = self._tracker.expected(Moment(frame.index, frame.timestamp))
             return self._preparation.ready(frame, expected, history, prepared)
 
     def _track(self, ready: Ready, T_odometry: Float64 | None, repeated: bool) -> Step:

@@ -281,6 +281,19 @@ def searched_link(
     match = search(source, target, belief.search)
     if match is None:
         return None, "there are too few surfaces to search with"
+    return link_of(match, source, target, belief, usual, adjacent=adjacent)
+
+
+def link_of(
+    match: Match,
+    source: SurfaceMap,
+    target: SurfaceMap,
+    belief: Belief,
+    usual: UsualFit,
+    *,
+    adjacent: bool = False,
+) -> tuple[Link | None, str]:
+    """The link that a search of `source` in `target` gives; see `searched_link`."""
     objection = belief.objection(match, alone=False)
     if objection:
         return None, objection
