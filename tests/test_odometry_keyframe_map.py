@@ -126,15 +126,14 @@ def test_the_one_that_looks_most_alike_is_found(around) -> None:
 # The budget of searches
 
 
-def counted(monkeypatch, found=(None, "")):
-    """Searches that find the same each time; the frames that were asked for."""
+def counted(monkeypatch):
+    """Searches that find nothing; the frames that were asked for."""
     asked = []
 
-    def search(view, target, belief, usual, *, adjacent):
-        asked.append((view.index, target.index, adjacent))
-        return found
+    def search(view, target, options):
+        asked.append((view.index, target.index))
 
-    monkeypatch.setattr(relocalization, "searched_link", search)
+    monkeypatch.setattr(relocalization, "search", search)
     return asked
 
 
@@ -158,15 +157,15 @@ def test_the_newest_and_the_likest_keyframe_are_searched(around, monkeypatch) ->
     asked = counted(monkeypatch)
     lost = surface(seen(at(0, 0.3, 0.72), 7))
     assert Relocalizer(Belief()).links(lost, keyframes, 2, UsualFit(), 5) == ()
-    assert asked == [(7, 5, True), (7, 1, False)]
+    assert asked == [(7, 5), (7, 1)]
     # Not in its own component, and each once.
     asked.clear()
     Relocalizer(Belief()).links(lost, keyframes, 1, UsualFit())
-    assert [j for _, j, _ in asked] == [1]
+    assert [j for _, j in asked] == [1]
     asked.clear()
     last = surface(seen(at(0, 0.3, 3.52), 7))
     Relocalizer(Belief()).links(last, keyframes, 2, UsualFit())
-    assert [j for _, j, _ in asked] == [5]
+    assert [j for _, j in asked] == [5]
 
 
 def test_without_belief_nothing_is_searched(around, monkeypatch) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,12 +76,14 @@ class Relocalizer:
         return link_of(match, view, keyframe.view, self._belief, usual, adjacent=adjacent)[0]
 
     def confirms(self, view: SurfaceMap, keyframe: Keyframe, T_keyframe_camera: Float64) -> bool:
-        """Whether a search finds nothing better than a pose (4, 4) that an alignment found.
+        """Whether a search finds the pose (4, 4) that an alignment found.
 
-        Two methods that agree need not lead by much.
+        Two methods that agree need not lead by any margin, but both images must support the pose.
         """
         match = self._match(view, keyframe)
         if match is None or self._belief is None:
+            return False
+        if replace(self._belief, margin=0.0).objection(match, alone=False):
             return False
         return not self._belief.search.differ(match.T_target_source, T_keyframe_camera)
 
