@@ -51,12 +51,12 @@ def thesis(kind: ViewKind) -> Config:
 
 
 def default(kind: ViewKind) -> Config:
-    """Return what `tofuse run` does unless told otherwise.
+    """Return what `tofuse run` does unless another method is asked for.
 
-    Range images are told their noise, lose the light that came by way of other surfaces, and are
-    aligned with keyframes, by planes and albedo; only what goes into the model is filtered, and
-    only loops given by hand are closed. Clouds are registered from coarse to fine, and moved to
-    the planes that all of them share.
+    Range images get their noise model and lose multipath, as far as that helps, and are aligned
+    with keyframes by planes and albedo; only what goes into the model is filtered further. Places
+    that are seen again close loops, and all views are refined together. Clouds are registered from
+    coarse to fine, and moved to the planes that all of them share.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
