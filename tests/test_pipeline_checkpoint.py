@@ -72,7 +72,9 @@ def turned_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_stopped_anywhere_goes_on(room_recording: Path, monkeypatch) -> None:
     recording = tofuse.open(room_recording).select(every=2)
     kept_as_it_is = [{"part": "noise"}, {"part": "multipath", "trial": False}]
-    config = changed(from_method("default"), {"corrections": kept_as_it_is}, where="test")
+    known = {"surface": {"falloff": 0.0}}  # which is not looked for then
+    changes = {"corrections": kept_as_it_is, "odometry": known}
+    config = changed(from_method("default"), changes, where="test")
     never = Kept(0)
     whole = reconstruct.reconstruct(recording, config, seed=3, stages=never)
     assert never.saved == ["tracking"] * 4 + ["joining", "loops", "refinement", "fusion"]

@@ -59,7 +59,7 @@ def test_compensation_stays_where_there_is_indirect_light() -> None:
 def test_what_is_given_or_asked_for_is_not_tried(straight: Recording) -> None:
     for part in (Multipath(gain=3000.0), Multipath(trial=False)):
         config = replace(from_method("default"), corrections=(part,))
-        assert learnt(config, straight, 1) == config
+        assert learnt(config, straight, 1).corrections == config.corrections
 
 
 def bent(by: float) -> object:
