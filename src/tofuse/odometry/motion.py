@@ -46,9 +46,8 @@ class Moment:
 
     def since(self, before: Moment) -> float:
         """Time since another frame, in s, or in frames where only these were counted; above 0."""
-        if (self.is_timed or before.is_timed) and self.timestamp > before.timestamp:
-            return self.timestamp - before.timestamp
-        return float(max(self.index - before.index, 1))
+        seconds = self.seconds_since(before)
+        return float(max(self.index - before.index, 1)) if seconds is None else seconds
 
     def seconds_since(self, before: Moment) -> float | None:
         """Time since another frame in s; None where only frames were counted."""
