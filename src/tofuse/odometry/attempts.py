@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe
-from tofuse.registration.projective import Aligned, ProjectiveOptions, Target, align
+from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.verification import PATIENT, Assessment, UsualFit
 
 Float64 = NDArray[np.float64]
 
 # A turn must explain more than standing still does: a flat wall fits any.
 CLEARLY = 1.03
+# What is nearly aligned needs a few more iterations, at the resolution of tracking.
+SETTLING = (Level(4, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +127,7 @@ class Attempts:
         """The attempt after as many iterations as it takes: few do for small motions alone."""
         if attempt.aligned.converged:
             return attempt
-        patient = replace(self._options, levels=PATIENT)
+        patient = replace(self._options, levels=SETTLING)
         T = attempt.T_component_camera
         kept = T if self._steady is None or not attempt.predicted else self._steady
         aligned = align(

@@ -150,14 +150,19 @@ class KeyframeTracker(Tracker):
     def _first_usual(self, attempts: Attempts, now: Moment) -> Attempt | None:
         """The first alignment that fits as usual, and that the camera's motion allows.
 
-        While it is not known what is usual for the camera, both images must agree as well.
+        While it is not known what is usual for the camera, both images must agree as well. So they
+        must where a fit is only noisier than usual: a view farther from the keyframe shares less of
+        its systematic errors, and a chain of nearer references would drift.
         """
         for attempt in attempts:
-            if not attempt.assessment.usual or self._is_surprising(attempt, now):
+            usual = attempt.assessment.usual
+            if not usual and (attempt.assessment.conflict or not attempt.predicted):
+                continue
+            if self._is_surprising(attempt, now):
                 continue
             if not attempt.predicted and not self._is_verified(attempt):
                 continue
-            if self._usual.is_known or self._agreement(attempt) > 0:
+            if (usual and self._usual.is_known) or self._agreement(attempt) > 0:
                 return attempt
         return None
 

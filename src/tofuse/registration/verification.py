@@ -42,6 +42,8 @@ _NO_CONFLICT = 2.0
 # However alike the views of a recording, the next one may be of another kind.
 _LEAST_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
 _WINDOW = 200
+# Once a camera is known, what is usual is computed anew after so many alignments.
+_RELEARN_EVERY = 10
 _MEDIAN_OF_NORMAL = 0.6745
 # Six unknowns, and neighbouring pixels that share their noise.
 _LEAST_INLIERS = 40
@@ -88,6 +90,7 @@ class UsualFit:
         self._seen: deque[Float64] = deque(maxlen=_WINDOW)
         self._mean, self._sigma = _PRIOR_MEAN, _PRIOR_SIGMA
         self._rms: deque[float] = deque(maxlen=_WINDOW)
+        self._count = 0
 
     @property
     def noise_scale(self) -> float:
@@ -114,6 +117,11 @@ class UsualFit:
         self._seen.append(_statistics(aligned))
         if np.isfinite(aligned.rms_m) and depth > 0:
             self._rms.append(aligned.rms_m / depth)
+        self._count += 1
+        if self._count <= 2 * _KNOWN or self._count % _RELEARN_EVERY == 0:
+            self._update()
+
+    def _update(self) -> None:
         seen = np.stack(self._seen)
         mean, sigma = _PRIOR_MEAN.copy(), _PRIOR_SIGMA.copy()
         for k in range(len(_NAMES)):
