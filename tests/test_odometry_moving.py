@@ -14,7 +14,13 @@ from tofuse.kernels import moving as kernels
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.odometry.moving import MovingObjects, MovingOptions, _robust_scale, without_pixels
+from tofuse.odometry.moving import (
+    Moving,
+    MovingObjects,
+    MovingOptions,
+    _robust_scale,
+    without_pixels,
+)
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import agreement
@@ -26,6 +32,13 @@ from tofuse.simulation.scene import FRAME_RATE_HZ, build
 
 FRAMES = 18
 NEAR = 1.3  # m
+
+
+def followed(objects: MovingObjects, *pair: object) -> Moving:
+    """Compare a view with a reference, and keep what came of it."""
+    moving = objects.compare(*pair)
+    objects.learn(moving)
+    return moving
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +103,9 @@ def segment(frames, poses, options=None):
     objects, key, found = MovingObjects(options), 0, []
     for n in range(1, len(frames)):
         predicted = objects.predicted_mask(poses[n], views[n])
-        found.append((key, predicted, objects.update(views[n], poses[n], views[key], poses[key])))
+        found.append(
+            (key, predicted, followed(objects, views[n], poses[n], views[key], poses[key]))
+        )
         distance, angle = distance_and_angle(poses[key], poses[n])
         if angle > 0.2 or distance > 0.1 * views[key].depth:
             key = n
@@ -172,7 +187,7 @@ def test_an_object_that_stops_becomes_static(room):
     views = [surface_map(frame, SurfaceOptions()) for frame in made]
     objects = MovingObjects()
     fractions = [
-        objects.update(views[n], poses[n], views[0 if n < 12 else 11], poses[0]).fraction
+        followed(objects, views[n], poses[n], views[0 if n < 12 else 11], poses[0]).fraction
         for n in range(1, 40)
     ]
     assert fractions[9] > 0.1
@@ -189,7 +204,7 @@ def test_leaving_out_what_moves_keeps_the_pose(room):
     views = [surface_map(frame, SurfaceOptions()) for frame in made]
     objects, n = MovingObjects(), 6
     for k in range(1, n):
-        objects.update(views[k], poses[k], views[0], poses[0])
+        followed(objects, views[k], poses[k], views[0], poses[0])
     mask = objects.predicted_mask(poses[n], views[n])
     whole, rest = (
         align(view, [Target(target, np.eye(4))], poses[n], ProjectiveOptions())
@@ -220,7 +235,7 @@ def test_a_wrong_pose_is_no_motion(room, metres, degrees):
     objects = MovingObjects()
     for n in range(1, 13):
         key = 0 if n < 7 else 6
-        moving = objects.update(views[n], wrong[n], views[key], wrong[key])
+        moving = followed(objects, views[n], wrong[n], views[key], wrong[key])
         if n >= 10:
             assert moving.fraction < 0.05
             assert moving.scale_ratio > 1.5 or moving.agreement < 0.8
@@ -232,9 +247,9 @@ def test_nothing_is_learnt_from_a_pair_that_disagrees():
     ]
     objects = MovingObjects()
     still = np.eye(4)
-    assert objects.update(views[1], still, views[0], still).reliable
+    assert followed(objects, views[1], still, views[0], still).reliable
     for _ in range(3):
-        moving = objects.update(views[2], still, views[0], still)
+        moving = followed(objects, views[2], still, views[0], still)
         assert not moving.reliable
         assert moving.fraction == 0
         assert moving.agreement == 0
@@ -249,9 +264,9 @@ def test_a_pose_can_be_tried_without_learning_from_it(room):
     tried, untried = MovingObjects(), MovingObjects()
     for n in range(1, 9):
         pair = views[n], poses[n], views[0], poses[0]
-        wrong = tried.update(views[n], poses[n] @ off, views[0], poses[0], learn=False)
-        before = tried.update(*pair, learn=False)
-        one, two = tried.update(*pair), untried.update(*pair)
+        wrong = tried.compare(views[n], poses[n] @ off, views[0], poses[0])
+        before = tried.compare(*pair)
+        one, two = followed(tried, *pair), followed(untried, *pair)
         np.testing.assert_array_equal(one.view, two.view)
         np.testing.assert_array_equal(one.reference, two.reference)
         np.testing.assert_array_equal(one.view, before.view)
@@ -266,11 +281,11 @@ def test_keyframes_keep_what_was_learnt_and_are_forgotten_when_there_are_too_man
     views = [surface_map(frame, SurfaceOptions()) for frame in made]
     objects = MovingObjects(MovingOptions(keyframes=1))
     for n in range(1, 9):
-        moving = objects.update(views[n], poses[n], views[0], poses[0])
+        moving = followed(objects, views[n], poses[n], views[0], poses[0])
     np.testing.assert_array_equal(objects.reference_mask(views[0]), moving.reference)
     np.testing.assert_array_equal(objects.reference_mask(views[8]), moving.view)
     assert objects.reference_mask(views[8]).any()
-    objects.update(views[9], poses[9], views[8], poses[8])
+    followed(objects, views[9], poses[9], views[8], poses[8])
     assert not objects.reference_mask(views[0]).any()
     assert objects.reference_mask(views[8]).any()
     objects.reset()
@@ -534,7 +549,7 @@ def test_a_person_who_turns_before_a_still_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
     views = [surface_map(frame, SurfaceOptions()) for frame in frames]
     objects, still = MovingObjects(), np.eye(4)
-    found = [objects.update(view, still, views[0], still) for view in views[1:]]
+    found = [followed(objects, view, still, views[0], still) for view in views[1:]]
     # The person is what is nearer than the wall.
     person = views[-1].z < 0.5 * views[-1].z.max()
     person &= views[-1].planes[..., 3] > 0
@@ -554,6 +569,6 @@ def test_a_static_kitchen_does_not_move(shared_data):
         T.append(align(views[k], [target], T[-1], ProjectiveOptions()).T_world_source)
     objects = MovingObjects()
     for k in range(1, len(views)):
-        moving = objects.update(views[k], T[k], views[0], T[0])
+        moving = followed(objects, views[k], T[k], views[0], T[0])
         assert moving.fraction < 0.01
         assert moving.agreement > 0.95

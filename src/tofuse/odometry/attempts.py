@@ -82,6 +82,11 @@ class Attempts:
         stay. None where nothing is expected.
     T_last
         (4, 4) where the camera was.
+
+    Attributes
+    ----------
+    segmented
+        The same alignments without what moves by itself, of those of which they were made.
     """
 
     def __init__(
@@ -94,12 +99,12 @@ class Attempts:
         options: ProjectiveOptions,
         usual: UsualFit,
     ) -> None:
-        self._view = view
-        self.expected, self.references = expected, references
+        self.view, self.expected, self.references = view, expected, references
         self._steady, self._T_last = steady, T_last
         self._options, self._usual = options, usual
         self._coming = self._make()
         self._made: list[Attempt] = []
+        self.segmented: dict[Attempt, tuple[Attempt, ...]] = {}
 
     def __iter__(self) -> Iterator[Attempt]:
         yield from self._made
@@ -144,7 +149,7 @@ class Attempts:
         return made if aligned.score >= attempt.aligned.score else attempt
 
     def _make(self) -> Iterator[Attempt]:
-        expected, view = self.expected, self._view
+        expected, view = self.expected, self.view
         if expected is not None:
             kept = expected if self._steady is None else self._steady
             for r in self.references:
@@ -170,7 +175,7 @@ class Attempts:
 
     def _turned(self, reference: Reference) -> tuple[Aligned, str]:
         """Align from where the camera was, or from the turn of it that fits best."""
-        view, target, scale = self._view, [reference.target], self._usual.noise_scale
+        view, target, scale = self.view, [reference.target], self._usual.noise_scale
         coarse = replace(self._options, levels=PATIENT[:1])
         motions = _turns(view)
         still, *turned = [

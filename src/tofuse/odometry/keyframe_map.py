@@ -24,11 +24,12 @@ _SHIFT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A view with its pose in the frame of its component."""
+    """A view with its pose in the frame of its component; doubtful if it fitted unusually badly."""
 
     view: SurfaceMap
     T_component_camera: Float64
     component: int
+    doubtful: bool = False
 
     @property
     def depth(self) -> float:

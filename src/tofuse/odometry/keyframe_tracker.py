@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, surface_map
-from tofuse.odometry.attempts import CLEARLY, Attempt, Attempts, Reference
+from tofuse.odometry.attempts import Attempt, Attempts, Reference
 from tofuse.odometry.base import Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.keyframes import Keyframes
@@ -23,7 +22,7 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registration
 from tofuse.registration.projective import UNITS, Target
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import Link, UsualFit, comparable, self_scaled
+from tofuse.registration.verification import Link, UsualFit, comparable, finely_scaled, self_scaled
 
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -31,6 +30,9 @@ Float64 = NDArray[np.float64]
 # Moving objects are looked for in every n-th frame, and wherever something indicates them: what
 # fits worse than usual, so many points in free space, or objects in the frame before.
 _LOOK_EVERY, _IN_FRONT = 4, 0.005
+# Between rival poses, what a deviation from the usual motion costs, as a fraction of the points:
+# little, as where a scene determines the pose a wrong one loses more.
+_MOTION = 0.05
 # Fraction of a view that moves, from which the rest is aligned once more, and which is reported.
 _NOTICED = 0.01
 
@@ -72,13 +74,13 @@ class KeyframeTracker(Tracker):
             return self._lose("too few pixels have a surface")
         now = Moment(frame.index, frame.timestamp)
         attempts = self._attempts(view, now, T_odometry)
-        found = self._first_usual(attempts, now) or self._unrivalled(view, attempts, now)
+        found = self._first_usual(view, attempts, now) or self._unrivalled(view, attempts, now)
         if found is None:
             step = self._begin_component(view, attempts)
         else:
             step = self._continue_component(frame, view, found, attempts)
         assert step.T_component_camera is not None
-        self._last = Keyframe(view, step.T_component_camera, self._component)
+        self._last = Keyframe(view, step.T_component_camera, self._component, step.doubtful)
         self._motion.follow(step.T_component_camera, now)
         self._T_odometry = T_odometry
         self._in_sequence = True
@@ -147,24 +149,53 @@ class KeyframeTracker(Tracker):
             return None
         return np.asarray(last.T_component_camera @ se3.inverse(before) @ T_odometry, np.float64)
 
-    def _first_usual(self, attempts: Attempts, now: Moment) -> Attempt | None:
+    def _first_usual(self, view: SurfaceMap, attempts: Attempts, now: Moment) -> Attempt | None:
         """The first alignment that fits as usual, and that the camera's motion allows.
 
         While it is not known what is usual for the camera, both images must agree as well. So they
         must where a fit is only noisier than usual: a view farther from the keyframe shares less of
-        its systematic errors, and a chain of nearer references would drift.
+        its systematic errors, and a chain of nearer references would drift. Where a reference
+        contradicts, what moves by itself may explain it; else another pose must explain all
+        references better: an alignment with the last frame may follow what moves since then.
         """
+        rival = -np.inf
         for attempt in attempts:
-            usual = attempt.assessment.usual
-            if not usual and (attempt.assessment.conflict or not attempt.predicted):
-                continue
+            usual, predicted = attempt.assessment.usual, attempt.predicted
             if self._is_surprising(attempt, now):
                 continue
-            if not attempt.predicted and not self._is_verified(attempt):
+            if not usual and (attempt.assessment.conflict or not predicted):
+                if predicted:
+                    for again in self._with_segmentation(view, attempt, attempts):
+                        if again.assessment.usual and not self._is_surprising(again, now):
+                            return again
+                    rival = max(rival, self._explained(attempt, attempts, now))
+                continue
+            if not predicted and not self._is_verified(attempt):
+                continue
+            if np.isfinite(rival) and self._explained(attempt, attempts, now) <= rival:
                 continue
             if (usual and self._usual.is_known) or self._agreement(attempt) > 0:
                 return attempt
         return None
+
+    def _explained(self, attempt: Attempt, attempts: Attempts, now: Moment) -> float:
+        """How well a pose explains the view beside all references, and the camera's motion.
+
+        A doubtful reference is no witness, unless there is no other: its own pose may follow what
+        moves by itself.
+        """
+        T, compare = attempt.T_component_camera, finely_scaled(self._usual)
+        references = [
+            attempt.reference if r.keyframe is attempt.keyframe else r for r in attempts.references
+        ]
+        sure = [r for r in references if not r.keyframe.doubtful] or references
+        fits = np.mean(
+            [
+                agreement(attempt.view, r.target.view, r.target.T_target_world @ T, compare).score
+                for r in sure
+            ]
+        )
+        return float(fits - _MOTION * np.log1p(self._motion.deviation(T, now) ** 2))
 
     def _agreement(self, attempt: Attempt) -> float:
         """Support less contradiction, of both images, for an alignment."""
@@ -197,45 +228,46 @@ class KeyframeTracker(Tracker):
         """
         if self._last is None or not self._in_sequence:
             return None
-        best, best_score = None, 0.0
-        for attempt in (*self._with_segmentation(view, attempts), *attempts):
+        best, best_score = None, -np.inf
+        made = list(attempts)
+        segmented = [a for m in made for a in self._with_segmentation(view, m, attempts)]
+        for attempt in (*segmented, *made):
             if not np.isfinite(attempt.aligned.rms_m) or self._is_surprising(attempt, now):
                 continue
             if not (attempt.predicted or self._is_small(attempt)):
                 continue
-            if attempt.assessment.usual:
-                return attempt
             if attempt.assessment.conflict and len(attempt.aligned.unobservable):
                 continue  # the motion model, on which it relies, explains the view badly
-            score = self._agreement(attempt)
-            # Of equals the likeliest, which comes first.
-            if score > CLEARLY * best_score:
+            if self._agreement(attempt) <= 0:
+                continue
+            score = self._explained(attempt, attempts, now)
+            if score > best_score:
                 best, best_score = attempt, score
         return best
 
-    def _with_segmentation(self, view: SurfaceMap, attempts: Attempts) -> Iterator[Attempt]:
-        """Alignments without what moves by itself, if the camera is where motion or a fit has it.
+    def _with_segmentation(
+        self, view: SurfaceMap, attempt: Attempt, attempts: Attempts
+    ) -> tuple[Attempt, ...]:
+        """The same alignment without what moves by itself, if it ended where the camera is.
 
         What moves may fill so much of the view that the alignment follows it: then the prediction
         is the better guess.
         """
-        poses = [(attempts.expected, r, True) for r in attempts.references[:1]]
-        made = list(attempts)
-        for T, r, predicted in [
-            *poses,
-            *((a.T_component_camera, a.reference, a.predicted) for a in made),
-        ]:
-            if T is None:
-                continue
-            moving = self._segment(view, T, r.keyframe, learn=False)
-            if moving.reliable and moving.fraction > _NOTICED:
-                yield self._without_moving(view, T, r.keyframe, moving, attempts, predicted)
+        if attempt not in attempts.segmented:
+            k, predicted = attempt.keyframe, attempt.predicted
+            poses = [attempt.T_component_camera]
+            if predicted and attempts.expected is not None:
+                poses.insert(0, attempts.expected)
+            found = []
+            for T in poses:
+                moving = self._segment(view, T, k)
+                if moving.reliable and moving.fraction > _NOTICED:
+                    found.append(self._without_moving(view, T, k, moving, attempts, predicted))
+            attempts.segmented[attempt] = tuple(found)
+        return attempts.segmented[attempt]
 
-    def _segment(
-        self, view: SurfaceMap, T: Float64, keyframe: Keyframe, *, learn: bool = True
-    ) -> Moving:
-        k = keyframe
-        return self._moving.update(view, T, k.view, k.T_component_camera, learn=learn)
+    def _segment(self, view: SurfaceMap, T: Float64, keyframe: Keyframe) -> Moving:
+        return self._moving.compare(view, T, keyframe.view, keyframe.T_component_camera)
 
     def _without_moving(
         self,
@@ -259,6 +291,7 @@ class KeyframeTracker(Tracker):
         a = found.aligned
         look = (
             self._moved
+            or found.view is not attempts.view
             or not found.assessment.usual
             or a.in_front > _IN_FRONT * a.compared
             or view.index % _LOOK_EVERY == 0
@@ -275,6 +308,7 @@ class KeyframeTracker(Tracker):
             if again.assessment.usual or not found.assessment.usual:
                 found = again
                 moving = self._segment(view, again.T_component_camera, k)
+        self._moving.learn(moving)
         self._moved = moving.fraction > 0
         return found, moving
 
@@ -319,7 +353,8 @@ class KeyframeTracker(Tracker):
             if not self._connected:
                 links = self._relocalizer.links(view, self._keyframes, self._component, self._usual)
                 self._connected = any(link.certain for link in links)
-            self._keyframes.add(Keyframe(view, T, self._component))
+            doubtful = not found.assessment.usual
+            self._keyframes.add(Keyframe(view, T, self._component, doubtful))
         mask = None
         if moving is not None and moving.fraction > _NOTICED:
             mask = _at_size(moving.view, frame)

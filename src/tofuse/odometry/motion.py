@@ -26,6 +26,8 @@ FLOOR = np.array([0.06, np.radians(4.0)])
 _SECONDS, _FARTHEST = 0.2, 10.0
 # Over that, so many times the largest of so many recent differences.
 _TIMES, _RECENT = 2.0, 4
+# Differences of a tripod are the tracker's noise: m and rad.
+_STILL = np.array([0.003, np.radians(0.2)])
 # Share of the newest motion in the running mean.
 _NEWEST = 0.3
 # After so many frames without a pose, of which no time is known, the camera can be anywhere.
@@ -109,6 +111,17 @@ class Motion:
             f"{difference[0]:.2f} m and {np.degrees(difference[1]):.0f} degrees from the predicted "
             "pose"
         )
+
+    def deviation(self, T: Float64, now: Moment) -> float:
+        """Distance of a pose from the expected one, in multiples of what recent ones had.
+
+        0 where nothing is expected.
+        """
+        expected = self.expected(now)
+        if expected is None or not self._differences:
+            return 0.0
+        usual = np.maximum(np.max(self._differences, axis=0), _STILL)
+        return float(np.max(_apart(expected, T) / usual))
 
     def follow(self, T: Float64, now: Moment) -> None:
         """Take the pose of the next frame."""

@@ -136,6 +136,39 @@ class MovingOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class _Cells:
+    """What is known of the cells of a view: (rows, columns) each.
+
+    `depth` m, 0 unknown; `odds` log-odds of motion; `moving` the segmentation; `tracked` 1 where
+    the surface was seen to agree with a reference, and was followed since then.
+    """
+
+    depth: Float32
+    odds: Float32
+    moving: Bool
+    tracked: UInt8
+
+
+@dataclass(frozen=True, eq=False)
+class _Last:
+    """The view before: where it was, and its cells."""
+
+    view: SurfaceMap
+    T_world_camera: Float64
+    cells: _Cells
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """What a pair of views shows of the cells of both, and the scale of its residuals."""
+
+    last: _Last
+    reference: int
+    cells: _Cells
+    scale: float | None
+
+
+@dataclass(frozen=True, eq=False)
 class Moving:
     """What moved in a pair of views, and how well the rest of them agrees.
 
@@ -165,6 +198,8 @@ class Moving:
     reliable
         Whether the pair agreed enough for its disagreements to be counted as motion. If not, the
         masks are those of earlier frames, carried along.
+    learnt
+        What `MovingObjects.learn` keeps.
     """
 
     view: Bool
@@ -177,6 +212,7 @@ class Moving:
     scale_ratio: float
     segments: int
     reliable: bool
+    learnt: Learnt
 
     def applied(self, view: SurfaceMap) -> SurfaceMap:
         """Return the view without its pixels that moved."""
@@ -218,37 +254,14 @@ def without_pixels(view: SurfaceMap, mask: Bool) -> SurfaceMap:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """What is known of the cells of a view: (rows, columns) each.
-
-    `depth` m, 0 unknown; `odds` log-odds of motion; `moving` the segmentation; `tracked` 1 where
-    the surface was seen to agree with a reference, and was followed since then.
-    """
-
-    depth: Float32
-    odds: Float32
-    moving: Bool
-    tracked: UInt8
-
-
-@dataclass(frozen=True, eq=False)
-class _Last:
-    """The view before: where it was, and its cells."""
-
-    view: SurfaceMap
-    T_world_camera: Float64
-    cells: _Cells
-
-
 class MovingObjects:
     """Segments what moves by itself, from views whose poses relative to keyframes are known.
 
     Before a view is aligned, leave `predicted_mask` out of it and `reference_mask` out of the
-    keyframe; afterwards call `update`. Where its masks have grown much beyond those (something just
-    began to move), align once more without them: they are right before the pose is. `update` itself
-    takes whole views. References are recognised by their `SurfaceMap.index`; one that was the last
-    view updated keeps what was learnt of it.
+    keyframe; afterwards `compare` both, and `learn` the outcome. Where the masks have grown much
+    beyond those (something just began to move), align once more without them before: they are right
+    before the pose is. `compare` takes whole views. References are recognised by their `SurfaceMap.index`; one that was the last
+    view learnt keeps what was learnt of it.
     """
 
     def __init__(self, options: MovingOptions | None = None) -> None:
@@ -293,16 +306,14 @@ class MovingObjects:
             self._reference(reference).moving, reference.z.shape, self._stride(reference)
         )
 
-    def update(
+    def compare(
         self,
         view: SurfaceMap,
         T_world_camera: Float64,
         reference: SurfaceMap,
         T_world_reference: Float64,
-        *,
-        learn: bool = True,
     ) -> Moving:
-        """Segment a view that was aligned with a keyframe, and the keyframe.
+        """Segment a view that was aligned with a keyframe, and the keyframe; nothing is kept.
 
         Parameters
         ----------
@@ -310,9 +321,6 @@ class MovingObjects:
             The view and its (4, 4) pose.
         reference, T_world_reference
             The keyframe and its (4, 4) pose.
-        learn
-            Whether the outcome is kept. A tracker that has several poses for a view, or doubts the
-            one it has, compares what would come of them without.
         """
         options = self.options
         now, arrived = self._carried(view, T_world_camera)
@@ -344,12 +352,6 @@ class MovingObjects:
             evidence, evidence_then = now.odds, then.odds
         now, segments = self._segmented(replace(now, tracked=tracked), evidence)
         then, _ = self._segmented(then, evidence_then)
-        if learn:
-            self._last = _Last(view, T_world_camera, now)
-            self._remember(reference.index, then)
-            if reliable:
-                self._scales.append(scale)
-
         rest = _counts(seen, now.moving) + _counts(met, then.moving)
         everything = _counts(seen, None) + _counts(met, None)
         mask = _pixels(now.moving, view.z.shape, self._stride(view))
@@ -365,7 +367,21 @@ class MovingObjects:
             scale_ratio=scale / max(typical, 1e-6),
             segments=segments,
             reliable=reliable,
+            learnt=Learnt(
+                _Last(view, T_world_camera, now),
+                reference.index,
+                then,
+                scale if reliable else None,
+            ),
         )
+
+    def learn(self, moving: Moving) -> None:
+        """Keep what `compare` found, of the pose that turned out to be the right one."""
+        learnt = moving.learnt
+        self._last = learnt.last
+        self._remember(learnt.reference, learnt.cells)
+        if learnt.scale is not None:
+            self._scales.append(learnt.scale)
 
     @property
     def _max_evidence(self) -> float:

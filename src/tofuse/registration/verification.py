@@ -397,6 +397,14 @@ def self_scaled(usual: UsualFit) -> AgreementOptions:
     )
 
 
+def finely_scaled(usual: UsualFit) -> AgreementOptions:
+    """How rival poses for one image are compared: errors beyond the usual ones tell them apart."""
+    coarse = self_scaled(usual)
+    if not usual.is_known:
+        return coarse
+    return replace(coarse, floor_m=0.0, floor_share=_NO_CONFLICT * usual.rms_share)
+
+
 # From one place no view is so many times deeper than another of the same scene.
 _RESCALED = 4.0
 
