@@ -512,30 +512,40 @@ def test_carry_and_predict_are_their_twins():
     there = np.where(ok, before[i, j], 0)
     apart = np.maximum(tolerance * here, 4 * np.sqrt(variance))
     same = (there > 0) & (np.abs(here - there) <= apart)
+    # What moved with the camera is where it was in the image.
+    moved = odds_before > 2
+    _, _, own_i, own_j, on_ray = projected(camera, view, depth, np.eye(4), STRIDE)
+    own_i, own_j = own_i // STRIDE, own_j // STRIDE
+    along_ray = np.abs(before[own_i, own_j] - depth) <= tolerance * depth
+    with_camera = ok & ~same & on_ray & moved[own_i, own_j] & along_ray
+    odds = np.where(same, odds_before[i, j], np.float32(prior))
+    odds = np.where(with_camera, odds_before[own_i, own_j], odds)
     out = [np.empty(before.shape, t) for t in (np.float32, np.float32, np.uint8, np.bool_)]
     grid = other.projection
     for start, stop in ((0, 5), (5, 18)):
         kernels.carry(
             view.rays, view.z, view.sigma, view.planes, view.plane_variance, STRIDE, before,
-            odds_before, tracked_before, STRIDE, other.z.shape, grid.lookup, grid.frame, T,
+            odds_before, moved, tracked_before, STRIDE, other.z.shape, grid.lookup, grid.frame, T,
             tolerance, prior, *out, start, stop,
         )  # fmt: skip
     np.testing.assert_allclose(out[0], depth, rtol=1e-6)
-    np.testing.assert_array_equal(out[1], np.where(same, odds_before[i, j], np.float32(prior)))
+    assert with_camera.any()
+    np.testing.assert_array_equal(out[1], odds)
     np.testing.assert_array_equal(out[2], np.where(same, tracked_before[i, j], 0))
     np.testing.assert_array_equal(out[3], there > here + apart)
     assert out[3].any()
 
-    moved = odds_before > 2
     raw = view.z[::STRIDE, ::STRIDE].astype(float)
     _, here, i, j, ok = projected(camera, view, raw, T, STRIDE)
     expected = np.zeros(before.shape, bool)
-    for a, b in zip(*np.nonzero(ok), strict=True):
-        k, m = i[a, b] // STRIDE, j[a, b] // STRIDE
-        near = np.s_[max(k - 1, 0) : k + 2, max(m - 1, 0) : m + 2]
-        expected[a, b] = np.any(
-            moved[near] & (np.abs(before[near] - here[a, b]) <= 0.1 * here[a, b])
-        )
+    for pose, distance in ((T, here), (np.eye(4), raw)):
+        _, _, i, j, seen = projected(camera, view, raw, pose, STRIDE)
+        for a, b in zip(*np.nonzero(ok & seen), strict=True):
+            k, m = i[a, b] // STRIDE, j[a, b] // STRIDE
+            near = np.s_[max(k - 1, 0) : k + 2, max(m - 1, 0) : m + 2]
+            expected[a, b] |= np.any(
+                moved[near] & (np.abs(before[near] - distance[a, b]) <= 0.1 * distance[a, b])
+            )
     got = np.empty(before.shape, np.bool_)
     kernels.predict(
         view.rays, view.z, STRIDE, before, moved, STRIDE, other.z.shape, grid.lookup, grid.frame,

@@ -321,6 +321,7 @@ def carry(
     stride: int,
     before: Float32,
     odds_before: Float32,
+    moving_before: Bool,
     tracked_before: UInt8,
     stride_before: int,
     shape_before: tuple[int, int],
@@ -342,8 +343,9 @@ def carry(
     ----------
     rays, z, sigma, planes, plane_variance, stride
         Of the view, as in `compare`.
-    before, odds_before, tracked_before, stride_before
-        Cells of the view before: depth in m (0 unknown), log-odds, and whether they are tracked.
+    before, odds_before, moving_before, tracked_before, stride_before
+        Cells of the view before: depth in m (0 unknown), log-odds, whether they were segmented, and
+        whether they are tracked.
     shape_before, lookup, lookup_frame
         Rows and columns of that view, and where points fall on it.
     T
@@ -399,6 +401,14 @@ def carry(
             apart = max(tolerance * here, _EDGE_SIGMAS * np.sqrt(variance))
             if there > 0 and abs(here - there) <= apart:
                 odds[a, b], tracked[a, b] = odds_before[k, m], tracked_before[k, m]
+            else:  # what moves may move with the camera, and be where it was in the image
+                k, m = _cell_on_ray(rays[i, j], shape_before, stride_before, lookup, lookup_frame)
+                if (
+                    k >= 0
+                    and moving_before[k, m]
+                    and abs(before[k, m] - depth) <= tolerance * depth
+                ):
+                    odds[a, b] = odds_before[k, m]
             arrived[a, b] = there > here + apart
 
 
@@ -457,7 +467,42 @@ def predict(
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // stride_before, m // stride_before
-            for p in range(max(k - radius, 0), min(k + radius + 1, before.shape[0])):
-                for q in range(max(m - radius, 0), min(m + radius + 1, before.shape[1])):
-                    if moving_before[p, q] and abs(before[p, q] - here) <= tolerance * here:
-                        moving[a, b] = True
+            moving[a, b] = _moved_near(k, m, here, before, moving_before, tolerance, radius)
+            if not moving[a, b]:  # it may move with the camera
+                k, m = _cell_on_ray(rays[i, j], shape_before, stride_before, lookup, lookup_frame)
+                moving[a, b] = k >= 0 and _moved_near(
+                    k, m, depth, before, moving_before, tolerance, radius
+                )
+
+
+@kernel
+def _cell_on_ray(
+    ray: Float32,
+    shape: tuple[int, int],
+    stride: int,
+    lookup: Float32,
+    lookup_frame: Float64,
+) -> tuple[int, int]:
+    """Cell of a view on one of its rays; -1 where it has none."""
+    u, v, node, _ = landing(np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame)
+    if not inside(u, v, node, shape[0], shape[1]):
+        return -1, -1
+    return int(v + 0.5) // stride, int(u + 0.5) // stride
+
+
+@kernel
+def _moved_near(
+    k: int,
+    m: int,
+    depth: float,
+    before: Float32,
+    moving_before: Bool,
+    tolerance: float,
+    radius: int,
+) -> bool:
+    """Whether a moving cell is within the radius of cell (k, m), and at about the depth."""
+    for p in range(max(k - radius, 0), min(k + radius + 1, before.shape[0])):
+        for q in range(max(m - radius, 0), min(m + radius + 1, before.shape[1])):
+            if moving_before[p, q] and abs(before[p, q] - depth) <= tolerance * depth:
+                return True
+    return False

@@ -236,8 +236,6 @@ class KeyframeTracker(Tracker):
                 continue
             if not (attempt.predicted or self._is_small(attempt)):
                 continue
-            if attempt.assessment.conflict and len(attempt.aligned.unobservable):
-                continue  # the motion model, on which it relies, explains the view badly
             if self._agreement(attempt) <= 0:
                 continue
             score = self._explained(attempt, attempts, now)
@@ -251,7 +249,8 @@ class KeyframeTracker(Tracker):
         """The same alignment without what moves by itself, if it ended where the camera is.
 
         What moves may fill so much of the view that the alignment follows it: then the prediction
-        is the better guess.
+        is the better guess. Where something begins to move, the camera may as well have jumped: a
+        search must not say so.
         """
         if attempt not in attempts.segmented:
             k, predicted = attempt.keyframe, attempt.predicted
@@ -260,14 +259,22 @@ class KeyframeTracker(Tracker):
                 poses.insert(0, attempts.expected)
             found = []
             for T in poses:
-                moving = self._segment(view, T, k)
-                if moving.reliable and moving.fraction > _NOTICED:
-                    found.append(self._without_moving(view, T, k, moving, attempts, predicted))
+                moving = self._segment(view, T, k, suspected=True)
+                if not moving.reliable or moving.fraction <= _NOTICED:
+                    continue
+                again = self._without_moving(view, T, k, moving, attempts, predicted)
+                if self._moved or not self._relocalizer.contradicts(
+                    view, k, again.T_keyframe_camera
+                ):
+                    found.append(again)
             attempts.segmented[attempt] = tuple(found)
         return attempts.segmented[attempt]
 
-    def _segment(self, view: SurfaceMap, T: Float64, keyframe: Keyframe) -> Moving:
-        return self._moving.compare(view, T, keyframe.view, keyframe.T_component_camera)
+    def _segment(
+        self, view: SurfaceMap, T: Float64, keyframe: Keyframe, *, suspected: bool = False
+    ) -> Moving:
+        k = keyframe
+        return self._moving.compare(view, T, k.view, k.T_component_camera, suspected=suspected)
 
     def _without_moving(
         self,
@@ -299,7 +306,8 @@ class KeyframeTracker(Tracker):
         if not look:
             return found, None
         T, k = found.T_component_camera, found.keyframe
-        moving = self._segment(view, T, k)
+        suspected = found.view is not attempts.view
+        moving = self._segment(view, T, k, suspected=suspected)
         left_out = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
             found.view.planes[..., 3]
         )
@@ -307,7 +315,7 @@ class KeyframeTracker(Tracker):
             again = self._without_moving(view, T, k, moving, attempts, found.predicted)
             if again.assessment.usual or not found.assessment.usual:
                 found = again
-                moving = self._segment(view, again.T_component_camera, k)
+                moving = self._segment(view, again.T_component_camera, k, suspected=suspected)
         self._moving.learn(moving)
         self._moved = moving.fraction > 0
         return found, moving
@@ -322,7 +330,10 @@ class KeyframeTracker(Tracker):
         )
         self._connected = any(link.certain for link in links)
         self._keyframes.add(Keyframe(view, np.eye(4), self._component))
-        self._motion.interrupt()
+        if self._in_sequence:  # the camera still moves as it did
+            self._motion.restart()
+        else:
+            self._motion.interrupt()
         self._moving.reset()
         self._moved = False
         reason = ""

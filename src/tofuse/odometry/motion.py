@@ -147,6 +147,11 @@ class Motion:
         """Take the pose of the next frame, but not the motion to it, which does not go on."""
         self._T, self._when = T, now
 
+    def restart(self) -> None:
+        """Say that the next pose is in another frame of reference; the velocity is the same."""
+        self._T = self._when = None
+        self._differences.clear()
+
     def interrupt(self) -> None:
         """Say that the camera may be anywhere by the next frame."""
         self._velocity = self._steady = self._T = self._when = None

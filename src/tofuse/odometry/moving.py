@@ -259,9 +259,9 @@ class MovingObjects:
 
     Before a view is aligned, leave `predicted_mask` out of it and `reference_mask` out of the
     keyframe; afterwards `compare` both, and `learn` the outcome. Where the masks have grown much
-    beyond those (something just began to move), align once more without them before: they are right
-    before the pose is. `compare` takes whole views. References are recognised by their `SurfaceMap.index`; one that was the last
-    view learnt keeps what was learnt of it.
+    beyond those (something just began to move), align once more without them: they are right before
+    the pose is. `compare` takes whole views. References are recognised by their
+    `SurfaceMap.index`; one that was the last view learnt keeps what was learnt of it.
     """
 
     def __init__(self, options: MovingOptions | None = None) -> None:
@@ -277,8 +277,8 @@ class MovingObjects:
     def predicted_mask(self, T_world_camera_predicted: Float64, view: SurfaceMap) -> Bool:
         """(H, W) pixels of a view, not yet aligned, that belong to what moved in the last view.
 
-        An object is assumed to be nearly where it was: the mask is widened, and bound to surfaces
-        of about its depth.
+        An object is assumed to be nearly where it was, in the scene or before the camera: the mask
+        is widened, and bound to surfaces of about its depth.
 
         Parameters
         ----------
@@ -312,6 +312,8 @@ class MovingObjects:
         T_world_camera: Float64,
         reference: SurfaceMap,
         T_world_reference: Float64,
+        *,
+        suspected: bool = False,
     ) -> Moving:
         """Segment a view that was aligned with a keyframe, and the keyframe; nothing is kept.
 
@@ -321,6 +323,9 @@ class MovingObjects:
             The view and its (4, 4) pose.
         reference, T_world_reference
             The keyframe and its (4, 4) pose.
+        suspected
+            Whether the views conflict anyway, so that motion is the likely reason: then pixels are
+            segmented that move more likely than not, which one frame can show.
         """
         options = self.options
         now, arrived = self._carried(view, T_world_camera)
@@ -350,8 +355,9 @@ class MovingObjects:
             tracked = np.where(seen == kernels.AGREES, np.uint8(1), tracked)
         else:
             evidence, evidence_then = now.odds, then.odds
-        now, segments = self._segmented(replace(now, tracked=tracked), evidence)
-        then, _ = self._segmented(then, evidence_then)
+        detect = 0.0 if suspected else options.detect
+        now, segments = self._segmented(replace(now, tracked=tracked), evidence, detect)
+        then, _ = self._segmented(then, evidence_then, detect)
         rest = _counts(seen, now.moving) + _counts(met, then.moving)
         everything = _counts(seen, None) + _counts(met, None)
         mask = _pixels(now.moving, view.z.shape, self._stride(view))
@@ -433,9 +439,9 @@ class MovingObjects:
         def work(a: int, b: int) -> None:
             kernels.carry(
                 view.rays, view.z, view.sigma, view.planes, view.plane_variance, stride,
-                cells.depth, cells.odds, tracked_before, self._stride(before), before.z.shape,
-                grid.lookup, grid.frame, T, options.tolerance, self._prior, depth, odds, tracked,
-                arrived, a, b,
+                cells.depth, cells.odds, cells.moving, tracked_before, self._stride(before),
+                before.z.shape, grid.lookup, grid.frame, T, options.tolerance, self._prior, depth,
+                odds, tracked, arrived, a, b,
             )  # fmt: skip
 
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
@@ -484,13 +490,13 @@ class MovingObjects:
         most = options.detect + 2 * self._max_evidence
         return replace(cells, odds=np.clip(odds, 2 * prior, most).astype(np.float32))
 
-    def _segmented(self, cells: _Cells, evidence: Float32) -> tuple[_Cells, int]:
+    def _segmented(self, cells: _Cells, evidence: Float32, detect: float) -> tuple[_Cells, int]:
         """Segment cells with hysteresis, and count the segments.
 
         `evidence` of this frame: segments are not grown over what agrees in it.
         """
         options, odds, depth = self.options, cells.odds, cells.depth
-        certain = odds > options.detect
+        certain = odds > detect
         none = replace(cells, moving=np.zeros(odds.shape, np.bool_))
         if not certain.any():
             return none, 0

@@ -87,6 +87,13 @@ class Relocalizer:
             return False
         return not self._belief.search.differ(match.T_target_source, T_keyframe_camera)
 
+    def contradicts(self, view: SurfaceMap, keyframe: Keyframe, T_keyframe_camera: Float64) -> bool:
+        """Whether a search finds another pose than the (4, 4) of an alignment."""
+        match = self._match(view, keyframe)
+        if match is None or self._belief is None or self._belief.objection(match, alone=False):
+            return False
+        return self._belief.search.differ(match.T_target_source, T_keyframe_camera)
+
     def _match(self, view: SurfaceMap, keyframe: Keyframe) -> Match | None:
         """Search a view in a keyframe, if the budget allows; the same pair is searched once."""
         pair = view.index, keyframe.view.index
