@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -74,7 +75,11 @@ class KeyframeTracker(Tracker):
             return self._lose("too few pixels have a surface")
         now = Moment(frame.index, frame.timestamp)
         attempts = self._attempts(view, now, T_odometry)
-        found = self._first_usual(view, attempts, now) or self._unrivalled(view, attempts, now)
+        found = (
+            self._first_usual(view, attempts, now)
+            or self._searched(attempts, now)
+            or self._unrivalled(view, attempts, now)
+        )
         if found is None:
             step = self._begin_component(view, attempts)
         else:
@@ -176,6 +181,20 @@ class KeyframeTracker(Tracker):
                 continue
             if (usual and self._usual.is_known) or self._agreement(attempt) > 0:
                 return attempt
+        return None
+
+    def _searched(self, attempts: Attempts, now: Moment) -> Attempt | None:
+        """A quick motion that nothing predicted, which a search is certain of in sequence."""
+        if not self._in_sequence:
+            return None
+        for r in attempts.references:
+            link = self._relocalizer.link(attempts.view, r.keyframe, self._usual, adjacent=False)
+            if link is None or not link.certain:
+                continue
+            T = r.keyframe.T_component_camera @ link.T_i_j
+            found = attempts.again(T, attempts.view, r, predicted=False)
+            if found.assessment.usual and self._motion.is_possible(found.T_component_camera, now):
+                return replace(found, how=f"the prediction did not fit: {link.how}")
         return None
 
     def _explained(self, attempt: Attempt, attempts: Attempts, now: Moment) -> float:
@@ -338,7 +357,7 @@ class KeyframeTracker(Tracker):
         self._moved = False
         reason = ""
         if self._component:
-            why = attempts.objection or "another recording begins"
+            why = attempts.objection or "nothing comparable was seen before"
             reason = f"begins component {self._component}: {why}"
             if links:
                 reason += f"; {links[-1].how} in frame {links[-1].i}"

@@ -23,6 +23,8 @@ Float64 = NDArray[np.float64]
 # cameras at 5 to 30 frames a second stay below. At lower rates the same accelerations, of 3 m/s^2,
 # take them further, by the square of the time; after 0.6 s nothing can be expected any more.
 FLOOR = np.array([0.06, np.radians(4.0)])
+# What a hand can do at any time, m/s and rad/s.
+HANDHELD = np.array([3.0, 6.0])
 _SECONDS, _FARTHEST = 0.2, 10.0
 # Over that, so many times the largest of so many recent differences.
 _TIMES, _RECENT = 2.0, 4
@@ -65,6 +67,7 @@ class Motion:
         self._when: Moment | None = None
         self._velocity: Float64 | None = None  # (6,) by the unit of time, while it is known
         self._steady: Float64 | None = None  # (6,) the same as a running mean, with less noise
+        self._guessed = False  # whether the velocity is that of another component
         self._interval = 1.0  # between the last two frames with a pose
         self._differences: deque[Float64] = deque(maxlen=_RECENT)
 
@@ -82,7 +85,7 @@ class Motion:
 
     def allowed(self, now: Moment) -> Float64:
         """What a pose may differ from the expected one, m and rad; infinite if none is expected."""
-        if self._T is None or self._when is None or self._velocity is None:
+        if self._T is None or self._when is None or self._velocity is None or self._guessed:
             return np.full(2, np.inf)
         elapsed = now.since(self._when) / self._interval
         usual = (
@@ -112,6 +115,14 @@ class Motion:
             "pose"
         )
 
+    def is_possible(self, T: Float64, now: Moment) -> bool:
+        """Whether a hand can have moved the camera to a pose since the last frame."""
+        if self._T is None or self._when is None:
+            return True
+        seconds = now.seconds_since(self._when)
+        far = FLOOR + HANDHELD * (1.0 if seconds is None else seconds)
+        return bool((_apart(self._T, T) <= far).all())
+
     def deviation(self, T: Float64, now: Moment) -> float:
         """Distance of a pose from the expected one, in multiples of what recent ones had.
 
@@ -132,7 +143,7 @@ class Motion:
         expected = self.expected(now)
         if expected is not None:
             difference = _apart(expected, T)
-            if (difference <= self.allowed(now)).all():
+            if not self._guessed and (difference <= self.allowed(now)).all():
                 self._differences.append(difference * min(self._interval / elapsed, 1.0))
         velocity = twist_between(self._T, T) / elapsed
         mean = velocity if self._steady is None else self._steady
@@ -141,15 +152,19 @@ class Motion:
         far = max(np.linalg.norm(off[:3]) / FLOOR[0], np.linalg.norm(off[3:]) / FLOOR[1], 1.0)
         self._steady = mean + _NEWEST / far * (velocity - mean)
         self._velocity, self._interval = velocity, elapsed
-        self._T, self._when = T, now
+        self._T, self._when, self._guessed = T, now, False
 
     def jump(self, T: Float64, now: Moment) -> None:
         """Take the pose of the next frame, but not the motion to it, which does not go on."""
         self._T, self._when = T, now
 
     def restart(self) -> None:
-        """Say that the next pose is in another frame of reference; the velocity is the same."""
+        """Say that the next pose is in another frame of reference.
+
+        The velocity is still the best guess, but no motion is a surprise to begin with.
+        """
         self._T = self._when = None
+        self._guessed = True
         self._differences.clear()
 
     def interrupt(self) -> None:

@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 from tofuse.geometry import se3
 from tofuse.kernels.motion import moved, twist_between
 from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.posegraph.views import PosedView
 from tofuse.registration.agreement import Agreement, agreement
@@ -195,6 +196,7 @@ class Joining:
             joiner.add(link)
         joiner.decide()
         joiner.look_for_more()
+        joiner.decide(single=True)
         if self.bridge:
             joiner.bridge_gaps()
         return joiner.groups()
@@ -236,8 +238,12 @@ class _Joiner:
         if {link.i, link.j} <= self._poses.keys():
             self._links.append(link)
 
-    def decide(self) -> None:
-        """Join islands while links say so, those with the most support first."""
+    def decide(self, *, single: bool = False) -> None:
+        """Join islands while links say so, those with the most support first.
+
+        A single link waits for the end, unless the camera had no time to get far: another room may
+        look the same, and only links elsewhere contradict.
+        """
         while True:
             proposals = []
             for (a, b), links in self._links_between().items():
@@ -246,7 +252,10 @@ class _Joiner:
                     weight, chosen = found
                     proposals.append((-weight, a, b, chosen))
             for _, a, b, chosen in sorted(proposals, key=lambda p: p[:3]):
-                if self._join(self._islands[a], self._islands[b], chosen):
+                first, second = self._islands[a], self._islands[b]
+                if len(chosen) < 2 and not (single or self._is_near(first, second, _IN_SIGHT)):
+                    continue
+                if self._join(first, second, chosen):
                     break
             else:
                 return
@@ -541,14 +550,15 @@ class _Joiner:
             overlap += seen.overlap
             against += seen.violation + seen.clash
         limit = self._contradiction
-        if self._is_same_place(
-            a, b
-        ):  # what contradicts there has moved, or is an error of the pose
+        if self._is_near(a, b, _NEAR):  # what contradicts has moved, or is an error of the pose
             limit = max(limit, _SAME_PLACE)
         return overlap > 0 and against / overlap > limit
 
-    def _is_same_place(self, a: _Island, b: _Island) -> bool:
-        """Whether the camera had no time to get out of sight between the two sides."""
+    def _is_near(self, a: _Island, b: _Island, far: float) -> bool:
+        """Whether the camera had no time to get `far` between the two sides.
+
+        A fraction of the depth, and rad.
+        """
         for c in a.T:
             for d in b.T:
                 before, after = self._in_time(c, d)
@@ -556,7 +566,7 @@ class _Joiner:
                 if before.recording != after.recording or elapsed < 0:
                     continue
                 reach = self._speed * elapsed
-                if reach[0] < _NEAR * before.depth and reach[1] < _NEAR:
+                if reach[0] < far * before.depth and reach[1] < far:
                     return True
         return False
 
@@ -631,7 +641,7 @@ def _reach(before: Stretch, after: Stretch) -> Float64:
     if len(speeds) < _AROUND // 4:
         return np.full(2, np.inf)
     elapsed = max(float(after.times[0] - before.times[-1]), 0.0)
-    return np.asarray(_FASTER * speeds.max(0) * elapsed)
+    return np.asarray(np.maximum(_FASTER * speeds.max(0), HANDHELD) * elapsed)
 
 
 def _bridged(before: Stretch, after: Stretch) -> Link | None:
