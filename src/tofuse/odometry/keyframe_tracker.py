@@ -34,6 +34,8 @@ _LOOK_EVERY, _IN_FRONT = 4, 0.005
 # Between rival poses, what a deviation from the usual motion costs, as a fraction of the points:
 # little, as where a scene determines the pose a wrong one loses more.
 _MOTION = 0.05
+# By which fraction of the points a rival must explain more: what differs less is the same pose.
+_CLEARLY = 0.03
 # Fraction of a view that moves, from which the rest is aligned once more, and which is reported.
 _NOTICED = 0.01
 
@@ -77,8 +79,8 @@ class KeyframeTracker(Tracker):
         attempts = self._attempts(view, now, T_odometry)
         found = (
             self._first_usual(view, attempts, now)
-            or self._searched(attempts, now)
             or self._unrivalled(view, attempts, now)
+            or self._searched(attempts, now)
         )
         if found is None:
             step = self._begin_component(view, attempts)
@@ -161,7 +163,7 @@ class KeyframeTracker(Tracker):
         must where a fit is only noisier than usual: a view farther from the keyframe shares less of
         its systematic errors, and a chain of nearer references would drift. Where a reference
         contradicts, what moves by itself may explain it; else another pose must explain all
-        references better: an alignment with the last frame may follow what moves since then.
+        references as well: an alignment with the last frame may follow what moves since then.
         """
         rival = -np.inf
         for attempt in attempts:
@@ -177,7 +179,7 @@ class KeyframeTracker(Tracker):
                 continue
             if not predicted and not self._is_verified(attempt):
                 continue
-            if np.isfinite(rival) and self._explained(attempt, attempts, now) <= rival:
+            if np.isfinite(rival) and self._explained(attempt, attempts, now) < rival - _CLEARLY:
                 continue
             if (usual and self._usual.is_known) or self._agreement(attempt) > 0:
                 return attempt
