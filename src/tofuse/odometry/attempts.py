@@ -73,8 +73,8 @@ class Attempts:
 
     Parameters
     ----------
-    view
-        Without what moves by itself.
+    whole, view
+        The view, and the same without what moves by itself.
     references
         To align with, the likeliest first.
     expected, steady
@@ -91,6 +91,7 @@ class Attempts:
 
     def __init__(
         self,
+        whole: SurfaceMap,
         view: SurfaceMap,
         references: Sequence[Reference],
         expected: Float64 | None,
@@ -99,8 +100,9 @@ class Attempts:
         options: ProjectiveOptions,
         usual: UsualFit,
     ) -> None:
-        self.view, self.expected, self.references = view, expected, references
-        self._steady, self._T_last = steady, T_last
+        self.whole, self.view, self.references = whole, view, references
+        self.expected, self.T_last = expected, T_last
+        self._steady = steady
         self._options, self._usual = options, usual
         self._coming = self._make()
         self._made: list[Attempt] = []
@@ -179,7 +181,7 @@ class Attempts:
         coarse = replace(self._options, levels=PATIENT[:1])
         motions = _turns(view)
         still, *turned = [
-            align(view, target, self._T_last @ motion, coarse, usual_scale=scale)
+            align(view, target, self.T_last @ motion, coarse, usual_scale=scale)
             for motion in motions
         ]
         best = max(range(len(turned)), key=lambda k: turned[k].score)
@@ -189,7 +191,7 @@ class Attempts:
             where += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
         # With no prediction to keep to, what little the data says is the better guess.
         how = replace(self._options, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
-        T = chosen.T_world_source if moves else self._T_last
+        T = chosen.T_world_source if moves else self.T_last
         start = chosen.T_world_source
         return align(view, target, T, how, start=start, usual_scale=scale), where
 

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.posegraph.joining import Stretch
 from tofuse.posegraph.outside import Sensed
 from tofuse.posegraph.views import ViewStore
+from tofuse.recordings.frames import Frame
 from tofuse.registration.verification import Link
 from tofuse.results.types import FrameRecord
 
@@ -49,6 +51,21 @@ class Entry:
         return self.step is not None and self.step.T_component_camera is not None
 
 
+def record_of(frame: Frame, step: Step) -> FrameRecord:
+    """What is reported of a frame once it was tracked."""
+    r = step.registration
+    return FrameRecord(
+        frame.index,
+        frame.timestamp,
+        step.status,
+        step.reason,
+        valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
+        inlier_share=None if r is None else r.share,
+        rms_m=None if r is None else r.rms_m,
+        unobservable=np.zeros((0, 6)) if r is None else r.unobservable,
+    )
+
+
 @dataclass(eq=False)
 class FrameLog:
     """All frames so far.
@@ -81,6 +98,17 @@ class FrameLog:
             step = replace(step, surface=None, moving=None)
         number = len(self.interruptions)
         self.entries.append(Entry(record, step, number, T_odometry, gravity, moving))
+
+    def check_posed(self) -> None:
+        """Raise InputError if no frame has a pose: there is nothing to make a model of."""
+        if not self.posed:
+            entries = self.entries
+            raise InputError(
+                f"none of the {len(entries)} frames has enough valid points for a pose"
+                + (f" (first: {entries[0].record.reason})" if entries else ""),
+                where="recording",
+                remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
+            )
 
     @property
     def posed(self) -> list[Entry]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,22 +13,19 @@ from tofuse.errors import InputError
 from tofuse.kernels.threads import thread_count, threads, undivided
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
-from tofuse.pipeline.backend import BackEnd
+from tofuse.pipeline.assembly import Assembly
 from tofuse.pipeline.behind import Behind
 from tofuse.pipeline.checkpoint import NotKept, Stages
-from tofuse.pipeline.components import numbered_components
 from tofuse.pipeline.config import Config, check_views, from_method, kind_of
-from tofuse.pipeline.frame_log import FrameLog, poses_in_world
+from tofuse.pipeline.frame_log import FrameLog, record_of
 from tofuse.pipeline.intake import Intake
 from tofuse.pipeline.live import LivePoses
 from tofuse.pipeline.memory import give_back
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
-from tofuse.posegraph.joining import Group, Join
 from tofuse.posegraph.loops import GivenLoop
-from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.results.samples import FrameSample, FrameSamples
+from tofuse.recordings.frames import Frame
 from tofuse.results.types import FrameRecord, Reconstruction
 
 Float64 = NDArray[np.float64]
@@ -75,7 +71,6 @@ class Mapper:
         self._progress = progress or Silent()
         self._intake = Intake()
         self._log = FrameLog()
-        self._samples = FrameSamples()
         self._behind = Behind()
         self._ended = self._finished = False
         self._begin()
@@ -162,44 +157,24 @@ class Mapper:
     def _remember(
         self, ready: Ready, step: Step, T_odometry: Float64 | None, gravity: Float64 | None
     ) -> None:
-        frame, r = ready.frame, step.registration
-        record = FrameRecord(
-            frame.index,
-            frame.timestamp,
-            step.status,
-            step.reason,
-            valid_share=len(frame) / frame.valid.size if frame.valid.size else 0.0,
-            inlier_share=None if r is None else r.share,
-            rms_m=None if r is None else r.rms_m,
-            unobservable=np.zeros((0, 6)) if r is None else r.unobservable,
-        )
-        self._log.add(record, step, T_odometry, gravity)
+        frame = ready.frame
+        self._log.add(record_of(frame, step), step, T_odometry, gravity)
         lost = step.T_component_camera is None
         if step.moving is not None:
             ready = replace(ready, clean=ready.clean.keep(~step.moving))
-        filtered, clean = ready.filtered, ready.clean
         if not lost:
             with self.watch.timing("loops"):
                 self._kept.add(ready, step)
             with self.watch.timing("fusion"):
-                add = self._kept.add_to_model
-                self._behind.do(lambda: add(frame, clean, step))
-        if (
-            isinstance(frame, RangeFrame)
-            and isinstance(filtered, RangeFrame)
-            and isinstance(clean, RangeFrame)
-        ):
-            make = partial(FrameSample.of, frame, filtered, clean)
-            self._behind.do(lambda: self._samples.take(lost=lost, make=make))
+                self._behind.do(lambda: self._kept.add_to_model(frame, ready.clean, step))
+        self._behind.do(lambda: self._kept.sample(ready, lost=lost))
 
     def _close_loops(self, step: Step) -> None:
         """Let loops that were found some frames ago count in the present component."""
         with self.watch.timing("loops"):
             loops = self._live.follow(step, self._log)
             if loops:
-                log = self._log.of_component(step.component)
-                poses = poses_in_world(log, {step.component: np.eye(4)})
-                graph = self._back_end(log, poses, ()).graph(loops)
+                graph = self._assembly().graph(self._log, step.component, loops)
                 self._live.close(graph, self.config.optimiser.optimise(graph).graph)
 
     def _report(self, ready: Ready, step: Step) -> Float64 | None:
@@ -253,67 +228,29 @@ class Mapper:
         if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
         self._finished = True
-        if not self._log.posed:
-            entries = self._log.entries
-            raise InputError(
-                f"none of the {len(entries)} frames has enough valid points for a pose"
-                + (f" (first: {entries[0].record.reason})" if entries else ""),
-                where="recording",
-                remedy="look at it with `tofuse inspect`; the filters may be too strict for it",
-            )
+        self._log.check_posed()
         self._live.finish()
         with self.watch.timing("fusion"):
             self._behind.finish()
         self.end()
-        stages = stages or NotKept()
-        with threads(self.threads):
-            groups = self._join(stages)
-            log, components = numbered_components(self._log, groups, self._reconstruct_alone)
-            poses = poses_in_world(log, groups[0].T_group_component)
-            result = self._back_end(log, poses, groups[0].joins).run(stages, components)
-        return replace(
-            result,
-            diagnostics=replace(
-                result.diagnostics,
-                removed=self._preparation.removed,
-                seconds=dict(self.watch.seconds),
-                samples=self._samples.all,
-            ),
-            seed=self.seed,
-            threads=self.threads,
+        result = self._assembly().run(self._log, stages or NotKept())
+        diagnostics = replace(
+            result.diagnostics,
+            removed=self._preparation.removed,
+            seconds=dict(self.watch.seconds),
+            samples=self._kept.samples.all,
         )
+        return replace(result, diagnostics=diagnostics)
 
-    def _join(self, stages: Stages) -> list[Group]:
-        """Decide, now that everything was seen, which components are connected, and how."""
-        kept = stages.load("joining")
-        if kept is not None:
-            self.watch.seconds.update(kept[1])
-            return list(kept[0])
-        stretches = self._log.stretches(self._kept.views)
-        if len(stretches) > 1:
-            self._progress.stage("joining components")
-        with self.watch.timing("joining"):
-            groups = self.config.joining.join(stretches, self._log.links)
-        stages.save("joining", (groups, dict(self.watch.seconds)))
-        return groups
-
-    def _reconstruct_alone(
-        self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
-    ) -> Reconstruction:
-        """Make the model of a component that is not connected with the main one."""
-        result = self._back_end(log, poses, joins).run(NotKept(), ())
-        return replace(result, seed=self.seed, threads=self.threads)
-
-    def _back_end(self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]) -> BackEnd:
-        return BackEnd(
+    def _assembly(self) -> Assembly:
+        return Assembly(
             self.config,
-            log,
-            poses,
-            joins,
+            self._kept,
             self._given,
-            self._kept.at_the_end(),
             self._progress,
             self.watch,
+            self.seed,
+            self.threads,
         )
 
     def _check(self, frame: Frame) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from tofuse.pipeline.preparation import Ready
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.results.samples import FrameSample, FrameSamples
 
 _KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
 _CHECKED_IMAGES = 60  # how many images are compared with each other in the end
@@ -34,12 +36,15 @@ class Observations:
         Prepared views of all components: joining, loops and refinement work on these.
     loops
         Loop detection at work, told of every frame.
+    samples
+        Some frames for the report.
     """
 
     def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
         ends = [frame for loop in given for frame in (loop.i, loop.j)]
         self.views: ViewStore[SurfaceMap] = ViewStore(Spacing(), always=ends)
         self.loops = config.loops.start(seed, given, self.views)
+        self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
         self._model = ModelBuilder(config.fusion)
         self._checks = _EvenSample(_CHECKED_IMAGES)
@@ -72,6 +77,16 @@ class Observations:
             if isinstance(clean, RangeFrame):
                 self._checks.add(lambda: whole(frame, clean))
         self._model.add(clean, step.surface, _KEPT_POINTS)
+
+    def sample(self, ready: Ready, *, lost: bool) -> None:
+        """Keep a small picture of some frames, for the report."""
+        frame, filtered, clean = ready.frame, ready.filtered, ready.clean
+        if (
+            isinstance(frame, RangeFrame)
+            and isinstance(filtered, RangeFrame)
+            and isinstance(clean, RangeFrame)
+        ):
+            self.samples.take(lost=lost, make=partial(FrameSample.of, frame, filtered, clean))
 
     def at_the_end(self) -> Kept:
         """What the back end works on."""
