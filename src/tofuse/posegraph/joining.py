@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -103,7 +104,7 @@ class Stretch:
     views: tuple[View, ...]
     recording: int = 0
 
-    @property
+    @cached_property
     def depth(self) -> float:
         """Typical distance of what its views see, m."""
         return float(np.median([v.view.depth for v in self.views])) if self.views else 1.0
@@ -220,6 +221,10 @@ class _Joiner:
         self._islands = [_Island({s.component: np.eye(4)}) for s in stretches]
         self._links: list[Link] = []
         self._refused: set[tuple[int, ...]] = set()
+        # Frames of each component that links or verification ask about.
+        self._nodes = {s.component: {v.index for v in s.views} for s in stretches}
+        self._proposals: dict[tuple[int, ...], tuple[float, list[Link]]] = {}
+        self._paths: dict[tuple[int, ...], dict[int, float]] = {}
         total = sum(len(s.frames) for s in stretches)
         self._searches = options.searches + len(stretches) + int(options.searches_per_frame * total)
         self._alignments = _ALIGNMENTS * len(stretches)
@@ -237,6 +242,8 @@ class _Joiner:
         """Take note of a link."""
         if {link.i, link.j} <= self._poses.keys():
             self._links.append(link)
+            for frame in (link.i, link.j):
+                self._nodes[self._component_of[frame]].add(frame)
 
     def decide(self, *, single: bool = False) -> None:
         """Join islands while links say so, those with the most support first.
@@ -294,7 +301,7 @@ class _Joiner:
             tried.add((first.index, second.index))
             link = self._registered(first, second)
             if link is not None:
-                self._links.append(link)
+                self.add(link)
                 self.decide()
 
     def bridge_gaps(self) -> None:
@@ -392,8 +399,11 @@ class _Joiner:
         self, a: _Island, b: _Island, between: list[Link]
     ) -> tuple[float, list[Link]] | None:
         """The links to believe between two islands, and their weight; None if there are none."""
-        if _key(a, b, between) in self._refused:
+        key = _key(a, b, between)
+        if key in self._refused:
             return None
+        if key in self._proposals:
+            return self._proposals[key]
         T = [self._T_a_b(a, b, link) for link in between]
         n = len(between)
         agree = np.ones((n, n), bool)
@@ -408,9 +418,10 @@ class _Joiner:
         rest = [k for k in range(n) if not agree[k, chosen].all()]
         rivals = maximum_consistent_set(agree[np.ix_(rest, rest)], [weights[k] for k in rest])
         if sum(weights[rest[k]] for k in rivals) > _RIVAL * weight:
-            self._refused.add(_key(a, b, between))
+            self._refused.add(key)
             return None
-        return weight, [between[k] for k in chosen]
+        self._proposals[key] = weight, [between[k] for k in chosen]
+        return self._proposals[key]
 
     def _say_the_same(
         self, a: _Island, b: _Island, first: Link, second: Link, T: Float64, other: Float64
@@ -443,11 +454,14 @@ class _Joiner:
         Along the poses of components, and over what joins them; turns in rad plus motions as a
         fraction of the depth.
         """
-        nodes = {v.index for v in self._views.values() if self._component_of[v.index] in island.T}
-        nodes |= {f for join in island.joins for f in (join.link.i, join.link.j)} | {start}
-        nodes |= {
-            f for link in self._links for f in (link.i, link.j) if self._component_of[f] in island.T
-        }
+        # They only become more, so that their number says which they are.
+        key = (start, sum(len(self._nodes[c]) for c in island.T), *sorted(island.T))
+        if key not in self._paths:
+            nodes = set().union(*(self._nodes[c] for c in island.T))
+            self._paths[key] = self._path_over(nodes | {start}, island, start)
+        return self._paths[key]
+
+    def _path_over(self, nodes: set[int], island: _Island, start: int) -> dict[int, float]:
         order = sorted(nodes, key=lambda f: (self._component_of[f], f))
         T = np.stack([self._T_island(island, f) for f in order])
         row = {f: k for k, f in enumerate(order)}
@@ -493,6 +507,8 @@ class _Joiner:
         T_a_b = self._T_a_b(a, b, link)
         a.T.update({c: T_a_b @ T for c, T in b.T.items()})
         a.joins += [*b.joins, *joins]
+        for frame in (f for join in joins for f in (join.link.i, join.link.j)):
+            self._nodes[self._component_of[frame]].add(frame)
         self._islands.remove(b)
 
     def _overlapping(
