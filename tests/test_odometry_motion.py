@@ -218,3 +218,38 @@ def test_small_motions() -> None:
     assert is_small(elsewhere(np.eye(4), 0.05, 0.06))
     assert not is_small(elsewhere(np.eye(4), 0.07))
     assert not is_small(elsewhere(np.eye(4), 0.0, 0.08))
+
+
+def test_in_another_component_the_velocity_is_a_guess_but_no_constraint() -> None:
+    poses = walk(10)
+    motion = followed(poses[:6])
+    motion.restart()
+    motion.follow(np.eye(4), counted(6))
+    step = se3.inverse(poses[5]) @ poses[6]
+    np.testing.assert_allclose(motion.expected(counted(7)), step, atol=1e-12)
+    far = elsewhere(np.eye(4), 2.0, 1.0)
+    assert not motion.surprise(far, counted(7))
+    assert motion.deviation(far, counted(7)) == 0
+    # Once a motion was seen in it, this is what is expected.
+    motion.follow(step, counted(7))
+    assert motion.surprise(far, counted(8))
+
+
+@pytest.mark.parametrize(
+    ("metres", "angle", "possible"), [(0.3, 0.5, True), (0.5, 0.0, False), (0.0, 0.9, False)]
+)
+def test_a_hand_moves_a_camera_only_so_fast(metres, angle, possible) -> None:
+    when = timed(10.0)
+    motion = followed(walk(3), when)
+    assert motion.is_possible(elsewhere(walk(3)[2], metres, angle), when(3)) is possible
+
+
+def test_deviations_are_multiples_of_what_is_usual() -> None:
+    rng = np.random.default_rng(2)
+    poses = [T @ se3.exp(np.array([*rng.normal(0, 0.01, 3), 0, 0, 0])) for T in walk(12)]
+    motion = followed(poses[:11])
+    expected = motion.expected(counted(11))
+    usual = motion.deviation(elsewhere(expected, 0.02), counted(11))
+    assert 0 < usual < 2
+    assert motion.deviation(elsewhere(expected, 0.2), counted(11)) == pytest.approx(10 * usual)
+    assert Motion().deviation(np.eye(4), counted(0)) == 0

@@ -213,6 +213,38 @@ def test_the_camera_must_have_been_able_to_get_there(late, joined, monkeypatch) 
         assert_joined(groups[0], parts, path)
 
 
+def two_rooms_that_look_alike():
+    """A walk in a room, and later one that begins in its double, 6 m away, and comes back."""
+    away = np.eye(4)
+    away[0, 3] = 6.0
+    # Where the camera is, and where it would see the same in the first room.
+    local = [*PATH[:10], *PATH[9:13], *PATH[:8]]
+    path = [*PATH[:10], *(away @ T for T in PATH[9:13]), *PATH[:8]]
+    parts = []
+    for c, frames in enumerate((range(10), range(10, 22))):
+        poses = np.stack([se3.inverse(path[frames[0]]) @ path[k] for k in frames])
+        views = [
+            PosedView(surface(seen(local[k], k)), T, c) for k, T in zip(frames, poses, strict=True)
+        ]
+        times = np.array(frames) / RATE + 60.0 * c
+        parts.append(Stretch(c, np.array(frames), times, poses, tuple(views)))
+    return path, parts
+
+
+def test_a_single_link_waits_for_links_elsewhere() -> None:
+    """The views at the gap are alike, and a link between them would be certain."""
+    path, parts = two_rooms_that_look_alike()
+    a, b = parts[0].views[-1], parts[1].views[0]
+    wrong = link_of(a, b, np.eye(4))
+    (group,) = Joining().join(parts, [wrong])
+    assert_joined(group, parts, path)
+    # Had the camera no time to get away, it would be believed.
+    soon = replace(parts[1], times=parts[1].times - 60.0)
+    (group,) = Joining().join([parts[0], soon], [wrong])
+    with pytest.raises(AssertionError):
+        assert_joined(group, parts, path)
+
+
 def test_between_recordings_no_motion_is_known(monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
     path, parts, link = turned_back(0.0)

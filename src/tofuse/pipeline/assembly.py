@@ -1,0 +1,93 @@
+"""The end of a run: components are joined, and each connected part is reconstructed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.threads import threads
+from tofuse.pipeline.backend import BackEnd
+from tofuse.pipeline.checkpoint import NotKept, Stages
+from tofuse.pipeline.components import numbered_components
+from tofuse.pipeline.config import Config
+from tofuse.pipeline.frame_log import FrameLog, poses_in_world
+from tofuse.pipeline.observations import Observations
+from tofuse.pipeline.progress import Progress, Stopwatch
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.joining import Group, Join
+from tofuse.posegraph.loops import ClosedLoop, GivenLoop
+from tofuse.results.types import Reconstruction
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """Makes reconstructions of what was tracked and kept.
+
+    Attributes
+    ----------
+    observations
+        What was kept of the frames.
+    given
+        Loops known beforehand.
+    """
+
+    config: Config
+    observations: Observations
+    given: tuple[GivenLoop, ...]
+    progress: Progress
+    watch: Stopwatch
+    seed: int
+    threads: int
+
+    def run(self, log: FrameLog, stages: Stages) -> Reconstruction:
+        """Join components, and reconstruct them: the main one last."""
+        with threads(self.threads):
+            groups = self._join(log, stages)
+            log, components = numbered_components(log, groups, self._alone)
+            poses = poses_in_world(log, groups[0].T_group_component)
+            result = self._back_end(log, poses, groups[0].joins).run(stages, components)
+        return replace(result, seed=self.seed, threads=self.threads)
+
+    def graph(self, log: FrameLog, component: int, loops: Sequence[ClosedLoop]) -> PoseGraph:
+        """The graph of a component as it was tracked, with loops."""
+        own = log.of_component(component)
+        poses = poses_in_world(own, {component: np.eye(4)})
+        return self._back_end(own, poses, ()).graph(loops)
+
+    def _join(self, log: FrameLog, stages: Stages) -> list[Group]:
+        """Decide, now that everything was seen, which components are connected, and how."""
+        kept = stages.load("joining")
+        if kept is not None:
+            self.watch.seconds.update(kept[1])
+            return list(kept[0])
+        stretches = log.stretches(self.observations.views)
+        if len(stretches) > 1:
+            self.progress.stage("joining components")
+        with self.watch.timing("joining"):
+            groups = self.config.joining.join(stretches, log.links)
+        stages.save("joining", (groups, dict(self.watch.seconds)))
+        return groups
+
+    def _alone(
+        self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]
+    ) -> Reconstruction:
+        """Make the model of a component that is not connected with the main one."""
+        result = self._back_end(log, poses, joins).run(NotKept(), ())
+        return replace(result, seed=self.seed, threads=self.threads)
+
+    def _back_end(self, log: FrameLog, poses: dict[int, Float64], joins: Sequence[Join]) -> BackEnd:
+        return BackEnd(
+            self.config,
+            log,
+            poses,
+            joins,
+            self.given,
+            self.observations.at_the_end(),
+            self.progress,
+            self.watch,
+        )

@@ -1,0 +1,95 @@
+"""Which explanation of a view is believed: the camera, what moves by itself, or a quick motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from made_rooms import CAMERA, at, seen
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceOptions
+from tofuse.odometry.keyframes import Keyframes
+
+OPTIONS = Keyframes(surface=SurfaceOptions(radii=(2,)))
+# A camera that walks along and turns slowly.
+WALK = [at(-0.4 + 0.03 * k, 0.0, 0.015 * k) for k in range(24)]
+FIRST = 10  # frame with something before the camera
+
+
+def run(frames):
+    tracker = OPTIONS.start(0)
+    return [tracker.push(frame) for frame in frames]
+
+
+def with_plate(frame, left, right, z=0.7):
+    """Put a textured plate before the camera, as high as the image, between two columns."""
+    columns = np.arange(CAMERA.width)
+    covered = np.broadcast_to((columns >= left) & (columns < right), frame.depth.shape)
+    rng = np.random.default_rng(frame.index)
+    depth = np.where(covered, z * (1 + 0.004 * rng.standard_normal(frame.depth.shape)), frame.depth)
+    marks = 600 + 300 * (((columns - left) // 5) % 2)
+    light = np.where(covered, marks, frame.amplitude_image)
+    light = light * (1 + 0.02 * rng.standard_normal(light.shape))
+    return replace(frame, depth=depth.astype(np.float32), amplitude_image=light.astype(np.float32))
+
+
+def off(step, pose, first=WALK[0]):
+    """m and degrees by which a step's pose is wrong in component 0."""
+    error = se3.inverse(se3.inverse(first) @ pose) @ step.T_component_camera
+    return np.linalg.norm(error[:3, 3]), np.degrees(se3.angle(error))
+
+
+@pytest.mark.parametrize("columns", [24, 48])
+def test_what_passes_before_the_camera_does_not_take_it_along(columns) -> None:
+    """A plate goes with the camera, which moves by 3 cm a frame: nearly half a metre in all."""
+    frames = []
+    for k, T in enumerate(WALK):
+        frame = seen(T, k)
+        if k >= FIRST:
+            right = min(12 * (k - FIRST + 1), 100)
+            frame = with_plate(frame, right - columns, right)
+        frames.append(frame)
+    steps = run(frames)
+    assert [step.component for step in steps] == [0] * len(WALK)
+    for step, pose in zip(steps, WALK, strict=True):
+        metres, degrees = off(step, pose)
+        assert metres < 0.03
+        assert degrees < 1.5
+    assert sum(step.moving is not None for step in steps[FIRST:]) > len(steps[FIRST:]) / 2
+    assert all(step.moving is None for step in steps[:FIRST])
+
+
+def test_a_camera_that_jumped_is_not_explained_by_moving_objects() -> None:
+    """What differs after a jump in the same room is as coherent as an object that moved."""
+    there = at(0.35, 0.3, 0.25)
+    frames = [seen(T, k) for k, T in enumerate(WALK[:12])]
+    frames += [seen(there, 12 + k) for k in range(3)]
+    steps = run(frames)
+    for step in steps[12:]:
+        if step.component == 0 and not step.doubtful:
+            assert off(step, there)[0] < 0.03
+
+
+def test_a_quick_turn_stays_in_the_component_if_a_search_is_certain() -> None:
+    path = [*WALK[:12], *(at(-0.07 + 0.03 * k, 0.0, 0.165 + 0.45 + 0.015 * k) for k in range(6))]
+    steps = run([seen(T, k) for k, T in enumerate(path)])
+    assert [step.component for step in steps] == [0] * len(path)
+    assert "exhaustive search" in steps[12].reason
+    for step, pose in zip(steps, path, strict=True):
+        assert off(step, pose)[0] < 0.03
+
+
+def test_a_new_component_goes_on_as_the_camera_moved() -> None:
+    """Another room from one frame to the next, and the same motion."""
+    frames = [seen(T, k) for k, T in enumerate(WALK[:12])]
+    frames += [
+        seen(T, 12 + k, boxes=(), spots=90, scene=9, half=(2.6, 1.4, 2.4))
+        for k, T in enumerate(WALK[12:])
+    ]
+    steps = run(frames)
+    assert [step.component for step in steps] == [0] * 12 + [1] * 12
+    assert "nothing predicted it" not in steps[13].reason
+    for step, pose in zip(steps[12:], WALK[12:], strict=True):
+        assert off(step, pose, WALK[12])[0] < 0.03
