@@ -60,14 +60,20 @@ class Moment:
 
 
 class Motion:
-    """The motion of a camera so far; poses are (4, 4) T_world_camera."""
+    """The motion of a camera so far; poses are (4, 4) T_world_camera.
+
+    Attributes
+    ----------
+    is_guess
+        Whether the velocity is that of another component: what differs from it is no surprise.
+    """
 
     def __init__(self) -> None:
+        self.is_guess = False
         self._T: Float64 | None = None  # of the last frame with a pose
         self._when: Moment | None = None
         self._velocity: Float64 | None = None  # (6,) by the unit of time, while it is known
         self._steady: Float64 | None = None  # (6,) the same as a running mean, with less noise
-        self._guessed = False  # whether the velocity is that of another component
         self._interval = 1.0  # between the last two frames with a pose
         self._differences: deque[Float64] = deque(maxlen=_RECENT)
 
@@ -85,14 +91,13 @@ class Motion:
 
     def allowed(self, now: Moment) -> Float64:
         """What a pose may differ from the expected one, m and rad; infinite if none is expected."""
-        if self._T is None or self._when is None or self._velocity is None or self._guessed:
+        if self._T is None or self._when is None or self._velocity is None:
             return np.full(2, np.inf)
         elapsed = now.since(self._when) / self._interval
-        usual = (
-            np.max(self._differences, axis=0)
-            if self._differences
-            else _apart(self._T, moved(self._T, self._velocity * self._interval))
-        )
+        if self._differences or self.is_guess:
+            usual = np.max([np.zeros(2), *self._differences], axis=0)
+        else:
+            usual = _apart(self._T, moved(self._T, self._velocity * self._interval))
         seconds = now.seconds_since(self._when)
         if seconds is None:
             if elapsed > _FORGOTTEN:
@@ -143,7 +148,7 @@ class Motion:
         expected = self.expected(now)
         if expected is not None:
             difference = _apart(expected, T)
-            if not self._guessed and (difference <= self.allowed(now)).all():
+            if not self.is_guess and (difference <= self.allowed(now)).all():
                 self._differences.append(difference * min(self._interval / elapsed, 1.0))
         velocity = twist_between(self._T, T) / elapsed
         mean = velocity if self._steady is None else self._steady
@@ -152,7 +157,7 @@ class Motion:
         far = max(np.linalg.norm(off[:3]) / FLOOR[0], np.linalg.norm(off[3:]) / FLOOR[1], 1.0)
         self._steady = mean + _NEWEST / far * (velocity - mean)
         self._velocity, self._interval = velocity, elapsed
-        self._T, self._when, self._guessed = T, now, False
+        self._T, self._when, self.is_guess = T, now, False
 
     def jump(self, T: Float64, now: Moment) -> None:
         """Take the pose of the next frame, but not the motion to it, which does not go on."""
@@ -161,15 +166,18 @@ class Motion:
     def restart(self) -> None:
         """Say that the next pose is in another frame of reference.
 
-        The velocity is still the best guess, but no motion is a surprise to begin with.
+        The velocity is still the best guess, unless it was but a guess itself.
         """
+        if self.is_guess or self._velocity is None:
+            self.interrupt()
         self._T = self._when = None
-        self._guessed = True
+        self.is_guess = self._velocity is not None
         self._differences.clear()
 
     def interrupt(self) -> None:
         """Say that the camera may be anywhere by the next frame."""
         self._velocity = self._steady = self._T = self._when = None
+        self.is_guess = False
         self._differences.clear()
 
     def _onward(self, velocity: Float64 | None, now: Moment) -> Float64 | None:

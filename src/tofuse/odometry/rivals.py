@@ -60,7 +60,7 @@ class Rivals:
         """
         rival = -np.inf
         for attempt in attempts:
-            usual, predicted = attempt.assessment.usual, attempt.predicted
+            usual, predicted = attempt.assessment.usual, self._is_predicted(attempt, now)
             if self._is_surprising(attempt, now):
                 continue
             if not usual and (attempt.assessment.conflict or not predicted):
@@ -90,7 +90,7 @@ class Rivals:
         for attempt in (*segmented, *made):
             if not np.isfinite(attempt.aligned.rms_m) or self._is_surprising(attempt, now):
                 continue
-            if not (attempt.predicted or _is_small(attempt, attempts)):
+            if not (self._is_predicted(attempt, now) or _is_small(attempt, attempts)):
                 continue
             if len(attempt.aligned.unobservable) >= _PLANE and attempt.assessment.conflict:
                 continue  # the motion model, on which most of it relies, explains the view badly
@@ -139,7 +139,13 @@ class Rivals:
 
     def _is_surprising(self, attempt: Attempt, now: Moment) -> bool:
         """Whether the camera can hardly have moved like this."""
-        return bool(self._motion.surprise(attempt.T_component_camera, now))
+        surprise = self._motion.surprise(attempt.T_component_camera, now)
+        return bool(surprise) and not self._motion.is_guess
+
+    def _is_predicted(self, attempt: Attempt, now: Moment) -> bool:
+        """Whether an alignment began where the motion leads, and ended there if that is a guess."""
+        surprise = self._motion.is_guess and self._motion.surprise(attempt.T_component_camera, now)
+        return attempt.predicted and not surprise
 
     def _is_verified(self, attempt: Attempt, attempts: Attempts) -> bool:
         """Whether a step that nothing predicted is small, or a search finds the same."""
