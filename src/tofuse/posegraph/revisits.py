@@ -30,7 +30,7 @@ from tofuse.registration.likeness import look_of
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import Match, search
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import Belief, UsualFit
+from tofuse.registration.verification import Belief, UsualFit, both_ways_agree
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -380,10 +380,8 @@ class _RevisitLoops(Loops):
         if not objection:
             back = self._freely(source, target, se3.inverse(T), options.near)
             objection = self._misfit(back)
-            gap = T @ back.T_world_source
-            if not objection and (
-                np.linalg.norm(gap[:3, 3]) > options.both_ways_m
-                or se3.angle(gap) > options.both_ways_rad
+            if not objection and not both_ways_agree(
+                T, back.T_world_source, options.both_ways_m, options.both_ways_rad
             ):
                 objection = "the alignment back ends elsewhere"
         record = LoopRecord(

@@ -363,12 +363,9 @@ def aligned_link(
         target, [Target(source, np.eye(4))], se3.inverse(T), _ALIGNMENT,
         usual_scale=usual.noise_scale,
     )  # fmt: skip
-    gap = T @ back.T_world_source
     far_m, far_rad = tolerance
-    if (
-        not usual.assess(back).usual
-        or np.linalg.norm(gap[:3, 3]) > far_m * source.depth
-        or se3.angle(gap) > far_rad
+    if not usual.assess(back).usual or not both_ways_agree(
+        T, back.T_world_source, far_m * source.depth, far_rad
     ):
         return None
     found = agreement(source, target, T, self_scaled(usual))
@@ -385,6 +382,14 @@ def aligned_link(
         False,
         "aligned both ways",
     )
+
+
+def both_ways_agree(
+    T_target_source: Float64, T_source_target: Float64, metres: float, radians: float
+) -> bool:
+    """Whether an alignment (4, 4), and the one back, end at the same pose."""
+    gap = T_target_source @ T_source_target
+    return bool(np.linalg.norm(gap[:3, 3]) <= metres and se3.angle(gap) <= radians)
 
 
 def self_scaled(usual: UsualFit) -> AgreementOptions:
