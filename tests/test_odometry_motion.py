@@ -252,3 +252,39 @@ def test_deviations_are_multiples_of_what_is_usual() -> None:
     assert 0 < usual < 2
     assert motion.deviation(elsewhere(expected, 0.2), counted(11)) == pytest.approx(10 * usual)
     assert Motion().deviation(np.eye(4), counted(0)) == 0
+
+
+def turning(count):
+    """Poses of a camera that begins to turn quickly at the last one."""
+    poses = walk(count)
+    poses[-1] = poses[-1] @ se3.exp(np.array([0, 0, 0, 0, 0.5, 0]))
+    return poses
+
+
+@pytest.mark.parametrize(("drift", "proven"), [(0.0, True), (0.1, False)])
+def test_odometry_says_how_the_camera_turned_once_it_has_proved_right(drift, proven) -> None:
+    rng = np.random.default_rng(3)
+    poses = turning(12)
+    shaken = [T @ se3.exp(np.array([0, 0, 0, *rng.normal(0, 0.01, 3)])) for T in poses]
+    world = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
+    sensed = [world @ T @ se3.exp([0, 0, 0, 0, drift * k, 0]) for k, T in enumerate(shaken)]
+    motion = Motion()
+    for k in range(11):
+        motion.sense(sensed[k])
+        motion.follow(shaken[k], counted(k))
+    assert motion.surprise(shaken[11], counted(11))
+    motion.sense(sensed[11])
+    assert (not motion.surprise(shaken[11], counted(11))) is proven
+    if proven:
+        off = se3.inverse(motion.expected(counted(11))) @ shaken[11]
+        assert se3.angle(off) < 1e-9
+
+
+def test_odometry_that_is_missing_for_a_frame_says_nothing() -> None:
+    poses = walk(13)
+    motion = Motion()
+    for k in range(12):
+        motion.sense(None if k == 11 else poses[k])
+        motion.follow(poses[k], counted(k))
+    motion.sense(se3.exp(np.array([0, 0, 0, 0, 1.0, 0])))
+    np.testing.assert_allclose(motion.expected(counted(12)), poses[12], atol=1e-12)

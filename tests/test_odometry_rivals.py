@@ -18,9 +18,10 @@ WALK = [at(-0.4 + 0.03 * k, 0.0, 0.015 * k) for k in range(24)]
 FIRST = 10  # frame with something before the camera
 
 
-def run(frames):
-    tracker = OPTIONS.start(0)
-    return [tracker.push(frame) for frame in frames]
+def run(frames, odometry=None, options=OPTIONS):
+    tracker = options.start(0)
+    given = odometry or [None] * len(frames)
+    return [tracker.push(frame, T) for frame, T in zip(frames, given, strict=True)]
 
 
 def with_plate(frame, left, right, z=0.7):
@@ -79,6 +80,19 @@ def test_a_quick_turn_stays_in_the_component_if_a_search_is_certain() -> None:
     assert "exhaustive search" in steps[12].reason
     for step, pose in zip(steps, path, strict=True):
         assert off(step, pose)[0] < 0.03
+
+
+def test_a_quick_turn_that_odometry_has_seen_needs_no_search() -> None:
+    rng = np.random.default_rng(5)
+    path = [T @ se3.exp([0, 0, 0, *rng.normal(0, 0.01, 3)]) for T in WALK[:12]]
+    path += [at(-0.07 + 0.03 * k, 0.0, 0.615 + 0.015 * k) for k in range(6)]
+    frames = [seen(T, k) for k, T in enumerate(path)]
+    never = replace(OPTIONS, searches=False)
+    assert max(step.component for step in run(frames, options=never)) > 0
+    steps = run(frames, path, never)
+    assert [step.component for step in steps] == [0] * len(path)
+    for step, pose in zip(steps, path, strict=True):
+        assert off(step, pose, path[0])[0] < 0.03
 
 
 def test_a_new_component_goes_on_as_the_camera_moved() -> None:

@@ -64,6 +64,7 @@ class KeyframeTracker(Tracker):
         if np.count_nonzero(view.planes[..., 3] > 0) < self._options.minimum_points:
             return self._lose("too few pixels have a surface")
         now = Moment(frame.index, frame.timestamp)
+        self._motion.sense(T_odometry)
         attempts = self._attempts(view, now, T_odometry)
         found = self._rivals.best(attempts, now, in_sequence=self._in_sequence)
         if found is None:

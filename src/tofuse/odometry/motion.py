@@ -32,6 +32,8 @@ _TIMES, _RECENT = 2.0, 4
 _STILL = np.array([0.003, np.radians(0.2)])
 # Share of the newest motion in the running mean.
 _NEWEST = 0.3
+# Odometry is compared with the velocity over so many turns, at least half of them.
+_PROOF = 10
 # After so many frames without a pose, of which no time is known, the camera can be anywhere.
 _FORGOTTEN = 3
 
@@ -76,10 +78,27 @@ class Motion:
         self._steady: Float64 | None = None  # (6,) the same as a running mean, with less noise
         self._interval = 1.0  # between the last two frames with a pose
         self._differences: deque[Float64] = deque(maxlen=_RECENT)
+        # (4, 4) of odometry beside the images, at the last frame and now; and by which angles it
+        # and the velocity failed to predict recent turns.
+        self._sensed_before: Float64 | None = None
+        self._sensed: Float64 | None = None
+        self._failed: deque[tuple[float, float]] = deque(maxlen=_PROOF)
+
+    def sense(self, T_odometry: Float64 | None) -> None:
+        """Take the pose (4, 4) that odometry gives the coming frame, in any fixed frame."""
+        self._sensed = T_odometry
 
     def expected(self, now: Moment) -> Float64 | None:
-        """Pose if the last motion goes on; None if it is not known."""
-        return self._onward(self._velocity, now)
+        """Pose if the last motion goes on; None if it is not known.
+
+        Turned as odometry says, if it has predicted recent turns better than the velocity did.
+        """
+        T, turn = self._onward(self._velocity, now), self._sensed_turn()
+        if turn is None or self._T is None or not self._odometry_is_proven():
+            return T
+        out = self._T.copy() if T is None else T.copy()
+        out[:3, :3] = self._T[:3, :3] @ turn
+        return out
 
     def steadily(self, now: Moment) -> Float64 | None:
         """Pose if the mean motion of some frames goes on; None if it is not known.
@@ -139,8 +158,34 @@ class Motion:
         usual = np.maximum(np.max(self._differences, axis=0), _STILL)
         return float(np.max(_apart(expected, T) / usual))
 
+    def _sensed_turn(self) -> Float64 | None:
+        """(3, 3) how odometry says that the camera turned since the last frame."""
+        if self._sensed is None or self._sensed_before is None:
+            return None
+        return np.asarray(self._sensed_before[:3, :3].T @ self._sensed[:3, :3], np.float64)
+
+    def _odometry_is_proven(self) -> bool:
+        if len(self._failed) < _PROOF // 2:
+            return False
+        odometry, velocity = np.median(self._failed, axis=0)
+        return bool(odometry < velocity)
+
+    def _compare_odometry(self, T: Float64, now: Moment) -> None:
+        """Take note of how well odometry and velocity predicted a turn."""
+        turn, onward = self._sensed_turn(), self._onward(self._velocity, now)
+        if turn is None or onward is None or self._T is None:
+            return
+        sensed = self._T.copy()
+        sensed[:3, :3] = self._T[:3, :3] @ turn
+        self._failed.append((float(_apart(sensed, T)[1]), float(_apart(onward, T)[1])))
+
     def follow(self, T: Float64, now: Moment) -> None:
         """Take the pose of the next frame."""
+        self._compare_odometry(T, now)
+        self._move(T, now)
+        self._sensed_before, self._sensed = self._sensed, None
+
+    def _move(self, T: Float64, now: Moment) -> None:
         if self._T is None or self._when is None:
             self._T, self._when = T, now
             return
@@ -162,6 +207,7 @@ class Motion:
     def jump(self, T: Float64, now: Moment) -> None:
         """Take the pose of the next frame, but not the motion to it, which does not go on."""
         self._T, self._when = T, now
+        self._sensed_before, self._sensed = self._sensed, None
 
     def restart(self) -> None:
         """Say that the next pose is in another frame of reference.
