@@ -12,7 +12,7 @@ from tofuse.odometry.attempts import Attempt, Attempts
 from tofuse.odometry.motion import Moment, Motion, is_small
 from tofuse.odometry.relocalization import Relocalizer
 from tofuse.odometry.segmentation import Segmentation
-from tofuse.registration.agreement import agreement
+from tofuse.registration.agreement import AgreementOptions, agreement
 from tofuse.registration.verification import UsualFit, finely_scaled, self_scaled
 
 Float64 = NDArray[np.float64]
@@ -94,7 +94,7 @@ class Rivals:
                 continue
             if len(attempt.aligned.unobservable) >= _PLANE and attempt.assessment.conflict:
                 continue  # the motion model, on which most of it relies, explains the view badly
-            if self._agreement(attempt) <= 0:
+            if self._agreement(attempt, finely_scaled(self._usual)) <= 0:
                 continue
             score = self._explained(attempt, attempts, now)
             if score > best_score:
@@ -131,10 +131,10 @@ class Rivals:
         off = self._motion.deviation(T, now)
         return float(np.mean(fits) - _MOTION * np.log1p(off * off))
 
-    def _agreement(self, attempt: Attempt) -> float:
+    def _agreement(self, attempt: Attempt, compare: AgreementOptions | None = None) -> float:
         """Support less contradiction, of both images, for an alignment."""
         target = attempt.reference.target.view
-        compare = self_scaled(self._usual)
+        compare = compare or self_scaled(self._usual)
         return agreement(attempt.view, target, attempt.T_keyframe_camera, compare).score
 
     def _is_surprising(self, attempt: Attempt, now: Moment) -> bool:

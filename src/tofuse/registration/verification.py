@@ -407,7 +407,13 @@ def finely_scaled(usual: UsualFit) -> AgreementOptions:
     coarse = self_scaled(usual)
     if not usual.is_known:
         return coarse
-    return replace(coarse, floor_m=0.0, floor_share=_NO_CONFLICT * usual.rms_share)
+    return replace(
+        coarse,
+        floor_m=0.0,
+        floor_share=_NO_CONFLICT * usual.rms_share,
+        # Twice as much is where an albedo begins to count against a pose.
+        albedo=2 * _NO_CONFLICT * usual.albedo,
+    )
 
 
 # From one place no view is so many times deeper than another of the same scene.
