@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.view_pair import register_pair
 
 Float64 = NDArray[np.float64]
 
@@ -64,12 +66,31 @@ def register(
     """
     start = np.eye(4) if guess is None else se3.check_pose(guess, where="guess")
     rng = np.random.default_rng([seed, 0])
+    if method is None and isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
+        return _register_images(source, target, None if guess is None else start, rng)
     if method is None:
         method = CoarseToFine() if guess is not None else _NoGuess()
     if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
         views = _view(source, "source"), _view(target, "target")
         return method.register(*views, start, rng)
     return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
+
+
+def _register_images(
+    source: RangeFrame, target: RangeFrame, guess: Float64 | None, rng: np.random.Generator
+) -> Registration:
+    """Search, and where images have too little surface for that, register their points."""
+    for frame in (source, target):
+        if len(frame) < _FEWEST_POINTS:
+            raise RegistrationError(f"has {len(frame)} points", where=f"frame {frame.index}")
+    options = SurfaceOptions()
+    found = register_pair(surface_map(source, options), surface_map(target, options), guess)
+    if found is not None:
+        return found
+    plain = _NoGuess() if guess is None else CoarseToFine()
+    start = np.eye(4) if guess is None else guess
+    reason = "there are too few surfaces to verify the pose"
+    return replace(plain.register(source, target, start, rng), believed=False, reason=reason)
 
 
 @dataclass(frozen=True)
