@@ -26,9 +26,11 @@ BELIEVED = 0.9
 # Poses that were followed from a guess are believed without a search only if they are as good as
 # certain, as nothing was compared with them.
 CERTAIN = 0.98
-# Coefficients of `Evidence.searched` and `Evidence.followed`.
-_SEARCHED = np.array([-0.89, 6.42, 1.66, -5.51, -2.37])
-_FOLLOWED = np.array([-4.0, 14.0, -10.0])
+# Coefficients of `Evidence.searched` and `Evidence.followed`, of 234 and 325 simulated poses. On
+# scenes that took no part in the fit the area under the ROC curve is 0.97 and 0.89; of 98 poses
+# that were believed after a search 1 was wrong, of 210 that were followed with 0.97 and more none.
+_SEARCHED = np.array([-0.40, 5.91, 1.11, -2.07, -3.77])
+_FOLLOWED = np.array([0.35, 6.54, -1.09])
 
 
 @dataclass(frozen=True)

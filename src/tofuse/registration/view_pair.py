@@ -63,9 +63,23 @@ class _Pose:
     def degenerate(self) -> int:
         return len(self.aligned.unobservable)
 
+    @property
+    def evidence(self) -> Evidence:
+        """Without rivals to compare with."""
+        return Evidence.of(self.agreement, degenerate=self.degenerate)
+
+    @property
+    def certain(self) -> bool:
+        """Whether it needs no search."""
+        return not self.degenerate and self.evidence.probability >= CERTAIN
+
 
 def register_pair(
-    source: SurfaceMap, target: SurfaceMap, guess: Float64 | None = None
+    source: SurfaceMap,
+    target: SurfaceMap,
+    guess: Float64 | None = None,
+    *,
+    always_search: bool = False,
 ) -> Registration | None:
     """Register two prepared views.
 
@@ -73,6 +87,8 @@ def register_pair(
     ----------
     guess
         (4, 4) T_target_source; the identity unless given.
+    always_search
+        Whether to search even if the pose that was followed from the guess is as good as certain.
 
     Returns
     -------
@@ -87,10 +103,8 @@ def register_pair(
     _check_scale(source, target)
     belief = _belief(source, target)
     near = _followed(source, target, np.eye(4) if guess is None else guess, belief)
-    if near is not None:
-        evidence = Evidence.of(near.agreement, degenerate=near.degenerate)
-        if not near.degenerate and evidence.probability >= CERTAIN:
-            return _registration(source, target, near, evidence, None, belief)
+    if near is not None and near.certain and not always_search:
+        return _registration(source, target, near, near.evidence, None, belief)
     match = search(source, target, belief.search)
     if match is None:
         return None
@@ -99,9 +113,25 @@ def register_pair(
     if guess is not None and near is not None:
         best = _nearer(near, best, rough, belief)
     rival = _rival(best.T_target_source, match, belief.search)
-    score = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
-    evidence = Evidence.of(best.agreement, score, best.degenerate)
+    lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
+    evidence = Evidence.of(best.agreement, lead, best.degenerate)
     return _registration(source, target, best, evidence, rival, belief)
+
+
+def follow(source: SurfaceMap, target: SurfaceMap, guess: Float64) -> Registration | None:
+    """Register two prepared views from a guess (4, 4) alone; None where they don't fit there.
+
+    Raises
+    ------
+    RegistrationError
+        If the depths of the views are of different scale.
+    """
+    _check_scale(source, target)
+    belief = _belief(source, target)
+    near = _followed(source, target, guess, belief)
+    if near is None:
+        return None
+    return _registration(source, target, near, near.evidence, None, belief)
 
 
 def _check_scale(source: SurfaceMap, target: SurfaceMap) -> None:
@@ -130,7 +160,7 @@ def _followed(
     """Align from a guess, first with few iterations; None where the views don't fit there."""
     options = belief.search.agreement
     found = _fitting(source, target, guess, _NEAR, options)
-    if found is None or Evidence.of(found.agreement).probability < CERTAIN:
+    if found is None or not found.certain:
         coarse = align(source, _at(target), guess, _FAR)
         found = _fitting(source, target, coarse.T_world_source, _PATIENT, options) or found
     return found
