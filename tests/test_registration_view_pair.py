@@ -145,11 +145,12 @@ def test_a_small_scene_is_registered_as_a_large_one(pair, far):
 
 
 def test_threads_do_not_change_a_bit(pair, far):
-    with threads(1):
-        found = tofuse.register(*pair)
-    assert found.T_target_source.tobytes() == far.T_target_source.tobytes()
-    assert found.information.tobytes() == far.information.tobytes()
-    assert found.probability == far.probability
+    for count in (1, 5):
+        with threads(count):
+            found = tofuse.register(*pair)
+        assert found.T_target_source.tobytes() == far.T_target_source.tobytes()
+        assert found.information.tobytes() == far.information.tobytes()
+        assert found.probability == far.probability
 
 
 def test_views_of_different_scale_are_refused(pair):
