@@ -68,10 +68,11 @@ class _Pose:
         """Without rivals to compare with."""
         return Evidence.of(self.agreement, degenerate=self.degenerate)
 
-    @property
-    def certain(self) -> bool:
+    def certain(self, belief: Belief) -> bool:
         """Whether it needs no search."""
-        return not self.degenerate and self.evidence.probability >= CERTAIN
+        found = self.evidence
+        held = not self.degenerate and found.contradiction <= belief.contradiction
+        return held and found.probability >= CERTAIN
 
 
 def register_pair(
@@ -103,7 +104,7 @@ def register_pair(
     _check_scale(source, target)
     belief = _belief(source, target)
     near = _followed(source, target, np.eye(4) if guess is None else guess, belief)
-    if near is not None and near.certain and not always_search:
+    if near is not None and near.certain(belief) and not always_search:
         return _registration(source, target, near, near.evidence, None, belief)
     match = search(source, target, belief.search)
     if match is None:
@@ -160,7 +161,7 @@ def _followed(
     """Align from a guess, first with few iterations; None where the views don't fit there."""
     options = belief.search.agreement
     found = _fitting(source, target, guess, _NEAR, options)
-    if found is None or not found.certain:
+    if found is None or not found.certain(belief):
         coarse = align(source, _at(target), guess, _FAR)
         found = _fitting(source, target, coarse.T_world_source, _PATIENT, options) or found
     return found
