@@ -24,6 +24,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 def scripts(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import end_to_end
+    import pairs
     import peers.o3d
     import pose_graphs
     import scaling
@@ -32,6 +33,7 @@ def scripts(monkeypatch):
 
     return {
         "end_to_end": end_to_end,
+        "pairs": pairs,
         "pose_graphs": pose_graphs,
         "peers": peers,
         "scaling": scaling,
@@ -148,6 +150,25 @@ def test_the_tuning_with_the_least_error_is_chosen(scripts, small_room):
     assert chosen is candidates[1]
     assert cleaned
     assert how == "best of 3 on 6 frames, cleaned"
+
+
+def test_the_fit_of_pairs_finds_a_logistic_model(scripts):
+    pairs = scripts["pairs"]
+    rng = np.random.default_rng(0)
+    x = np.column_stack([np.ones(4000), rng.uniform(0, 1, (4000, 2))])
+    p = 1 / (1 + np.exp(-x @ [-1.0, 4.0, -2.0]))
+    right = rng.uniform(size=4000) < p
+    np.testing.assert_allclose(pairs.fitted(x, right), [-1, 4, -2], atol=0.35)
+    ranked, known = np.array([0.9, 0.8, 0.3, 0.2]), np.array([True, False, True, False])
+    assert pairs.roc_area(ranked, known) == 0.75
+    assert pairs.roc_area(known.astype(float), known) == 1
+
+
+def test_pairs_are_spread_over_the_recording(scripts):
+    chosen = scripts["pairs"].chosen
+    assert chosen(10, 3, 3) == [(0, 3), (3, 6), (6, 9)]
+    assert chosen(4, 3, 8) == [(0, 3)]
+    assert chosen(3, 3, 8) == []
 
 
 def test_peers_see_the_same_surface_without_distortion(scripts):

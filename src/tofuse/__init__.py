@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tofuse.recordings.frames import CloudFrame, RangeFrame
     from tofuse.recordings.open import open_recording as open  # noqa: A004
     from tofuse.recordings.recording import Recording
+    from tofuse.registration.base import Registration
     from tofuse.registration.register import register
     from tofuse.results.types import Reconstruction
 
@@ -38,6 +39,7 @@ _HOMES = {
     "RangeFrame": "tofuse.recordings.frames",
     "Reconstruction": "tofuse.results.types",
     "Recording": "tofuse.recordings.recording",
+    "Registration": "tofuse.registration.base",
     "RegistrationError": "tofuse.errors",
     "TofuseError": "tofuse.errors",
     "inspect": "tofuse.inspection.inspect",
@@ -56,6 +58,7 @@ __all__ = [
     "RangeFrame",
     "Reconstruction",
     "Recording",
+    "Registration",
     "RegistrationError",
     "TofuseError",
     "__version__",

@@ -43,6 +43,22 @@ class Registration:
     margin
         By how much the pose leads the best other one, as a share of the points, for methods that
         look at several; None for those that follow one.
+    believed
+        Whether the pose is to be believed; None for methods that can't say. `converged` does not
+        tell: iterations converge at wrong poses too.
+    probability
+        That the pose is right, 0 to 1, see `registration.confidence`; None for methods that can't
+        say.
+    reason
+        Why the pose is not believed, in words; empty otherwise.
+    runner_up
+        (4, 4) the best other T_target_source; None if there is none, or none was looked for.
+    overlap, support
+        Share of the points of both views that land on a surface of the other one, and that lie on
+        it, 0 to 1; None for methods that don't compare views both ways.
+    contradiction
+        Points that lie in the other view's free space, or reflect otherwise, as a share of those
+        that land on a surface.
     """
 
     T_target_source: Float64
@@ -56,6 +72,13 @@ class Registration:
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
     errors: tuple[float, ...] = ()
     margin: float | None = None
+    believed: bool | None = None
+    probability: float | None = None
+    reason: str = ""
+    runner_up: Float64 | None = None
+    overlap: float | None = None
+    support: float | None = None
+    contradiction: float | None = None
 
     @property
     def share(self) -> float:

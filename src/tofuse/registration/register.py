@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.view_pair import register_pair
 
 Float64 = NDArray[np.float64]
 
@@ -34,25 +36,37 @@ def register(
 ) -> Registration:
     """Register two views, or two (N, 3) clouds in m.
 
+    The pose of two range images is followed from the guess. Where both views then agree so well
+    that it is as good as certain, that is the answer, within milliseconds. Else all poses within
+    reach are searched (`registration.search`: turns up to 63 degrees about the vertical and 52
+    about any axis, translations up to 0.6 of the median depth), and the best one is aligned and
+    judged by what both views saw of it and by its lead over the best other pose.
+
+    Clouds, and pairs of a cloud and an image, are registered by generalised ICP with a robust loss
+    from coarse to fine, at resolutions found from the points (`CoarseToFine`); without a guess
+    also by point features (`Fpfh`), where from the identity less than a third of the points find a
+    partner. These methods can't say whether the pose is right.
+
     Parameters
     ----------
     source, target
         Frames of a recording, or arrays; non-finite points are dropped.
     guess
-        (4, 4) T_target_source to start from. Unless given, the identity; and where from there
-        less than a third of the points find a partner, and no method is given, the views are
-        registered without a guess as well (`Fpfh`), which counts if more of them do by half.
+        (4, 4) T_target_source to start from; the identity unless given. Of poses of two images
+        that can't be told apart the one at the guess is taken.
     method
-        What registers; unless given, generalised ICP with a robust loss from coarse to fine, at
-        resolutions found from the points: `CoarseToFine`.
+        What registers, instead of the above.
     seed
         Of the random choice of points, for methods that choose.
 
     Returns
     -------
-    The `T_target_source` maps points of the source into the target's frame. Directions along
-    which the views could slide (three on a flat wall) are in `unobservable`, and stay as they are
-    in the guess.
+    The `T_target_source` maps points of the source into the target's frame, m. Of two images,
+    `believed` says whether it is to be believed, `probability` how probably it is right (within
+    5 % of the depth and 4 degrees), and `reason` why it is not believed: too little support or too
+    little lead over `runner_up`, contradiction, degenerate directions. `converged` says none of
+    that. Directions along which the views could slide (three on a flat wall) are in
+    `unobservable`, and stay as they are in the guess.
 
     Raises
     ------
@@ -60,16 +74,36 @@ def register(
         If an array has the wrong shape or fewer than ten finite points, or the guess is no rigid
         motion.
     RegistrationError
-        If too few points correspond.
+        If too few points correspond, an image is empty, or the median depths of two images differ
+        more than fourfold.
     """
     start = np.eye(4) if guess is None else se3.check_pose(guess, where="guess")
     rng = np.random.default_rng([seed, 0])
+    if method is None and isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
+        return _register_images(source, target, None if guess is None else start, rng)
     if method is None:
         method = CoarseToFine() if guess is not None else _NoGuess()
     if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
         views = _view(source, "source"), _view(target, "target")
         return method.register(*views, start, rng)
     return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
+
+
+def _register_images(
+    source: RangeFrame, target: RangeFrame, guess: Float64 | None, rng: np.random.Generator
+) -> Registration:
+    """Search, and where images have too little surface for that, register their points."""
+    for frame in (source, target):
+        if len(frame) < _FEWEST_POINTS:
+            raise RegistrationError(f"has {len(frame)} points", where=f"frame {frame.index}")
+    options = SurfaceOptions()
+    found = register_pair(surface_map(source, options), surface_map(target, options), guess)
+    if found is not None:
+        return found
+    plain = _NoGuess() if guess is None else CoarseToFine()
+    start = np.eye(4) if guess is None else guess
+    reason = "there are too few surfaces to verify the pose"
+    return replace(plain.register(source, target, start, rng), believed=False, reason=reason)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,420 @@
+"""Two range images far apart, with no guess: how often `tofuse.register` finds the pose, and knows.
+
+`table` gives, over the frames between the two, how many poses are right (within 0.1 m and 4
+degrees), how many of those are believed, and how many are believed and wrong; beside it Open3D's
+RANSAC over FPFH with point-to-plane ICP, if it is installed. `fit` fits the logistic models of
+`tofuse.registration.confidence` to simulated pairs, some of which share nothing, and prints their
+coefficients, with area under the ROC curve and calibration on scenes that took no part in the fit.
+For them a pose is right within 5 % of the depth and 4 degrees.
+
+    python benchmarks/pairs.py table [--data ../shared/data] [--scenes room kitchen]
+    python benchmarks/pairs.py fit
+
+Simulated scenes are made once and kept in benchmarks/out/recordings/pairs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import tofuse
+from peers import o3d_global
+from sequences import DATA, OUT, kinect_loop
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+from tofuse.registration.agreement import agreement
+from tofuse.registration.base import Registration
+from tofuse.registration.confidence import BELIEVED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
+from tofuse.registration.view_pair import follow, register_pair
+from tofuse.simulation.record import simulate
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+RIGHT_M, RIGHT_DEG = 0.1, 4.0
+# Shrinks coefficients a little, so that few pairs that are told apart exactly make no certainty.
+_RIDGE = 0.1
+# Views that share less than this see different places.
+_APART = 0.02
+# How far guesses are off, m and degrees, to which the model for followed poses is fitted.
+_GUESSES = ((0.0, 0.0), (0.1, 4.0), (0.3, 12.0), (0.8, 30.0))
+_BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Views of one scene, and how many views apart pairs are.
+
+    Attributes
+    ----------
+    every
+        Raw frames from one view to the next.
+    family
+        Scenes of one family show the same place.
+    """
+
+    name: str
+    title: str
+    open: Callable[[Path], Recording] = field(repr=False)
+    every: int
+    apart: tuple[int, ...]
+    family: str
+
+
+def _simulated(name: str, scene: str, **options: object) -> Callable[[Path], Recording]:
+    def opened(_data: Path) -> Recording:
+        path = OUT / "recordings" / "pairs" / name
+        if not path.is_dir():
+            unfinished = path.with_suffix(".part")
+            shutil.rmtree(unfinished, ignore_errors=True)
+            unfinished.parent.mkdir(parents=True, exist_ok=True)
+            simulate(scene, unfinished, **options)  # type: ignore[arg-type]
+            os.replace(unfinished, path)
+        return open_recording(path)
+
+    return opened
+
+
+def _kitchen(data: Path) -> Recording:
+    path = data / "sevenscenes_kitchen"
+    if not path.is_dir():
+        raise FileNotFoundError(path)
+    return open_recording(path)
+
+
+def _sim(name: str, title: str, scene: str, every: int, frames: int, **options: object) -> Scene:
+    family = "room" if "room" in scene else scene.removesuffix("-alike")
+    opened = _simulated(name, scene, every=every, frames=frames, **options)
+    apart = tuple(k for k in (1, 2, 3, 4, 6) if k < frames - 1)
+    return Scene(name, title, opened, every, apart, family)
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (
+        _sim("room", "Furnished room, SR4000", "room", 8, 24),
+        _sim("empty-room", "Empty room, SR4000", "empty-room", 8, 24),
+        _sim("plain-room", "Empty room, one albedo", "empty-room", 8, 24, texture=False),
+        _sim("flat", "Flat of four rooms, SR4000", "flat", 12, 48),
+        _sim("flat-alike", "The same, rooms alike", "flat-alike", 12, 48, seed=2),
+        _sim("rail", "Rail, pico flexx", "rail", 40, 7, camera="pico-flexx"),
+        _sim("hall", "Hall, ifm O3R", "hall", 12, 12, camera="ifm-o3r"),
+        Scene("kitchen", "7-Scenes kitchen, Kinect v1", _kitchen, 2, (10, 30, 60), "kitchen"),
+        Scene("kinect", "Loop round boxes, Kinect v2", kinect_loop, 1, (1, 2, 3), "boxes"),
+    )
+}
+# The others take no part in the fit, and show what it is worth for other cameras.
+FITTED = ["room", "empty-room", "plain-room", "flat", "flat-alike"]
+
+
+@lru_cache
+def _opened(name: str, data: Path) -> Recording:
+    return SCENES[name].open(data)
+
+
+def chosen(count: int, apart: int, most: int) -> list[tuple[int, int]]:
+    """At most so many pairs, evenly over the recording."""
+    starts = np.linspace(0, count - apart - 1, min(most, max(count - apart, 0)))
+    return [(int(i), int(i) + apart) for i in starts]
+
+
+def off(found: Float64, true: Float64) -> tuple[float, float]:
+    """Error of a pose, m and degrees."""
+    gap = se3.inverse(true) @ found
+    return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(se3.angle(gap)))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one pair; without a pose the error is infinite."""
+
+    metres: float
+    degrees: float
+    seconds: float
+    believed: bool = False
+    probability: float = 0.0
+
+    @property
+    def right(self) -> bool:
+        return self.metres < RIGHT_M and self.degrees < RIGHT_DEG
+
+
+Method = Callable[[RangeFrame, RangeFrame], Registration | Float64]
+
+
+def outcome(method: Method, source: RangeFrame, target: RangeFrame, true: Float64) -> Outcome:
+    """Register one pair. Its preparation counts."""
+    start = time.perf_counter()
+    try:
+        found = method(source, target)
+    except RegistrationError:
+        return Outcome(np.inf, np.inf, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    if isinstance(found, Registration):
+        believed, probability = bool(found.believed), found.probability or 0.0
+        return Outcome(*off(found.T_target_source, true), seconds, believed, probability)
+    return Outcome(*off(found, true), seconds)
+
+
+def print_table(names: Sequence[str], data: Path, most: int) -> None:
+    """Rows of success over frames apart, and what the probability is worth over all of them."""
+    ours: list[Outcome] = []
+    peer = o3d_global.method()
+    print(
+        "| Views | frames apart | right | of these believed | believed and wrong | s a pair"
+        " | Open3D right | s a pair |\n|---|---|---|---|---|---|---|---|"
+    )
+    for name in names:
+        if not _is_there(name, data):
+            print(f"| {name}: no data |")
+            continue
+        recording = _opened(name, data)
+        for apart in SCENES[name].apart:
+            pairs = chosen(len(recording), apart, most)
+            mine, theirs = [], []
+            for i, j in pairs:
+                source, target = recording[j], recording[i]
+                T = recording.reference
+                if not isinstance(source, RangeFrame) or not isinstance(target, RangeFrame):
+                    raise TypeError(f"{name} has clouds")
+                if T is None or not np.isfinite(T[[i, j]]).all():
+                    continue
+                true = se3.inverse(T[i]) @ T[j]
+                if not ours:
+                    tofuse.register(source, target)  # compiles
+                mine.append(outcome(tofuse.register, source, target, true))
+                ours.append(mine[-1])
+                if peer is not None:
+                    theirs.append(outcome(peer, source, target, true))
+            print(_row(SCENES[name], apart, mine, theirs), flush=True)
+    _print_worth(ours)
+    _print_decoys(names, data, most)
+    if peer is None:
+        print("\nOpen3D: not installed")
+
+
+def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
+    """How many pairs of views of different places are believed; `most` of each two scenes."""
+    rng = np.random.default_rng([1, 4])
+    there = [name for name in names if _is_there(name, data)]
+    found: list[Registration] = []
+    refused = 0
+    for k, name in enumerate(there):
+        for other in there[k + 1 :]:
+            if SCENES[name].family == SCENES[other].family:
+                continue
+            for _ in range(most):
+                a, b = (_opened(n, data) for n in (name, other))
+                try:
+                    found.append(
+                        tofuse.register(a[int(rng.integers(len(a)))], b[int(rng.integers(len(b)))])
+                    )
+                except RegistrationError:
+                    refused += 1
+    if found:
+        believed = sum(bool(f.believed) for f in found)
+        highest = max(f.probability or 0.0 for f in found)
+        print(
+            f"\nof {len(found) + refused} pairs of different places {believed} believed,", end=" "
+        )
+        print(f"{refused} refused, highest probability {highest:.2f}")
+
+
+def _is_there(name: str, data: Path) -> bool:
+    try:
+        _opened(name, data)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _row(scene: Scene, apart: int, mine: list[Outcome], theirs: list[Outcome]) -> str:
+    right = sum(o.right for o in mine)
+    sure = sum(o.right and o.believed for o in mine)
+    wrong = sum(o.believed and not o.right for o in mine)
+    cells = [
+        scene.title,
+        apart * scene.every,
+        f"{right} of {len(mine)}",
+        sure,
+        wrong,
+        f"{np.median([o.seconds for o in mine]):.2f}",
+        f"{sum(o.right for o in theirs)} of {len(theirs)}" if theirs else "",
+        f"{np.median([o.seconds for o in theirs]):.2f}" if theirs else "",
+    ]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _print_worth(found: list[Outcome]) -> None:
+    p = np.array([o.probability for o in found])
+    right = np.array([o.right for o in found])
+    believed = np.array([o.believed for o in found])
+    wrong = believed & ~right
+    print(f"\n{len(found)} pairs, area under the ROC curve {roc_area(p, right):.3f}")
+    print(f"believed {believed.sum()}, of these wrong by more than 0.1 m or 4 degrees", end=" ")
+    far = sum(o.believed and (o.metres > 3 * RIGHT_M or o.degrees > 3 * RIGHT_DEG) for o in found)
+    print(f"{wrong.sum()}, by more than three times that {far}")
+    print_calibration(p, right)
+
+
+def roc_area(p: Float64, right: Bool) -> float:
+    """Share of pairs of a right and a wrong answer that the probability ranks rightly."""
+    a, b = p[right][:, None], p[~right][None]
+    return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")
+
+
+def print_calibration(p: Float64, right: Bool) -> None:
+    """How often poses are right, over what was said of them."""
+    print("\n| probability | pairs | stated | right |\n|---|---|---|---|")
+    for low, high in itertools.pairwise(_BINS):
+        some = (p >= low) & ((p < high) | (high == 1))
+        if some.any():
+            stated, seen = p[some].mean(), right[some].mean()
+            print(f"| {low:g} to {high:g} | {some.sum()} | {stated:.2f} | {seen:.2f} |")
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Regressors (n, k) of poses, whether they are right, and which scene they are of."""
+
+    x: Float64
+    right: Bool
+    scene: NDArray[np.intp]
+
+
+def samples(most: int, data: Path) -> tuple[Samples, Samples]:
+    """Poses that were searched, and poses that were followed from guesses."""
+    searched: list[tuple[Float64, bool, int]] = []
+    followed: list[tuple[Float64, bool, int]] = []
+    rng = np.random.default_rng([1, 3])
+    views = {name: _prepared(name, data) for name in FITTED}
+    for number, name in enumerate(FITTED):
+        maps, T = views[name]
+        for apart in SCENES[name].apart:
+            for i, j in chosen(len(maps), apart, most):
+                true = se3.inverse(T[i]) @ T[j]
+                _add(searched, followed, maps[j], maps[i], true, number, rng)
+        others = [n for n in FITTED if SCENES[n].family != SCENES[name].family]
+        for _ in range(most):
+            other = views[others[int(rng.integers(len(others)))]][0]
+            source, target = (v[int(rng.integers(len(v)))] for v in (maps, other))
+            _add(searched, followed, source, target, None, number, rng)
+        print(f"{name}: {len(searched)} searched, {len(followed)} followed so far", flush=True)
+    return _stacked(searched), _stacked(followed)
+
+
+def _prepared(name: str, data: Path) -> tuple[list[SurfaceMap], Float64]:
+    recording = _opened(name, data)
+    assert recording.reference is not None
+    frames = [frame for frame in recording if isinstance(frame, RangeFrame)]
+    return [surface_map(frame, SurfaceOptions()) for frame in frames], recording.reference
+
+
+def _add(
+    searched: list[tuple[Float64, bool, int]],
+    followed: list[tuple[Float64, bool, int]],
+    source: SurfaceMap,
+    target: SurfaceMap,
+    true: Float64 | None,
+    scene: int,
+    rng: np.random.Generator,
+) -> None:
+    """Register a pair, from no guess and from several; without truth every answer is wrong."""
+
+    def is_right(found: Registration) -> bool:
+        if true is None or agreement(source, target, true).overlap < _APART:
+            return False
+        metres, degrees = off(found.T_target_source, true)
+        near = metres < RIGHT_SHARE * 0.5 * (source.depth + target.depth)
+        return near and np.radians(degrees) < RIGHT_RAD
+
+    try:
+        found = register_pair(source, target, always_search=True)
+        if found is not None:
+            searched.append((_evidence(found).searched, is_right(found), scene))
+        for metres, degrees in _GUESSES:
+            way = rng.standard_normal((2, 3))
+            way *= np.array([[metres], [np.radians(degrees)]]) / np.linalg.norm(
+                way, axis=1, keepdims=True
+            )
+            guess = (np.eye(4) if true is None else true) @ se3.exp(way.ravel())
+            near = follow(source, target, guess)
+            if near is not None and not len(near.unobservable):
+                followed.append((_evidence(near).followed, is_right(near), scene))
+    except RegistrationError:
+        pass
+
+
+def _evidence(found: Registration) -> Evidence:
+    assert found.support is not None
+    assert found.contradiction is not None
+    return Evidence(found.support, found.contradiction, found.margin, len(found.unobservable))
+
+
+def _stacked(rows: list[tuple[Float64, bool, int]]) -> Samples:
+    x, right, scene = zip(*rows, strict=True)
+    return Samples(np.stack(x), np.array(right, bool), np.array(scene))
+
+
+def fitted(x: Float64, right: Bool) -> Float64:
+    """Coefficients of a logistic model by Newton's method; the first regressor is constant."""
+    w = np.zeros(x.shape[1])
+    ridge = np.diag([0.0] + [_RIDGE] * (len(w) - 1))
+    for _ in range(50):
+        p = np.array([logistic(float(v)) for v in x @ w])
+        hessian = x.T @ (x * (p * (1 - p) + 1e-9)[:, None]) + ridge
+        w -= np.linalg.solve(hessian, x.T @ (p - right) + ridge @ w)
+    return w
+
+
+def print_fit(title: str, all_of: Samples) -> None:
+    """The coefficients for all pairs, and how good those are of all scenes but the pair's."""
+    w = fitted(all_of.x, all_of.right)
+    print(f"\n{title}: {len(all_of.right)} poses, {all_of.right.sum()} right")
+    print(f"coefficients {', '.join(f'{v:.2f}' for v in w)}")
+    p = np.empty(len(all_of.right))
+    for scene in np.unique(all_of.scene):
+        mine = all_of.scene == scene
+        other = fitted(all_of.x[~mine], all_of.right[~mine])
+        p[mine] = [logistic(float(v)) for v in all_of.x[mine] @ other]
+    believed = p >= BELIEVED
+    print(f"area under the ROC curve {roc_area(p, all_of.right):.3f}, left out by scene")
+    print(f"believed {believed.sum()}, of these wrong {(believed & ~all_of.right).sum()}")
+    print_calibration(p, all_of.right)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["table", "fit"])
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--scenes", nargs="*", choices=list(SCENES), default=list(SCENES))
+    parser.add_argument("--pairs", type=int, default=8, help="of each step")
+    given = parser.parse_args(arguments)
+    if given.what == "table":
+        print_table(given.scenes, given.data, given.pairs)
+        return
+    searched, followed = samples(given.pairs, given.data)
+    print_fit("Searched: constant, root of margin, support, contradiction, degenerate", searched)
+    print_fit("Followed from a guess: constant, support, contradiction", followed)
+
+
+if __name__ == "__main__":
+    main()

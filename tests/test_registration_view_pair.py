@@ -1,0 +1,224 @@
+"""``tofuse.register`` on two range images: far apart, and whether the pose is believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from made_rooms import BOXES, CAMERA, OTHER, at, seen
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.agreement import Agreement
+from tofuse.registration.coarse_to_fine import CoarseToFine
+from tofuse.registration.confidence import BELIEVED, Evidence
+from tofuse.registration.verification import Belief
+
+# 40 degrees and 0.5 m apart.
+A, B = at(-0.4, 0.3, 0.1), at(-0.1, 0.7, 0.8)
+TRUE = se3.inverse(A) @ B
+
+
+def error(found, true=TRUE):
+    """Metres and degrees."""
+    gap = se3.inverse(true) @ found
+    return np.linalg.norm(gap[:3, 3]), np.degrees(se3.angle(gap))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Source and target."""
+    return seen(B, 1), seen(A, 0)
+
+
+@pytest.fixture(scope="module")
+def far(pair):
+    return tofuse.register(*pair)
+
+
+def test_a_pair_far_apart_is_found_and_believed(far):
+    metres, degrees = error(far.T_target_source)
+    assert metres < 0.02
+    assert degrees < 0.5
+    assert far.believed
+    assert far.probability >= BELIEVED
+    assert far.reason == ""
+    assert far.margin > 0.1
+    assert 0.2 < far.support <= far.overlap < 1
+    assert far.contradiction < 0.05
+    assert np.linalg.eigvalsh(far.information).min() > 0
+
+
+def test_the_covariance_tells_how_large_the_error_is(far):
+    gap = se3.log(se3.inverse(far.T_target_source) @ TRUE)
+    assert gap @ far.information @ gap < 22.5  # 99.9 % of a chi square of six dimensions
+
+
+def test_views_of_different_rooms_are_not_believed(pair):
+    for k, boxes in enumerate((OTHER, BOXES)):
+        half = (3.4, 1.6, 2.9)
+        other = seen(at(0.8, -1.0, 2.4 + k), 7, half=half, boxes=boxes, scene=11 + k)
+        found = tofuse.register(other, pair[1])
+        assert not found.believed
+        assert found.probability < BELIEVED
+        assert found.reason
+
+
+def test_views_of_one_room_that_share_nothing_are_not_believed(pair):
+    away = seen(at(-0.4, 0.3, 0.1 + np.pi), 5)
+    found = tofuse.register(away, pair[1])
+    assert not found.believed
+    assert found.probability < BELIEVED
+
+
+def wall(T_world_camera, index, noise=0.004):
+    """A flat wall of one albedo, 2 m ahead."""
+    rays = np.dstack([CAMERA.rays(), np.ones((CAMERA.height, CAMERA.width))])
+    z = (2 - T_world_camera[2, 3]) / (rays @ T_world_camera[2, :3])
+    z += np.random.default_rng(index).normal(0, noise, z.shape)
+    return RangeFrame(index, 0.0, CAMERA, z.astype(np.float32))
+
+
+def test_a_flat_wall_is_degenerate_and_says_so():
+    T = se3.exp([0.3, 0.1, 0.1, 0.05, 0.15, 0.02])
+    found = tofuse.register(wall(T, 1), wall(np.eye(4), 0))
+    assert len(found.unobservable) == 3
+    np.testing.assert_allclose(np.linalg.norm(found.unobservable, axis=1), 1)
+    assert not found.believed
+    assert "3 directions are degenerate" in found.reason
+
+
+def test_what_a_wall_does_not_hold_stays_as_guessed():
+    T = se3.exp([0.3, 0.1, 0.1, 0.05, 0.15, 0.02])
+    guess = T @ se3.exp([0, 0, 0.04, 0.02, 0.02, 0])
+    found = tofuse.register(wall(T, 1), wall(np.eye(4), 0), guess=guess)
+    assert len(found.unobservable) == 3
+    assert not found.believed
+    # Along the wall's normal it is found, across as guessed.
+    gap = found.T_target_source @ se3.inverse(T)
+    normal_error = gap[2, 3] + (gap[2, :3] - [0, 0, 1]) @ [0, 0, 2]
+    assert abs(normal_error) < 0.003
+    assert np.linalg.norm((se3.inverse(guess) @ found.T_target_source)[:2, 3]) < 0.05
+
+
+def test_a_room_that_repeats_fits_in_several_ways():
+    # Posts at equal distances along a wall, seen from two places that are one and a half apart.
+    posts = tuple(((0.6 * k, 0.2, 1.6), (0.1, 0.9, 0.1), 0.0) for k in range(-12, 13))
+    room = {"half": (9.0, 1.1, 1.8), "boxes": posts, "spots": 0}
+    source, target = (seen(at(x, -0.6, 0.0), k, **room) for k, x in enumerate((0.3, -0.6)))
+    found = tofuse.register(source, target)
+    assert not found.believed
+    assert found.margin < 0.1
+    metres, degrees = error(found.runner_up, found.T_target_source)
+    assert metres > 0.05 or degrees > 4.9
+    assert "another pose fits nearly as well" in found.reason
+
+
+def test_a_good_guess_is_followed_without_a_search(pair):
+    near = seen(A @ se3.exp([0.1, 0.02, -0.05, 0.02, 0.1, 0.0]), 2)
+    true = se3.exp([0.1, 0.02, -0.05, 0.02, 0.1, 0.0])
+    found = tofuse.register(near, pair[1], guess=true @ se3.exp([0.02, 0, 0.02, 0, 0.03, 0]))
+    assert found.margin is None  # nothing was compared with it
+    assert found.believed
+    assert error(found.T_target_source, true)[0] < 0.01
+
+
+def test_a_wrong_guess_is_not_trusted(pair, far):
+    for wrong in ([0.8, 0, -0.5, 0, 0.6, 0], [0, 0.6, 0, 0.4, 0, 0.3]):
+        found = tofuse.register(*pair, guess=se3.exp(wrong))
+        assert found.believed
+        assert error(found.T_target_source, far.T_target_source)[0] < 0.02
+
+
+def test_a_small_scene_is_registered_as_a_large_one(pair, far):
+    small = [replace(f, depth=f.depth * np.float32(0.25)) for f in pair]
+    found = tofuse.register(*small)
+    assert found.believed
+    gap = se3.inverse(far.T_target_source) @ found.T_target_source
+    np.testing.assert_allclose(
+        found.T_target_source[:3, 3], 0.25 * far.T_target_source[:3, 3], atol=0.01
+    )
+    assert np.degrees(se3.angle(gap)) < 1
+
+
+def test_threads_do_not_change_a_bit(pair, far):
+    for count in (1, 5):
+        with threads(count):
+            found = tofuse.register(*pair)
+        assert found.T_target_source.tobytes() == far.T_target_source.tobytes()
+        assert found.information.tobytes() == far.information.tobytes()
+        assert found.probability == far.probability
+
+
+def test_views_of_different_scale_are_refused(pair):
+    large = replace(pair[0], depth=pair[0].depth * np.float32(1000))
+    with pytest.raises(tofuse.RegistrationError, match="frame 1: has a median depth of"):
+        tofuse.register(large, pair[1])
+
+
+def test_empty_images_are_refused(pair):
+    for value in (0, np.nan):
+        empty = replace(pair[0], index=7, depth=np.full_like(pair[0].depth, value))
+        for views in ((empty, pair[1]), (pair[1], empty)):
+            with pytest.raises(tofuse.RegistrationError, match="frame 7: has 0 points"):
+                tofuse.register(*views)
+
+
+def test_equal_depths_are_not_believed(pair):
+    flat = replace(pair[0], depth=np.full_like(pair[0].depth, 1.5), amplitude_image=None)
+    for views in ((flat, flat), (flat, pair[1])):
+        found = tofuse.register(*views)
+        assert not found.believed
+        assert found.reason
+
+
+def test_a_bad_guess_is_refused(pair):
+    for guess in (np.zeros((4, 4)), np.eye(3), np.full((4, 4), np.nan)):
+        with pytest.raises(tofuse.InputError, match="guess"):
+            tofuse.register(*pair, guess=guess)
+
+
+def test_few_pixels_are_registered_but_not_believed(pair):
+    depth = np.where(np.arange(pair[0].depth.size) % 97 == 0, pair[0].depth.ravel(), 0)
+    sparse = replace(pair[0], depth=depth.reshape(pair[0].depth.shape))
+    found = tofuse.register(sparse, pair[1], guess=TRUE)
+    assert found.believed is False
+    assert found.reason == "there are too few surfaces to verify the pose"
+
+
+def test_other_methods_do_not_say(pair):
+    found = tofuse.register(*pair, guess=TRUE, method=CoarseToFine())
+    assert found.believed is None
+    assert found.probability is None
+    assert found.reason == ""
+
+
+def said(support, contradiction, overlap=0.6):
+    return Agreement(overlap, support, contradiction * overlap, 0.0, 0.01, 1000, support)
+
+
+def test_the_probability_follows_the_evidence():
+    good = Evidence.of(said(0.5, 0.0), 0.3)
+    assert good.probability > 0.95
+    for worse in (
+        Evidence.of(said(0.2, 0.0), 0.3),
+        Evidence.of(said(0.5, 0.2), 0.3),
+        Evidence.of(said(0.5, 0.0), 0.02),
+        Evidence.of(said(0.5, 0.0), 0.3, 1),
+    ):
+        assert worse.probability < good.probability
+    assert (
+        Evidence.of(said(0.5, 0.0), -0.1).probability
+        == Evidence.of(said(0.5, 0.0), 0.0).probability
+    )
+    assert Evidence.of(said(0.9, 0.0)).probability > 0.98 > Evidence.of(said(0.3, 0.1)).probability
+
+
+def test_the_reason_names_what_speaks_against_it():
+    words = Evidence.of(said(0.1, 0.2), 0.01, 2).objection(Belief())
+    for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
+        assert part in words
+    assert Evidence.of(said(0.6, 0.0), 0.3).objection(Belief()) == ""
