@@ -175,11 +175,12 @@ class KeyframeTracker(Tracker):
             status = "predicted"
             notes.insert(0, "all directions are degenerate")
         links: tuple[Link, ...] = ()
-        if keyframe is self._last or self._keyframes.is_far(T, keyframe):
+        doubtful = not found.assessment.usual
+        # Where the last keyframe fits no longer, this one takes over; unless it is at fault itself.
+        if (keyframe is self._last and not doubtful) or self._keyframes.is_far(T, keyframe):
             if not self._connected:
                 links = self._relocalizer.links(view, self._keyframes, self._component, self._usual)
                 self._connected = any(link.certain for link in links)
-            doubtful = not found.assessment.usual
             self._keyframes.add(Keyframe(view, T, self._component, doubtful))
         mask = None
         if moving is not None and moving.fraction > NOTICED:
