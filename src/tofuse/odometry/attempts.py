@@ -17,9 +17,9 @@ from tofuse.registration.verification import PATIENT, Assessment, UsualFit
 Float64 = NDArray[np.float64]
 
 # A turn must explain more than standing still does: a flat wall fits any.
-CLEARLY = 1.03
+_CLEARLY = 1.03
 # What is nearly aligned needs a few more iterations, at the resolution of tracking.
-SETTLING = (Level(4, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
+_SETTLING = (Level(4, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,28 +126,18 @@ class Attempts:
         self, T: Float64, view: SurfaceMap, reference: Reference, *, predicted: bool
     ) -> Attempt:
         """Align once more from a pose T (4, 4): other pixels take part now."""
-        scale = self._usual.noise_scale
-        aligned = align(view, [reference.target], T, self._options, usual_scale=scale)
+        aligned = self._align(view, reference, T, self._options)
         return self._attempt(aligned, view, reference, "", predicted=predicted)
 
     def converged(self, attempt: Attempt) -> Attempt:
         """The attempt after as many iterations as it takes: few do for small motions alone."""
         if attempt.aligned.converged:
             return attempt
-        patient = replace(self._options, levels=SETTLING)
-        T = attempt.T_component_camera
+        view, r, T = attempt.view, attempt.reference, attempt.T_component_camera
         kept = T if self._steady is None or not attempt.predicted else self._steady
-        aligned = align(
-            attempt.view,
-            [attempt.reference.target],
-            kept,
-            patient,
-            start=T,
-            usual_scale=self._usual.noise_scale,
-        )
-        made = self._attempt(
-            aligned, attempt.view, attempt.reference, attempt.how, predicted=attempt.predicted
-        )
+        settling = replace(self._options, levels=_SETTLING)
+        aligned = self._align(view, r, kept, settling, start=T)
+        made = self._attempt(aligned, view, r, attempt.how, predicted=attempt.predicted)
         return made if aligned.score >= attempt.aligned.score else attempt
 
     def _make(self) -> Iterator[Attempt]:
@@ -155,14 +145,7 @@ class Attempts:
         if expected is not None:
             kept = expected if self._steady is None else self._steady
             for r in self.references:
-                aligned = align(
-                    view,
-                    [r.target],
-                    kept,
-                    self._options,
-                    start=expected,
-                    usual_scale=self._usual.noise_scale,
-                )
+                aligned = self._align(view, r, kept, self._options, start=expected)
                 yield self._attempt(aligned, view, r, "", predicted=True)
         unknown = "nothing predicted it" if expected is None else "the prediction did not fit"
         for r in self.references:
@@ -177,15 +160,14 @@ class Attempts:
 
     def _turned(self, reference: Reference) -> tuple[Aligned, str]:
         """Align from where the camera was, or from the turn of it that fits best."""
-        view, target, scale = self.view, [reference.target], self._usual.noise_scale
+        view = self.view
         coarse = replace(self._options, levels=PATIENT[:1])
         motions = _turns(view)
         still, *turned = [
-            align(view, target, self.T_last @ motion, coarse, usual_scale=scale)
-            for motion in motions
+            self._align(view, reference, self.T_last @ motion, coarse) for motion in motions
         ]
         best = max(range(len(turned)), key=lambda k: turned[k].score)
-        moves = turned[best].score > CLEARLY * still.score
+        moves = turned[best].score > _CLEARLY * still.score
         chosen, where = (turned[best], "a turn") if moves else (still, "where the camera was")
         if moves:
             where += f" by {np.degrees(se3.angle(motions[1 + best])):.0f} degrees"
@@ -193,7 +175,19 @@ class Attempts:
         how = replace(self._options, levels=PATIENT, common_tilt=0.0, common_slope=0.0)
         T = chosen.T_world_source if moves else self.T_last
         start = chosen.T_world_source
-        return align(view, target, T, how, start=start, usual_scale=scale), where
+        return self._align(view, reference, T, how, start=start), where
+
+    def _align(
+        self,
+        view: SurfaceMap,
+        reference: Reference,
+        T: Float64,
+        options: ProjectiveOptions,
+        *,
+        start: Float64 | None = None,
+    ) -> Aligned:
+        scale = self._usual.noise_scale
+        return align(view, [reference.target], T, options, start=start, usual_scale=scale)
 
 
 def _turns(view: SurfaceMap) -> list[Float64]:

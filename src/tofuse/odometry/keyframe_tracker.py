@@ -20,7 +20,7 @@ from tofuse.odometry.rivals import Rivals
 from tofuse.odometry.segmentation import NOTICED, Segmentation
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
-from tofuse.registration.projective import UNITS
+from tofuse.registration.projective import registration_of
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import Link, UsualFit, comparable
 
@@ -37,7 +37,7 @@ class KeyframeTracker(Tracker):
         self._relocalizer = Relocalizer(options.belief if options.searches else None)
         self._usual = UsualFit(options.unusual)
         self._motion = Motion()
-        self._segmentation = Segmentation()
+        self._segmentation = Segmentation(self._relocalizer)
         self._rivals = Rivals(self._usual, self._motion, self._segmentation, self._relocalizer)
         self._component = -1
         self._connected = True  # whether a certain link joins the component to an earlier one
@@ -195,7 +195,7 @@ class KeyframeTracker(Tracker):
             view,
             self._component,
             links,
-            not found.assessment.usual,
+            doubtful,
             mask,
         )
 
@@ -205,19 +205,7 @@ class KeyframeTracker(Tracker):
         C = covariance(found.view, targets, a, options.alignment, options.uncertainty)
         # Odds that are twice as high as usual double the standard deviation.
         C = C * np.exp(2 * min(found.assessment.excess, 5.0))
-        directions = a.unobservable * UNITS
-        lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-        return Registration(
-            T_target_source=found.T_keyframe_camera,
-            converged=a.converged,
-            iterations=a.iterations,
-            correspondences=a.inliers,
-            points=max(a.compared, 1),
-            error=a.scale,
-            rms_m=a.rms_m,
-            information=np.asarray(np.linalg.inv(C), np.float64),
-            unobservable=directions / np.maximum(lengths, 1e-12),
-        )
+        return registration_of(a, found.T_keyframe_camera, C)
 
 
 def _at_size(mask: Bool, frame: RangeFrame) -> Bool:

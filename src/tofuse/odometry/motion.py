@@ -93,12 +93,11 @@ class Motion:
 
         Turned as odometry says, if it has predicted recent turns better than the velocity did.
         """
-        T, turn = self._onward(self._velocity, now), self._sensed_turn()
-        if turn is None or self._T is None or not self._odometry_is_proven():
+        T = self._onward(self._velocity, now)
+        if not self._odometry_is_proven():
             return T
-        out = self._T.copy() if T is None else T.copy()
-        out[:3, :3] = self._T[:3, :3] @ turn
-        return out
+        sensed = self._as_sensed(self._T if T is None else T)
+        return T if sensed is None else sensed
 
     def steadily(self, now: Moment) -> Float64 | None:
         """Pose if the mean motion of some frames goes on; None if it is not known.
@@ -158,11 +157,14 @@ class Motion:
         usual = np.maximum(np.max(self._differences, axis=0), _STILL)
         return float(np.max(_apart(expected, T) / usual))
 
-    def _sensed_turn(self) -> Float64 | None:
-        """(3, 3) how odometry says that the camera turned since the last frame."""
-        if self._sensed is None or self._sensed_before is None:
+    def _as_sensed(self, T: Float64 | None) -> Float64 | None:
+        """A pose (4, 4), turned since the last frame as odometry says; None where it is silent."""
+        if T is None or self._T is None or self._sensed is None or self._sensed_before is None:
             return None
-        return np.asarray(self._sensed_before[:3, :3].T @ self._sensed[:3, :3], np.float64)
+        out = T.copy()
+        turn = self._sensed_before[:3, :3].T @ self._sensed[:3, :3]
+        out[:3, :3] = self._T[:3, :3] @ turn
+        return out
 
     def _odometry_is_proven(self) -> bool:
         if len(self._failed) < _PROOF // 2:
@@ -172,12 +174,9 @@ class Motion:
 
     def _compare_odometry(self, T: Float64, now: Moment) -> None:
         """Take note of how well odometry and velocity predicted a turn."""
-        turn, onward = self._sensed_turn(), self._onward(self._velocity, now)
-        if turn is None or onward is None or self._T is None:
-            return
-        sensed = self._T.copy()
-        sensed[:3, :3] = self._T[:3, :3] @ turn
-        self._failed.append((float(_apart(sensed, T)[1]), float(_apart(onward, T)[1])))
+        sensed, onward = self._as_sensed(T), self._onward(self._velocity, now)
+        if sensed is not None and onward is not None:
+            self._failed.append((float(_apart(sensed, T)[1]), float(_apart(onward, T)[1])))
 
     def follow(self, T: Float64, now: Moment) -> None:
         """Take the pose of the next frame."""

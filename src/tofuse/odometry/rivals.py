@@ -65,9 +65,7 @@ class Rivals:
                 continue
             if not usual and (attempt.assessment.conflict or not predicted):
                 if predicted:
-                    for again in self._segmentation.alternatives(
-                        attempt, attempts, self._relocalizer
-                    ):
+                    for again in self._segmentation.alternatives(attempt, attempts):
                         if again.assessment.usual and not self._is_surprising(again, now):
                             return again
                     rival = max(rival, self._explained(attempt, attempts, now))
@@ -84,9 +82,7 @@ class Rivals:
         """The alignment that explains the view best, unless both images contradict even that."""
         best, best_score = None, -np.inf
         made = list(attempts)
-        segmented = [
-            a for m in made for a in self._segmentation.alternatives(m, attempts, self._relocalizer)
-        ]
+        segmented = [a for m in made for a in self._segmentation.alternatives(m, attempts)]
         for attempt in (*segmented, *made):
             if not np.isfinite(attempt.aligned.rms_m) or self._is_surprising(attempt, now):
                 continue

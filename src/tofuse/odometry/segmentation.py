@@ -25,7 +25,8 @@ _LOOK_EVERY, _IN_FRONT = 4, 0.005
 class Segmentation:
     """Leaves what moves by itself out of alignments, before and after they are made."""
 
-    def __init__(self) -> None:
+    def __init__(self, relocalizer: Relocalizer) -> None:
+        self._relocalizer = relocalizer
         self._objects = MovingObjects()
         self._moved = False  # whether something did in the last frame
 
@@ -48,9 +49,7 @@ class Segmentation:
         view = without_pixels(keyframe.view, mask)
         return Reference(keyframe, Target(view, se3.inverse(keyframe.T_component_camera)))
 
-    def alternatives(
-        self, attempt: Attempt, attempts: Attempts, relocalizer: Relocalizer
-    ) -> tuple[Attempt, ...]:
+    def alternatives(self, attempt: Attempt, attempts: Attempts) -> tuple[Attempt, ...]:
         """The same alignment without what moves by itself, if it ended where the camera is.
 
         What moves may fill so much of the view that the alignment follows it: then the prediction
@@ -68,7 +67,7 @@ class Segmentation:
                 if not moving.reliable or moving.fraction <= NOTICED:
                     continue
                 again = _again(T, k, moving, attempts, predicted=predicted)
-                if self._moved or not relocalizer.contradicts(
+                if self._moved or not self._relocalizer.contradicts(
                     attempts.whole, k, again.T_keyframe_camera
                 ):
                     found.append(again)

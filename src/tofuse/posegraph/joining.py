@@ -242,8 +242,11 @@ class _Joiner:
         """Take note of a link."""
         if {link.i, link.j} <= self._poses.keys():
             self._links.append(link)
-            for frame in (link.i, link.j):
-                self._nodes[self._component_of[frame]].add(frame)
+            self._remember_ends(link)
+
+    def _remember_ends(self, link: Link) -> None:
+        for frame in (link.i, link.j):
+            self._nodes[self._component_of[frame]].add(frame)
 
     def decide(self, *, single: bool = False) -> None:
         """Join islands while links say so, those with the most support first.
@@ -507,8 +510,8 @@ class _Joiner:
         T_a_b = self._T_a_b(a, b, link)
         a.T.update({c: T_a_b @ T for c, T in b.T.items()})
         a.joins += [*b.joins, *joins]
-        for frame in (f for join in joins for f in (join.link.i, join.link.j)):
-            self._nodes[self._component_of[frame]].add(frame)
+        for join in joins:
+            self._remember_ends(join.link)
         self._islands.remove(b)
 
     def _overlapping(

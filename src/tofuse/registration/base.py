@@ -37,7 +37,7 @@ class Registration:
         (6, 6) information of the right perturbation (tx ty tz rx ry rz) in the source frame:
         1/m^2, 1/(m rad), 1/rad^2.
     unobservable
-        (k, 6) directions of the right perturbation that the data doesn't hold.
+        (k, 6) directions of the right perturbation that the data doesn't constrain.
     errors
         E at every iteration.
     margin

@@ -44,7 +44,7 @@ class Evidence:
     margin
         Lead over the best other pose, a share of the points; None if no other was looked for.
     degenerate
-        Number of directions that the views don't hold.
+        Number of degenerate directions.
     """
 
     support: float

@@ -18,6 +18,7 @@ from tofuse.kernels import alignment as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.middle import median
 from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.base import Registration
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -195,6 +196,31 @@ class Aligned:
     def overlap(self) -> float:
         """Points that land in a target, as a share of all (the mean over targets)."""
         return self.landed / self.points if self.points else 0.0
+
+
+def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> Registration:
+    """An alignment with one target as a registration.
+
+    Parameters
+    ----------
+    T_target_source
+        (4, 4).
+    C
+        (6, 6) covariance of the right perturbation, m and rad.
+    """
+    directions = aligned.unobservable * UNITS
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    return Registration(
+        T_target_source=T_target_source,
+        converged=aligned.converged,
+        iterations=aligned.iterations,
+        correspondences=aligned.inliers,
+        points=max(aligned.compared, 1),
+        error=aligned.scale,
+        rms_m=aligned.rms_m,
+        information=np.asarray(np.linalg.inv(C), np.float64),
+        unobservable=directions / np.maximum(lengths, 1e-12),
+    )
 
 
 def align(

@@ -49,6 +49,8 @@ _MEDIAN_OF_NORMAL = 0.6745
 _LEAST_INLIERS = 40
 # Registrations without a prediction need more iterations than tracking does.
 PATIENT = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(1, 6, 0.0, 0.0))
+# A guess may be off by more than tracking's: a first stage with more slack.
+COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +265,6 @@ class Link:
 _ALIGNMENT = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
 # A search leaves errors of about this size, m and rad.
 _AFTER_SEARCH = replace(_ALIGNMENT, prior_m=0.03, prior_rad=0.03)
-_COARSE = (Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
 
 
 def searched_link(
@@ -354,7 +355,7 @@ def aligned_link(
     if not comparable(source.depth, target.depth):
         return None
     at = [Target(target, np.eye(4))]
-    coarse = align(source, at, T_guess, replace(_ALIGNMENT, levels=_COARSE))
+    coarse = align(source, at, T_guess, replace(_ALIGNMENT, levels=COARSE))
     there = align(source, at, coarse.T_world_source, _ALIGNMENT, usual_scale=usual.noise_scale)
     if not there.converged or len(there.unobservable) or not usual.assess(there).usual:
         return None

@@ -21,15 +21,16 @@ from tofuse.registration.confidence import CERTAIN, Evidence
 from tofuse.registration.projective import (
     UNITS,
     Aligned,
-    Level,
     ProjectiveOptions,
     Target,
     align,
+    registration_of,
 )
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import Candidate, Match, SearchOptions, search
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import (
+    COARSE,
     PATIENT,
     Belief,
     UsualFit,
@@ -42,9 +43,7 @@ Float64 = NDArray[np.float64]
 # Near a guess few iterations do; else as many as a step of a third of the view needs.
 _NEAR = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
 _PATIENT = replace(_NEAR, levels=PATIENT)
-_FAR = replace(
-    _NEAR, levels=(Level(4, 25, 0.15, 0.3), Level(4, 10, 0.03, 0.1), Level(2, 6, 0.005, 0.02))
-)
+_FAR = replace(_NEAR, levels=COARSE)
 # Errors that the search leaves, m and rad, at depths of a metre and more.
 _AFTER_SEARCH = 0.03
 # Both ways of an alignment end no further apart: share of the depth, and rad.
@@ -249,20 +248,10 @@ def _registration(
     rival: Candidate | None,
     belief: Belief,
 ) -> Registration:
-    a = pose.aligned
-    directions = a.unobservable * UNITS
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     reason = evidence.objection(belief)
-    return Registration(
-        T_target_source=pose.T_target_source,
-        converged=a.converged,
-        iterations=a.iterations,
-        correspondences=a.inliers,
-        points=max(a.compared, 1),
-        error=a.scale,
-        rms_m=a.rms_m,
-        information=_information(source, target, pose),
-        unobservable=directions / np.maximum(lengths, 1e-12),
+    found = registration_of(pose.aligned, pose.T_target_source, _covariance(source, target, pose))
+    return replace(
+        found,
         margin=evidence.margin,
         believed=not reason,
         probability=evidence.probability,
@@ -274,10 +263,10 @@ def _registration(
     )
 
 
-def _information(source: SurfaceMap, target: SurfaceMap, pose: _Pose) -> Float64:
+def _covariance(source: SurfaceMap, target: SurfaceMap, pose: _Pose) -> Float64:
     C = covariance(source, _at(target), pose.aligned, pose.options)
     if pose.T_target_source is not pose.aligned.T_world_source:
         # It is known as well as the search leaves it.
         o = pose.options
         C = C + np.diag(np.array([o.prior_m] * 3 + [o.prior_rad] * 3) ** 2)
-    return np.asarray(np.linalg.inv(C), np.float64)
+    return C
