@@ -55,7 +55,7 @@ _RIDGE = 0.1
 # Views that share less than this see different places.
 _APART = 0.02
 # How far guesses are off, m and degrees, to which the model for followed poses is fitted.
-_GUESSES = ((0.0, 0.0), (0.1, 4.0), (0.3, 12.0), (0.8, 30.0))
+GUESSES = ((0.0, 0.0), (0.1, 4.0), (0.3, 12.0), (0.8, 30.0))
 _BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 
@@ -121,13 +121,21 @@ SCENES = {
         Scene("kinect", "Loop round boxes, Kinect v2", kinect_loop, 1, (1, 2, 3), "boxes"),
     )
 }
+# What moves there is the object, before a background that does not.
+OBJECTS = {
+    scene.name: scene
+    for scene in (
+        _sim("torso", "Torso, SR4000", "torso", 6, 20),
+        _sim("box", "Box, SR4000", "box", 6, 20),
+    )
+}
 # The others take no part in the fit, and show what it is worth for other cameras.
 FITTED = ["room", "empty-room", "plain-room", "flat", "flat-alike"]
 
 
 @lru_cache
-def _opened(name: str, data: Path) -> Recording:
-    return SCENES[name].open(data)
+def opened(name: str, data: Path) -> Recording:
+    return (SCENES | OBJECTS)[name].open(data)
 
 
 def chosen(count: int, apart: int, most: int) -> list[tuple[int, int]]:
@@ -186,7 +194,7 @@ def print_table(names: Sequence[str], data: Path, most: int) -> None:
         if not _is_there(name, data):
             print(f"| {name}: no data |")
             continue
-        recording = _opened(name, data)
+        recording = opened(name, data)
         for apart in SCENES[name].apart:
             pairs = chosen(len(recording), apart, most)
             mine, theirs = [], []
@@ -222,7 +230,7 @@ def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
             if SCENES[name].family == SCENES[other].family:
                 continue
             for _ in range(most):
-                a, b = (_opened(n, data) for n in (name, other))
+                a, b = (opened(n, data) for n in (name, other))
                 try:
                     found.append(
                         tofuse.register(a[int(rng.integers(len(a)))], b[int(rng.integers(len(b)))])
@@ -240,7 +248,7 @@ def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
 
 def _is_there(name: str, data: Path) -> bool:
     try:
-        _opened(name, data)
+        opened(name, data)
     except FileNotFoundError:
         return False
     return True
@@ -318,11 +326,11 @@ def samples(most: int, data: Path) -> tuple[Samples, Samples]:
             source, target = (v[int(rng.integers(len(v)))] for v in (maps, other))
             _add(searched, followed, source, target, None, number, rng)
         print(f"{name}: {len(searched)} searched, {len(followed)} followed so far", flush=True)
-    return _stacked(searched), _stacked(followed)
+    return stacked(searched), stacked(followed)
 
 
 def _prepared(name: str, data: Path) -> tuple[list[SurfaceMap], Float64]:
-    recording = _opened(name, data)
+    recording = opened(name, data)
     assert recording.reference is not None
     frames = [frame for frame in recording if isinstance(frame, RangeFrame)]
     return [surface_map(frame, SurfaceOptions()) for frame in frames], recording.reference
@@ -350,7 +358,7 @@ def _add(
         found = register_pair(source, target, always_search=True)
         if found is not None:
             searched.append((_evidence(found).searched, is_right(found), scene))
-        for metres, degrees in _GUESSES:
+        for metres, degrees in GUESSES:
             way = rng.standard_normal((2, 3))
             way *= np.array([[metres], [np.radians(degrees)]]) / np.linalg.norm(
                 way, axis=1, keepdims=True
@@ -369,7 +377,7 @@ def _evidence(found: Registration) -> Evidence:
     return Evidence(found.support, found.contradiction, found.margin, len(found.unobservable))
 
 
-def _stacked(rows: list[tuple[Float64, bool, int]]) -> Samples:
+def stacked(rows: list[tuple[Float64, bool, int]]) -> Samples:
     x, right, scene = zip(*rows, strict=True)
     return Samples(np.stack(x), np.array(right, bool), np.array(scene))
 

@@ -11,6 +11,7 @@ from tofuse.filters.neighbours import NeighbourShare
 from tofuse.filters.noise import Noise
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.odometry.pairwise import Pairwise
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.config import Config, ViewKind
 from tofuse.posegraph.castellani import Castellani
@@ -21,7 +22,7 @@ from tofuse.posegraph.outside import GravityEdges
 from tofuse.posegraph.planes import Planes
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.revisits import Revisits
-from tofuse.registration.coarse_to_fine import CoarseToFine
+from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.icp import algorithm_1
 
 
@@ -55,14 +56,21 @@ def default(kind: ViewKind) -> Config:
 
     Range images get their noise model and lose multipath, as far as that helps, and are aligned
     with keyframes by planes and albedo; only what goes into the model is filtered further. Places
-    that are seen again close loops, and all views are refined together. Clouds are registered from
-    coarse to fine, and moved to the planes that all of them share.
+    that are seen again close loops, and all views are refined together. Clouds are registered in
+    pairs, as far as their poses are believed, and moved to the planes that all of them share.
     """
     base = replace(thesis(kind), method="default")
     if kind == "cloud":
         return replace(
             base,
-            odometry=Sequential(registration=CoarseToFine(), guess="previous"),
+            odometry=Pairwise(),
+            loops=Nearby(
+                max_distance_m=1.5,
+                max_yaw_rad=0.8,
+                min_gap=30,
+                per_frame=6,
+                confirmation=Confirmation(registrations=(AnyPair(),)),
+            ),
             refinement=Planes(),
         )
     return replace(

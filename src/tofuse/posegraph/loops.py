@@ -163,7 +163,12 @@ class Confirmation:
             raise ValueError(f"max_error is {self.max_error}, not above 0")
 
     def objection(self, registration: Registration) -> str:
-        """Return why a registration is not good enough, or nothing if it is."""
+        """Return why a registration is not good enough, or nothing if it is.
+
+        A method that says whether its pose is to be believed decides by itself.
+        """
+        if registration.believed is not None:
+            return registration.reason
         if registration.correspondences == 0 or registration.share < self.min_share:
             return (
                 f"only {registration.share:.0%} of the points correspond, "

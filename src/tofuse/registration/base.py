@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.geometry import se3
 from tofuse.recordings.frames import Frame
 
 Float64 = NDArray[np.float64]
@@ -84,6 +85,28 @@ class Registration:
     def share(self) -> float:
         """Corresponding points as a share of the source's points, 0 to 1."""
         return self.correspondences / self.points if self.points else 0.0
+
+    def between(self, T_a_target: Float64, T_source_b: Float64) -> Registration:
+        """The same between other frames (4, 4): of source b in target a.
+
+        Parameters
+        ----------
+        T_a_target
+            Maps the target's frame into a.
+        T_source_b
+            Maps b into the source's frame.
+        """
+        inward = se3.adjoint(T_source_b)
+        free = self.unobservable @ np.linalg.inv(inward).T
+        lengths = np.linalg.norm(free, axis=1, keepdims=True)
+        other = self.runner_up
+        return replace(
+            self,
+            T_target_source=T_a_target @ self.T_target_source @ T_source_b,
+            information=inward.T @ self.information @ inward,
+            unobservable=free / np.maximum(lengths, 1e-12),
+            runner_up=None if other is None else T_a_target @ other @ T_source_b,
+        )
 
 
 class Registrar(Protocol):

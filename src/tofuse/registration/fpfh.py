@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.kernels import cloud_matching as kernels
 from tofuse.kernels.kdtree import KdTree
+from tofuse.kernels.threads import run_chunks
 from tofuse.parts import part
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
 from tofuse.registration.reduce import reduced
 from tofuse.registration.sample_consensus import (
+    Consensus,
     ConsensusOptions,
     Pairs,
     Way,
@@ -46,8 +49,6 @@ _DISTINCT, _DISTINCT_RAD = 4.0, 0.3
 _REACHES, _FEWEST = (4.0, 3.0, 3.0, 2.0, 2.0, 2.0), 6
 # Cosine of the angle between normals that fit.
 _ALIKE = 0.8
-# Distances of descriptors are worked out for so many points at a time.
-_ROWS = 256
 
 
 @part("registration", "fpfh")
@@ -118,27 +119,43 @@ class Fpfh(Registrar):
         RegistrationError
             If too few matches agree on a motion, or, once refined, too few points correspond.
         """
+        found = self.candidates(source, target, rng)
+        best = found.poses[0]
+        rival = found.poses[1].share if len(found.poses) > 1 else 0.0
+        first = registration_of(found.pairs, best.agreed, best.share - rival)
+        if not self.refine:
+            return first
+        fine = CoarseToFine(coarsest=found.size)
+        finer = fine.register(source, target, best.T_target_source, rng)
+        return replace(finer, margin=first.margin)
+
+    def candidates(self, source: Frame, target: Frame, rng: np.random.Generator) -> Candidates:
+        """Find the poses that many matches agree on, and how well the averaged views fit there.
+
+        Raises
+        ------
+        RegistrationError
+            If too few matches agree on a motion.
+        """
         size = _COARSER * max(spacing(source), spacing(target))
         size, data, model = reduced(source, target, size, self.points)
         there, here = self._described(data, size), self._described(model, size)
         i, j = mutually_nearest(there.histograms, here.histograms)
         variance = np.full(len(i), 2 * (_SCATTER * size) ** 2)
         pairs = Pairs(there.points[i], here.points[j], variance)
-        found = consensus(pairs, self._consensus(size), rng)
         tree = KdTree(here.points)
-        settled = [_settled(there, here, tree, c.T_target_source, size) for c in found]
-        order = sorted(range(len(found)), key=lambda k: (-settled[k][1], k))
-        best = order[0]
-        T = settled[best][0]
-        # What settles where the best does is no rival.
-        rivals = [settled[k][1] for k in order[1:] if _apart(settled[k][0], T, there, size)]
-        first = registration_of(pairs, found[best], settled[best][1] - max(rivals, default=0.0))
-        if not self.refine:
-            return first
-        finer = CoarseToFine(coarsest=size).register(source, target, T, rng)
-        return replace(finer, margin=first.margin)
+        settled = [
+            Candidate(*_settled(there, here, tree, c.T_target_source, size), c)
+            for c in consensus(pairs, self._consensus(size), rng)
+        ]
+        distinct: list[Candidate] = []
+        for one in sorted(settled, key=lambda c: -c.share):
+            # What settles where a better one does is no rival.
+            if all(_apart(one.T_target_source, c.T_target_source, there, size) for c in distinct):
+                distinct.append(one)
+        return Candidates(size, pairs, tuple(distinct))
 
-    def _described(self, view: CloudFrame, size: float) -> _Described:
+    def _described(self, view: CloudFrame, size: float) -> Described:
         shape = shape_at(view, np.arange(len(view)), self.neighbours)
         # What is not on a surface has no shape around it, and spoils that of its neighbours.
         known = np.isfinite(shape.normals).all(1) & (shape.roughness < _ROUGHEST)
@@ -148,16 +165,44 @@ class Fpfh(Registrar):
                 f"has {len(points)} points on surfaces, too few to be matched",
                 where=f"frame {view.index}",
             )
-        return _Described(points, normals, fpfh(points, normals, self.reach * size, self.signed))
+        return Described(points, normals, fpfh(points, normals, self.reach * size, self.signed))
 
 
 @dataclass(frozen=True, eq=False)
-class _Described:
+class Described:
     """Points (n, 3) of a view, their normals (n, 3), and histograms (n, 33)."""
 
     points: Float64
     normals: Float64
     histograms: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose T_target_source (4, 4), the share of averaged points that fit, and its matches."""
+
+    T_target_source: Float64
+    share: float
+    agreed: Consensus
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What matches of two views agree on.
+
+    Attributes
+    ----------
+    size
+        Resolution of the averaged views, m.
+    pairs
+        All matches.
+    poses
+        Distinct ones, that under which most points fit first.
+    """
+
+    size: float
+    pairs: Pairs
+    poses: tuple[Candidate, ...]
 
 
 def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float64:
@@ -178,35 +223,13 @@ def fpfh(points: Float64, normals: Float64, reach: float, signed: bool) -> Float
     """
     n = len(points)
     near, squared = KdTree(points).neighbours(points, min(_MOST_NEAR + 1, n))
-    i = np.repeat(np.arange(n), near.shape[1])
-    j = near.ravel()
-    distance = np.sqrt(squared.ravel())
-    use = (i != j) & (distance > 0) & (distance <= reach)
-    i, j, distance = i[use], j[use], distance[use]
-    d = (points[j] - points[i]) / distance[:, None]
-    u, other = normals[i], normals[j]
-    v = np.cross(u, d)
-    length = np.linalg.norm(v, axis=1)
-    v /= np.maximum(length, 1e-12)[:, None]
-    w = np.cross(u, v)
-    alpha, phi = (v * other).sum(1), (u * d).sum(1)
-    across, along = (w * other).sum(1), (u * other).sum(1)
-    if signed:
-        theta = np.arctan2(across, along) / np.pi
-    else:
-        alpha, phi = 2 * np.abs(alpha) - 1, 2 * np.abs(phi) - 1
-        theta = 4 * np.arctan2(np.abs(across), np.abs(along)) / np.pi - 1
-    own = np.zeros((n, 3, _BINS))
-    for k, angle in enumerate((alpha, phi, theta)):
-        place = np.clip(((angle + 1) / 2 * _BINS).astype(np.int64), 0, _BINS - 1)
-        own[:, k] = np.bincount(i * _BINS + place, minlength=n * _BINS).reshape(n, _BINS)
-    own = (own / np.maximum(own.sum(2, keepdims=True), 1)).reshape(n, 3 * _BINS)
-    weight = reach / distance
-    total = np.bincount(i, weight, minlength=n)
-    shared = np.stack(
-        [np.bincount(i, weight * own[j, k], minlength=n) for k in range(3 * _BINS)], axis=1
+    own, around = np.empty((n, 3, _BINS)), np.empty((n, 3 * _BINS))
+    run_chunks(
+        lambda a, b: kernels.histograms(points, normals, near, squared, reach, signed, own, a, b), n
     )
-    return own + shared / np.maximum(total, 1e-12)[:, None]
+    flat = own.reshape(n, 3 * _BINS)
+    run_chunks(lambda a, b: kernels.weighted_means(flat, near, squared, reach, around, a, b), n)
+    return flat + around
 
 
 def mutually_nearest(a: Float64, b: Float64) -> tuple[Int64, Int64]:
@@ -219,17 +242,15 @@ def mutually_nearest(a: Float64, b: Float64) -> tuple[Int64, Int64]:
 
 def _nearest(a: Float64, b: Float64) -> Int64:
     """(n,) position in b (m, d) of the row nearest to each of a (n, d); the first of equals."""
+    rows = np.ascontiguousarray(a, np.float32)
+    columns = np.ascontiguousarray(b.T, np.float32)
     nearest = np.empty(len(a), np.int64)
-    for k in range(0, len(a), _ROWS):
-        apart = np.zeros((len(a[k : k + _ROWS]), len(b)))
-        for axis in range(a.shape[1]):
-            apart += (a[k : k + _ROWS, axis, None] - b[None, :, axis]) ** 2
-        nearest[k : k + _ROWS] = np.argmin(apart, axis=1)
+    run_chunks(lambda i, j: kernels.nearest_rows(rows, columns, nearest, i, j), len(a))
     return nearest
 
 
 def _settled(
-    source: _Described, target: _Described, tree: KdTree, T: Float64, size: float
+    source: Described, target: Described, tree: KdTree, T: Float64, size: float
 ) -> tuple[Float64, float]:
     """Where ICP over the averaged points ends, and the share of the source's that then fit."""
     for far in _REACHES:
@@ -243,7 +264,7 @@ def _settled(
 
 
 def _fitting(
-    source: _Described, target: _Described, tree: KdTree, T: Float64, far: float
+    source: Described, target: Described, tree: KdTree, T: Float64, far: float
 ) -> tuple[NDArray[np.bool_], Int64]:
     """(n,) points of the source near a surface of the target that is turned alike, and which."""
     nearest, squared = tree.nearest(se3.transform(T, source.points))
@@ -252,7 +273,7 @@ def _fitting(
     return (squared < far * far) & alike, nearest
 
 
-def _apart(T: Float64, other: Float64, view: _Described, size: float) -> bool:
+def _apart(T: Float64, other: Float64, view: Described, size: float) -> bool:
     """Whether two motions take a view to different places."""
     middle = np.median(view.points, 0)[None]
     shift = np.linalg.norm(se3.transform(T, middle) - se3.transform(other, middle))

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofuse.errors import InputError, RegistrationError
+from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.coarse_to_fine import CoarseToFine
-from tofuse.registration.fpfh import Fpfh
-from tofuse.registration.view_pair import register_pair
 
 Float64 = NDArray[np.float64]
 
 _FEWEST_POINTS = 10
 _FURTHEST_M = 1e9
-# Share of the points with a partner below which a start is doubted, and how many times as many
-# another one must give.
-_LEAST_SHARE, _CLEARLY = 1 / 3, 1.5
+# Clouds that are further apart have different frames.
+_OTHER_FRAME_M = 1e4
 
 
 def register(
@@ -36,16 +29,13 @@ def register(
 ) -> Registration:
     """Register two views, or two (N, 3) clouds in m.
 
-    The pose of two range images is followed from the guess. Where both views then agree so well
-    that it is as good as certain, that is the answer, within milliseconds. Else all poses within
-    reach are searched (`registration.search`: turns up to 63 degrees about the vertical and 52
-    about any axis, translations up to 0.6 of the median depth), and the best one is aligned and
-    judged by what both views saw of it and by its lead over the best other pose.
-
-    Clouds, and pairs of a cloud and an image, are registered by generalised ICP with a robust loss
-    from coarse to fine, at resolutions found from the points (`CoarseToFine`); without a guess
-    also by point features (`Fpfh`), where from the identity less than a third of the points find a
-    partner. These methods can't say whether the pose is right.
+    The pose is followed from the guess. Where both views then agree so well that it is as good as
+    certain, that is the answer, within milliseconds for images. Else poses are searched, and the
+    best one is aligned and judged by what both views say of it and by its lead over the best other
+    pose. Two images, and clouds whose points show that they were seen from their origin, are
+    searched exhaustively (`registration.search`: turns up to 63 degrees about the vertical and 52
+    about any axis, translations up to 0.6 of the median depth). Clouds are also searched by shapes
+    that are alike (`registration.fpfh`), under any rotation.
 
     Parameters
     ----------
@@ -61,12 +51,13 @@ def register(
 
     Returns
     -------
-    The `T_target_source` maps points of the source into the target's frame, m. Of two images,
-    `believed` says whether it is to be believed, `probability` how probably it is right (within
-    5 % of the depth and 4 degrees), and `reason` why it is not believed: too little support or too
-    little lead over `runner_up`, contradiction, degenerate directions. `converged` says none of
-    that. Directions along which the views could slide (three on a flat wall) are in
-    `unobservable`, and stay as they are in the guess.
+    The `T_target_source` maps points of the source into the target's frame, m. `believed` says
+    whether it is to be believed, `probability` how probably it is right (images: within 5 % of the
+    depth and 4 degrees; clouds: within 2 % of the extent), and `reason` why it is not believed: too
+    little support or too little lead over `runner_up`, contradiction, degenerate directions.
+    `converged` says none of that. Directions along which the views could slide (three on a flat
+    wall) are in `unobservable`, and stay as they are in the guess. A `method` that says nothing of
+    its pose leaves `believed` None.
 
     Raises
     ------
@@ -77,84 +68,48 @@ def register(
         If too few points correspond, an image is empty, or the median depths of two images differ
         more than fourfold.
     """
-    start = np.eye(4) if guess is None else se3.check_pose(guess, where="guess")
+    start = None if guess is None else se3.check_pose(guess, where="guess")
     rng = np.random.default_rng([seed, 0])
-    if method is None and isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
-        return _register_images(source, target, None if guess is None else start, rng)
-    if method is None:
-        method = CoarseToFine() if guess is not None else _NoGuess()
     if isinstance(source, RangeFrame | CloudFrame) or isinstance(target, RangeFrame | CloudFrame):
-        views = _view(source, "source"), _view(target, "target")
-        return method.register(*views, start, rng)
+        return _registered(_view(source, "source"), _view(target, "target"), start, method, rng)
     return _register_arrays(_cloud(source, "source"), _cloud(target, "target"), start, method, rng)
 
 
-def _register_images(
-    source: RangeFrame, target: RangeFrame, guess: Float64 | None, rng: np.random.Generator
+def _registered(
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    method: Registrar | None,
+    rng: np.random.Generator,
 ) -> Registration:
-    """Search, and where images have too little surface for that, register their points."""
-    for frame in (source, target):
-        if len(frame) < _FEWEST_POINTS:
-            raise RegistrationError(f"has {len(frame)} points", where=f"frame {frame.index}")
-    options = SurfaceOptions()
-    found = register_pair(surface_map(source, options), surface_map(target, options), guess)
-    if found is not None:
-        return found
-    plain = _NoGuess() if guess is None else CoarseToFine()
-    start = np.eye(4) if guess is None else guess
-    reason = "there are too few surfaces to verify the pose"
-    return replace(plain.register(source, target, start, rng), believed=False, reason=reason)
-
-
-@dataclass(frozen=True)
-class _NoGuess(Registrar):
-    """From the identity, and where that leads nowhere, from what is alike in both views."""
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
-    def register(
-        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
-    ) -> Registration:
-        """See `Registrar.register`."""
-        near, failure = None, None
-        try:
-            near = CoarseToFine().register(source, target, guess, rng)
-        except RegistrationError as error:
-            failure = error
-        if near is not None and near.share >= _LEAST_SHARE:
-            return near
-        try:
-            far = Fpfh().register(source, target, guess, rng)
-        except RegistrationError:
-            far = None
-        if far is not None and (near is None or far.share > _CLEARLY * near.share):
-            return far
-        if near is None:
-            assert failure is not None
-            raise failure
-        return near
+    if method is None:
+        return AnyPair().register(source, target, guess, rng)
+    return method.register(source, target, np.eye(4) if guess is None else guess, rng)
 
 
 def _register_arrays(
-    source: Float64, target: Float64, guess: Float64, method: Registrar, rng: np.random.Generator
+    source: Float64,
+    target: Float64,
+    guess: Float64 | None,
+    method: Registrar | None,
+    rng: np.random.Generator,
 ) -> Registration:
-    """Register about the middle of the target: map coordinates are too long for float32."""
-    to, back = np.eye(4), np.eye(4)
-    to[:3, 3] = np.median(target, 0)
-    back[:3, 3] = -to[:3, 3]
+    """Register about the middle of the target: map coordinates are too long for float32.
+
+    A source that is far from there, as in a frame of its own, is moved to its own middle.
+    """
+    there, here = np.median(source, 0), np.median(target, 0)
+    there = there if np.linalg.norm(there - here) > _OTHER_FRAME_M else here
     data, model = (
-        CloudFrame(index, 0.0, (points + back[:3, 3]).astype(np.float32), origin=back[:3, 3])
-        for index, points in ((1, source), (0, target))
+        CloudFrame(index, 0.0, (points - middle).astype(np.float32), origin=-middle)
+        for index, points, middle in ((1, source, there), (0, target, here))
     )
-    found = method.register(data, model, back @ guess @ to, rng)
-    inward = se3.adjoint(back)
-    free = found.unobservable @ se3.adjoint(to).T
-    return replace(
-        found,
-        T_target_source=to @ found.T_target_source @ back,
-        information=inward.T @ found.information @ inward,
-        unobservable=free / np.linalg.norm(free, axis=1, keepdims=True),
-    )
+    to_target, to_source = np.eye(4), np.eye(4)
+    to_target[:3, 3], to_source[:3, 3] = here, there
+    from_source, from_target = se3.inverse(to_source), se3.inverse(to_target)
+    start = None if guess is None else from_target @ guess @ to_source
+    found = _registered(data, model, start, method, rng)
+    return found.between(to_target, from_source)
 
 
 def _view(view: Frame | ArrayLike, name: str) -> Frame:

@@ -1,0 +1,400 @@
+"""Two bare clouds far apart, with no guess: how often `tofuse.register` finds the pose, and knows.
+
+`table` gives, over kinds of pairs, how many poses are right (within 0.1 m, or 2 % of the extent
+where that is less, at the middle of the source, and 4 degrees), how many of those are believed, and
+how many are believed and wrong; beside it Open3D's RANSAC over FPFH with point-to-plane ICP, and
+KISS-Matcher, as far as they are installed, with voxels of 1/100 of the target's extent. Clouds have
+at most 20,000 points. "moved" clouds were taken to another frame, so that nothing is known of
+where they were seen from; of "sparse" pairs the source has a tenth of the target's points. `fit`
+fits the logistic models of `tofuse.registration.confidence` to simulated pairs.
+
+    python benchmarks/cloud_pairs.py table [--data ../shared/data] [--kinds scans]
+    python benchmarks/cloud_pairs.py fit
+
+Simulated scenes are made once and kept in benchmarks/out/recordings/pairs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import pairs
+import tofuse
+from peers import kiss_global, o3d_global
+from sequences import DATA
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.recordings.open import open_recording
+from tofuse.registration.base import Registration
+from tofuse.registration.cloud_pair import follow_clouds, register_clouds
+from tofuse.registration.confidence import CloudEvidence
+from tofuse.registration.viewpoint import viewpoint_of
+from tofuse.simulation import scene as scenes
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+POINTS = 20_000
+RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.1, 0.02, 4.0
+# What moves by itself stands before a background that does not.
+_OBJECT_M = 1.6
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Points (n, 3) of two views in m, and the true T_target_source; None if they share nothing."""
+
+    source: Float64
+    target: Float64
+    true: Float64 | None
+
+    @property
+    def allowed_m(self) -> float:
+        """Error up to which a pose is right."""
+        low, high = np.percentile(self.target, [2, 98], axis=0)
+        return min(RIGHT_M, RIGHT_SHARE * float(np.linalg.norm(high - low)))
+
+    def off(self, T: Float64) -> tuple[float, float]:
+        """Error at the middle of the source in m, and in degrees."""
+        if self.true is None:
+            return np.inf, np.inf
+        middle = np.median(self.source, 0)[None]
+        gap = se3.transform(T, middle) - se3.transform(self.true, middle)
+        turned = se3.angle(se3.inverse(self.true) @ T)
+        return float(np.linalg.norm(gap)), float(np.degrees(turned))
+
+    def is_right(self, T: Float64) -> bool:
+        metres, degrees = self.off(T)
+        return metres < self.allowed_m and degrees < RIGHT_DEG
+
+
+Maker = Callable[[Path, int, np.random.Generator], Iterator[Pair]]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Pairs of one kind; those of one family show the same place."""
+
+    name: str
+    title: str
+    make: Maker = field(repr=False)
+    family: str
+    fitted: bool = False
+
+
+def thinned(points: Float32, rng: np.random.Generator, most: int = POINTS) -> Float64:
+    """At most so many points, chosen at random."""
+    chosen = np.sort(rng.permutation(len(points))[:most])
+    return points[chosen].astype(np.float64)
+
+
+def frames(
+    name: str, apart: tuple[int, ...], *, moved: bool = False, sparse: bool = False
+) -> Maker:
+    """Points of a camera's frames, of a scene of `pairs.py`."""
+
+    def make(data: Path, most: int, rng: np.random.Generator) -> Iterator[Pair]:
+        recording = pairs.opened(name, data)
+        T = recording.reference
+        assert T is not None
+        for step in apart:
+            for i, j in pairs.chosen(len(recording), step, most):
+                if not np.isfinite(T[[i, j]]).all():
+                    continue
+                source, target = (_object(recording[k], name).points for k in (j, i))
+                if min(len(source), len(target)) < 100:
+                    continue
+                source = thinned(source, rng, POINTS // 10 if sparse else POINTS)
+                pair = Pair(source, thinned(target, rng), se3.inverse(T[i]) @ T[j])
+                yield _elsewhere(pair, rng) if moved else pair
+
+    return make
+
+
+def _object(frame: Frame, name: str) -> Frame:
+    if name not in ("torso", "box"):
+        return frame
+    near = np.linalg.norm(frame.points, axis=1) < _OBJECT_M
+    return CloudFrame(frame.index, frame.timestamp, frame.points[near])
+
+
+def _elsewhere(pair: Pair, rng: np.random.Generator) -> Pair:
+    """The same pair in other frames, turned by any angle."""
+    assert pair.true is not None
+    A, B = (_any_motion(rng) for _ in range(2))
+    source, target = se3.transform(A, pair.source), se3.transform(B, pair.target)
+    return Pair(source, target, B @ pair.true @ se3.inverse(A))
+
+
+def _any_motion(rng: np.random.Generator) -> Float64:
+    axis = rng.standard_normal(3)
+    axis *= rng.uniform(0, np.pi) / np.linalg.norm(axis)
+    return np.asarray(se3.exp(np.r_[rng.uniform(-3, 3, 3), axis]))
+
+
+def scans(name: str, *, moved: bool = False, points: int = 200_000, seed: int = 0) -> Maker:
+    """Spherical scans through a simulated scene, with any heading: neighbours, and every second."""
+
+    def make(_data: Path, most: int, rng: np.random.Generator) -> Iterator[Pair]:
+        taken = list(scanned(name, most + 1, points, seed))
+        for apart in (1, 2):
+            for (T_a, a), (T_b, b) in zip(taken[:-apart], taken[apart:], strict=True):
+                pair = Pair(b.astype(float), a.astype(float), se3.inverse(T_a) @ T_b)
+                yield _elsewhere(pair, rng) if moved else pair
+
+    return make
+
+
+def scanned(name: str, most: int, points: int, seed: int) -> Iterator[tuple[Float64, Float32]]:
+    """Poses (4, 4) in the room and points of a scanner with a grid of equal angles, z up."""
+    built, sequence = scenes.build(name, seed=seed)
+    rng = np.random.default_rng([seed, 5])
+    rows = int(np.sqrt(points / 2))
+    up = np.linspace(-0.39 * np.pi, 0.5 * np.pi, rows)
+    around = np.linspace(-np.pi, np.pi, 2 * rows, endpoint=False)
+    elevation, azimuth = np.meshgrid(up, around, indexing="ij")
+    level = np.cos(elevation)
+    rays = np.stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1
+    ).reshape(-1, 3)
+    last, count = np.full(3, np.inf), 0
+    for frame in range(0, 1140, 3):
+        at = sequence.T_room_camera(frame / sequence.frame_rate_hz)[:3, 3]
+        if np.linalg.norm(at - last) < 2.0:
+            continue
+        last, count = at, count + 1
+        heading = rng.uniform(-np.pi, np.pi)
+        T = np.asarray(se3.exp(np.array([0, 0, 0, 0, 0, heading])))
+        T[:3, 3] = at
+        hits = built.cast(at, rays @ T[:3, :3].T)
+        seen = np.isfinite(hits.distance)
+        distance = hits.distance[seen] + 0.003 * rng.standard_normal(int(seen.sum()))
+        yield T, (rays[seen] * distance[:, None]).astype(np.float32)
+        if count == most:
+            return
+
+
+def _lidar_pair(data: Path, _most: int, _rng: np.random.Generator) -> Iterator[Pair]:
+    folder = data / "lidar_pair_gt"
+    if not folder.is_dir():
+        raise FileNotFoundError(folder)
+    source, target = (open_recording(folder / f"{name}.ply")[0] for name in ("source", "target"))
+    true = np.loadtxt(folder / "T_target_source.txt").reshape(4, 4)
+    yield Pair(source.points.astype(float), target.points.astype(float), true)
+
+
+_FRAMES = (
+    ("room", "Furnished room, SR4000", (1, 2, 3), "room", True),
+    ("empty-room", "Empty room, SR4000", (1, 3), "room", True),
+    ("flat", "Flat of four rooms, SR4000", (1, 2, 3), "flat", True),
+    ("flat-alike", "The same, rooms alike", (1, 2), "flat", True),
+    ("torso", "Torso alone, SR4000", (1, 2, 4), "torso", True),
+    ("rail", "Rail, pico flexx", (1, 2), "rail", False),
+    ("hall", "Hall, ifm O3R", (1, 2), "hall", False),
+    ("box", "Box alone, SR4000", (1, 2, 4), "box", False),
+    ("kitchen", "7-Scenes kitchen, Kinect v1", (10, 30, 60), "kitchen", False),
+)
+KINDS = {
+    kind.name: kind
+    for kind in (
+        *(
+            Kind(name, title, frames(name, apart), family, fitted)
+            for name, title, apart, family, fitted in _FRAMES
+        ),
+        *(
+            Kind(
+                f"{name}-moved", f"{title}, moved", frames(name, apart, moved=True), family, fitted
+            )
+            for name, title, apart, family, fitted in _FRAMES
+        ),
+        *(
+            Kind(
+                f"{name}-sparse",
+                f"{title}, sparse",
+                frames(name, apart, sparse=True),
+                family,
+                False,
+            )
+            for name, title, apart, family, _ in _FRAMES
+            if name in ("flat", "torso", "kitchen")
+        ),
+        Kind("scans", "Scans of the flat", scans("flat"), "flat", True),
+        Kind("scans-moved", "Scans of the flat, moved", scans("flat", moved=True), "flat", True),
+        Kind("scans-2", "Scans of another flat", scans("flat", seed=3), "flat", False),
+        Kind("lidar", "LiDAR outdoors", _lidar_pair, "lidar", False),
+    )
+}
+
+
+def off_and_belief(pair: Pair, found: Registration | Float64) -> tuple[bool, bool, float]:
+    """Whether a pose is right, whether it is believed, and its probability."""
+    if isinstance(found, Registration):
+        T = found.T_target_source
+        return pair.is_right(T), bool(found.believed), found.probability or 0.0
+    return pair.is_right(found), False, 0.0
+
+
+def timed(method: pairs.Method, pair: Pair) -> tuple[bool, bool, float, float]:
+    """As `off_and_belief`, and seconds; what refuses is wrong."""
+    views = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
+    start = time.perf_counter()
+    try:
+        found = method(*views)
+    except RegistrationError:
+        return False, False, 0.0, time.perf_counter() - start
+    return *off_and_belief(pair, found), time.perf_counter() - start
+
+
+def print_table(names: list[str], data: Path, most: int) -> None:
+    """A row for each kind, and what the probability is worth over all of them."""
+    print(
+        "| Clouds | right | of these believed | believed and wrong | s a pair"
+        " | Open3D | s | KISS-Matcher | s |\n|---|---|---|---|---|---|---|---|---|"
+    )
+    p, right = [], []
+    for name in names:
+        ours, theirs = [], ([], [])  # type: ignore[var-annotated]
+        try:
+            made = list(KINDS[name].make(data, most, np.random.default_rng([1, 5])))
+        except FileNotFoundError:
+            print(f"| {name}: no data |")
+            continue
+        for pair in made:
+            if not p:
+                timed(tofuse.register, pair)  # compiles
+            ours.append(timed(tofuse.register, pair))
+            right.append(ours[-1][0])
+            p.append(ours[-1][2])
+            voxel = pair.allowed_m / RIGHT_SHARE / 100
+            for peer, rows in zip((o3d_global, kiss_global), theirs, strict=True):
+                method = peer.method(voxel)
+                if method is not None:
+                    rows.append(timed(method, pair))
+        print(_row(KINDS[name].title, ours, theirs), flush=True)
+    wrong = sum(x >= pairs.BELIEVED and not r for x, r in zip(p, right, strict=True))
+    print(
+        f"\n{len(p)} pairs, believed {sum(x >= pairs.BELIEVED for x in p)}, of these wrong {wrong}"
+    )
+    print(f"area under the ROC curve {pairs.roc_area(np.array(p), np.array(right)):.3f}")
+    pairs.print_calibration(np.array(p), np.array(right))
+    _print_decoys(names, data, most)
+
+
+def _row(title: str, ours: list, theirs: tuple[list, list]) -> str:  # type: ignore[type-arg]
+    right = sum(o[0] for o in ours)
+    cells = [title, f"{right} of {len(ours)}", sum(o[0] and o[1] for o in ours)]
+    cells += [sum(o[1] and not o[0] for o in ours), f"{np.median([o[3] for o in ours]):.2f}"]
+    for rows in theirs:
+        cells += (
+            [sum(o[0] for o in rows), f"{np.median([o[3] for o in rows]):.2f}"]
+            if rows
+            else [
+                "",
+                "",
+            ]
+        )
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def decoys(
+    names: list[str], data: Path, most: int, rng: np.random.Generator
+) -> Iterator[tuple[Pair, str]]:
+    """Pairs of views of different places, some moved, and which kind the source is of."""
+    made: dict[str, list[Pair]] = {}
+    for name in names:
+        try:
+            made[name] = list(KINDS[name].make(data, most, rng))
+        except FileNotFoundError:
+            continue
+    for name, mine in made.items():
+        others = [n for n in made if KINDS[n].family != KINDS[name].family]
+        for _ in range(most if others else 0):
+            other = made[others[int(rng.integers(len(others)))]]
+            a, b = mine[int(rng.integers(len(mine)))], other[int(rng.integers(len(other)))]
+            yield Pair(a.source, b.target, None), name
+
+
+def _print_decoys(names: list[str], data: Path, most: int) -> None:
+    found = [
+        timed(tofuse.register, pair)
+        for pair, _ in decoys(names, data, most, np.random.default_rng([1, 6]))
+    ]
+    if found:
+        believed = sum(f[1] for f in found)
+        print(f"\nof {len(found)} pairs of different places {believed} believed", end=", ")
+        print(f"highest probability {max(f[2] for f in found):.2f}")
+
+
+def print_fit(data: Path, most: int) -> None:
+    """Coefficients of both models, and what they are worth for kinds left out."""
+    names = [kind.name for kind in KINDS.values() if kind.fitted]
+    families = sorted({kind.family for kind in KINDS.values()})
+    searched: list[tuple[Float64, bool, int]] = []
+    followed: list[tuple[Float64, bool, int]] = []
+    rng = np.random.default_rng([1, 7])
+    todo = [(p, n) for n in names for p in KINDS[n].make(data, most, rng)]
+    todo += list(decoys(names, data, most, rng))
+    for pair, name in todo:
+        family = families.index(KINDS[name].family)
+        views = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
+        start = np.eye(4) if pair.true is None else pair.true
+        for guess in (None, *(start @ _off_by(m, d, rng) for m, d in pairs.GUESSES)):
+            try:
+                register = (
+                    follow_clouds
+                    if guess is not None
+                    else partial(register_clouds, always_search=True)
+                )
+                found = register(*views, guess, np.random.default_rng(0))
+            except RegistrationError:
+                continue
+            assert found.support is not None
+            assert found.contradiction is not None
+            evidence = CloudEvidence(
+                found.support,
+                found.contradiction,
+                found.margin,
+                len(found.unobservable),
+                None not in (viewpoint_of(views[0]), viewpoint_of(views[1])),
+            )
+            row = evidence.searched if guess is None else evidence.followed
+            rows = searched if guess is None else followed
+            rows.append((row, pair.is_right(found.T_target_source), family))
+    titles = ("Searched: constant, root of margin, support, contradiction, degenerate, unseen",)
+    pairs.print_fit(titles[0], pairs.stacked(searched))
+    pairs.print_fit("Followed: constant, support, contradiction, unseen", pairs.stacked(followed))
+
+
+def _off_by(metres: float, degrees: float, rng: np.random.Generator) -> Float64:
+    way = rng.standard_normal((2, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    return np.asarray(se3.exp(np.r_[metres * way[0], np.radians(degrees) * way[1]]))
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["table", "fit"])
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--pairs", type=int, default=8, help="of each step")
+    given = parser.parse_args(arguments)
+    if given.what == "table":
+        print_table(given.kinds, given.data, given.pairs)
+    else:
+        print_fit(given.data, given.pairs)
+
+
+if __name__ == "__main__":
+    main()

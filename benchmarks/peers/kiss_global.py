@@ -1,0 +1,33 @@
+"""KISS-Matcher (Lim et al. 2025), with its own parameters for the voxel size."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.recordings.frames import Frame
+
+Float64 = NDArray[np.float64]
+
+
+def method(voxel_m: float) -> Callable[[Frame, Frame], Float64] | None:
+    """The registration of two views; None where KISS-Matcher is not installed."""
+    try:
+        kiss = importlib.import_module("kiss_matcher")
+    except ImportError:
+        return None
+
+    def registered(source: Frame, target: Frame) -> Float64:
+        matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(voxel_m))
+        found = matcher.estimate(source.points, target.points)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.asarray(found.rotation), np.ravel(found.translation)
+        if not np.isfinite(T).all():
+            raise RegistrationError("found nothing", where="KISS-Matcher")
+        return T
+
+    return registered

@@ -1,0 +1,155 @@
+"""What two clouds say of a pose between them: surfaces that lie on each other, and free space.
+
+As `agreement`, for views without a camera. How close surfaces have to lie follows from how rough
+they are at the resolution that they are compared at. What was seen through is known only of views
+whose viewpoint is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels.kdtree import KdTree
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.registration.agreement import Agreement
+from tofuse.registration.shape import shape_at, tree_of
+from tofuse.registration.viewpoint import RangeSphere, viewpoint_of
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Points of each plane fit.
+NEIGHBOURS = 12
+# Points of each view that are compared.
+_COMPARED = 2500
+# Surfaces lie on each other within so many standard deviations of their points, plus a share of the
+# resolution: planes that are fitted to curved surfaces miss them.
+_SIGMAS, _BENT = 3.0, 0.25
+# How far a point may be from the nearest one of its surface, in resolutions.
+_NEAR = 2.0
+# Cosine of the largest angle between normals of surfaces that support each other.
+_ALIKE = 0.75
+# A point is in free space where it lies in front by more than this share of the range, on top of
+# what surfaces may differ by.
+_IN_FRONT = 0.02
+# How many supporting points one in free space outweighs: most points of a wrong pose lie on some
+# surface, as walls are alike, but hardly one of the right pose where the other view saw through.
+_VIOLATION_WEIGHT = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class CloudMap:
+    """A cloud that was averaged to a resolution, with its surfaces and what it saw through.
+
+    Attributes
+    ----------
+    view
+        The averaged points.
+    normals
+        (n, 3) NaN where points lie on no surface.
+    sigma
+        Typical distance of points from their planes, m.
+    size
+        Resolution, m.
+    samples
+        (m, 3) some of the points that were averaged, m.
+    sphere
+        What was seen in each direction; None where the viewpoint is not known.
+    """
+
+    view: CloudFrame
+    normals: Float64
+    sigma: float
+    size: float
+    samples: Float64
+    sphere: RangeSphere | None
+
+    @classmethod
+    def of(cls, view: CloudFrame, size: float, whole: Frame) -> CloudMap:
+        """Prepare a view that was averaged from the `whole` one."""
+        shape = shape_at(view, np.arange(len(view)), NEIGHBOURS)
+        rough = shape.roughness[np.isfinite(shape.roughness)]
+        sigma = float(np.median(rough)) * size if len(rough) else size
+        seen = viewpoint_of(whole)
+        sphere = None if seen is None else RangeSphere.of(whole, seen)
+        samples = whole.points[:: max(1, -(-len(whole) // _COMPARED))].astype(np.float64)
+        return cls(view, shape.normals, sigma, size, samples, sphere)
+
+    @property
+    def tree(self) -> KdTree:
+        """Over the averaged points."""
+        return tree_of(self.view)
+
+    def some(self) -> tuple[Float64, Float64]:
+        """Evenly chosen points (n, 3) on surfaces, and their normals (n, 3)."""
+        known = np.flatnonzero(np.isfinite(self.normals).all(1))
+        known = known[:: max(1, -(-len(known) // _COMPARED))]
+        return self.view.points[known].astype(np.float64), self.normals[known]
+
+
+def tolerance(source: CloudMap, target: CloudMap) -> float:
+    """Distance in m within which surfaces of two views lie on each other."""
+    noise = float(np.hypot(source.sigma, target.sigma))
+    return _SIGMAS * noise + _BENT * max(source.size, target.size)
+
+
+def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Agreement:
+    """Judge a pose (4, 4) by what both views saw.
+
+    `overlap` counts points that are near a surface or in space that was seen through. Without a
+    known viewpoint nothing is known of the latter.
+    """
+    within = tolerance(source, target)
+    ways = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
+    said = [_one_way(seen, by, T, within) for seen, by, T in ways]
+    near, on_surface, free, squares = np.mean(said, axis=0)
+    return Agreement(
+        overlap=float(near + free),
+        support=float(on_surface),
+        violation=float(free),
+        clash=0.0,
+        rms_m=float(np.sqrt(squares / on_surface)) if on_surface else np.inf,
+        points=sum(len(view.some()[0]) for view in (source, target)),
+        score=float(on_surface - _VIOLATION_WEIGHT * free),
+    )
+
+
+def _one_way(
+    seen: CloudMap, by: CloudMap, T: Float64, within: float
+) -> tuple[float, float, float, float]:
+    """Shares of the points near a surface, on one and in free space; mean square distance, m^2."""
+    points, normals = seen.some()
+    if not len(points):
+        return 0.0, 0.0, 0.0, 0.0
+    points, normals = se3.transform(T, points), normals @ T[:3, :3].T
+    near, off, alike = _surface_at(by, points, normals, max(seen.size, by.size))
+    on = near & alike & (off < within)
+    free = 0.0
+    if by.sphere is not None:
+        points = se3.transform(T, seen.samples)
+        before = by.sphere.before(points)
+        ranges = np.linalg.norm(points - by.sphere.origin, axis=1)
+        in_front = before > within + _IN_FRONT * ranges
+        close, gap, _ = _surface_at(by, points, None, max(seen.size, by.size))
+        free = float(np.mean(in_front & ~(close & (gap < within))))
+    return float(np.mean(near)), float(np.mean(on)), free, float((off[on] ** 2).sum() / len(off))
+
+
+def _surface_at(
+    view: CloudMap, points: Float64, normals: Float64 | None, size: float
+) -> tuple[Bool, Float64, Bool]:
+    """Whether points (n, 3) are near a surface, their distance from its plane, and whether alike.
+
+    Alike is what has normals (n, 3) like those of the surface.
+    """
+    nearest, _ = view.tree.nearest(points, _NEAR * size)
+    near = nearest >= 0
+    other = view.normals[np.maximum(nearest, 0)]
+    surface = view.view.points[np.maximum(nearest, 0)].astype(np.float64)
+    off = np.abs(((points - surface) * other).sum(1))
+    alike = near if normals is None else np.abs((normals * other).sum(1)) > _ALIKE
+    return near, off, alike

@@ -1,0 +1,262 @@
+"""Two clouds that may be far apart: where one lies in the other, and what is believed.
+
+The pose is followed from the guess. Where both clouds then agree so well that it is as good as
+certain, that is the answer. Else poses are proposed by shapes that are alike (`registration.fpfh`),
+and, where both clouds were seen from known points, by a search over their images
+(`registration.view_pair`); each is aligned, and judged by what both clouds say of it
+(`registration.cloud_agreement`) and by its lead over its rivals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.recordings.frames import Frame
+from tofuse.registration.agreement import Agreement
+from tofuse.registration.base import Registration
+from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
+from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
+from tofuse.registration.confidence import CERTAIN, CloudEvidence
+from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.icp import Icp
+from tofuse.registration.reduce import reduced
+from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.selectors import All, Uniform
+from tofuse.registration.stopping import SmallStep
+from tofuse.registration.surface_metrics import PointToPlane
+from tofuse.registration.view_pair import register_pair
+from tofuse.registration.viewpoint import as_image, viewpoint_of
+
+Float64 = NDArray[np.float64]
+
+# Points of either view at most, once they are averaged to be compared.
+_POINTS = 10_000
+# Proposals that are aligned closely.
+_POLISHED = 8
+# Poses that differ by more resolutions, or rad, are different answers.
+_DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
+# Of a pose at the guess and one that leads by less than this share of the points, the first.
+_LEAD = 0.02
+# Score that may be lost by noise alone when a pose is aligned once more.
+_GIVEN_UP = 0.02
+# Finest resolution in spacings of some thousand points.
+_FINER = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """A pose T_target_source and what both views say of it."""
+
+    T_target_source: Float64
+    agreement: Agreement
+
+
+# Where nothing fits: the rival of a pose that has no other.
+_NOWHERE = _Pose(np.eye(4), Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Two clouds that were averaged alike, ready to be compared."""
+
+    source: Frame
+    target: Frame
+    there: CloudMap
+    here: CloudMap
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, source: Frame, target: Frame, rng: np.random.Generator) -> _Views:
+        size = _FINER * max(spacing(source), spacing(target))
+        size, data, model = reduced(source, target, size, _POINTS)
+        maps = CloudMap.of(data, size, source), CloudMap.of(model, size, target)
+        return cls(source, target, *maps, rng)
+
+    @property
+    def size(self) -> float:
+        return self.here.size
+
+    @property
+    def seen_through(self) -> bool:
+        """Whether it is known of both what they saw through."""
+        return self.there.sphere is not None and self.here.sphere is not None
+
+    def judged(self, T: Float64) -> _Pose:
+        return _Pose(T, cloud_agreement(self.there, self.here, T))
+
+    def polished(self, T: Float64) -> _Pose:
+        """Align by some of the points of the averaged source."""
+        before = self.judged(T)
+        try:
+            for icp in _polish(self.size):
+                T = icp.register(self.there.view, self.here.view, T, self.rng).T_target_source
+        except RegistrationError:
+            return before
+        after = self.judged(T)
+        return after if after.agreement.score >= before.agreement.score else before
+
+    def evidence(
+        self, pose: _Pose, lead: float | None = None, degenerate: int = 0
+    ) -> CloudEvidence:
+        said = pose.agreement
+        through = self.seen_through
+        return CloudEvidence(said.support, said.contradiction, lead, degenerate, through)
+
+    def differ(self, a: Float64, b: Float64) -> bool:
+        """Whether two poses take the middle of the source elsewhere, or turn it otherwise."""
+        middle = np.median(self.there.view.points, 0)[None].astype(np.float64)
+        shift = np.linalg.norm(se3.transform(a, middle) - se3.transform(b, middle))
+        turned = se3.angle(se3.inverse(a) @ b)
+        return bool(shift > _DISTINCT * self.size or turned > _DISTINCT_RAD)
+
+
+def register_clouds(
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    rng: np.random.Generator,
+    *,
+    always_search: bool = False,
+) -> Registration:
+    """Register two clouds, or a cloud and an image.
+
+    Parameters
+    ----------
+    guess
+        (4, 4) T_target_source; the identity is tried first unless given.
+    always_search
+        Whether to search even if the pose that was followed from the guess is as good as certain.
+
+    Raises
+    ------
+    RegistrationError
+        If there are too few points, or too few of them correspond anywhere.
+    """
+    views = _Views.of(source, target, rng)
+    start = np.eye(4) if guess is None else guess
+    near = views.polished(start)
+    if views.evidence(near).probability >= CERTAIN and not always_search:
+        found = _registration(views, near)
+        if (found.probability or 0.0) >= CERTAIN:
+            return found
+    seen = _searched(source, target, guess)
+    if seen is not None and seen.believed and not always_search:
+        return seen
+    poses = [near] if seen is None else [near, views.judged(seen.T_target_source)]
+    poses += _proposed(views, start)
+    poses.sort(key=lambda pose: -pose.agreement.score)
+    best = poses[0]
+    if guess is not None:
+        alike = [p for p in poses if p.agreement.score >= best.agreement.score - _LEAD]
+        best = min(alike, key=lambda p: _apart(p.T_target_source, guess))
+    others = (p for p in poses if views.differ(p.T_target_source, best.T_target_source))
+    return _registration(views, best, next(others, _NOWHERE))
+
+
+def follow_clouds(
+    source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+) -> Registration:
+    """Register two clouds from a guess (4, 4) alone; see `register_clouds`."""
+    views = _Views.of(source, target, rng)
+    near = views.polished(guess)
+    if views.evidence(near).probability < CERTAIN:
+        far = CoarseToFine().register(source, target, guess, rng)
+        near = max(near, views.judged(far.T_target_source), key=lambda p: p.agreement.score)
+    return _registration(views, near)
+
+
+def _proposed(views: _Views, start: Float64) -> list[_Pose]:
+    """Poses that shapes propose, and where a start leads at all scales.
+
+    Raises
+    ------
+    RegistrationError
+        If there is none.
+    """
+    found, failure = [], None
+    try:
+        candidates = (
+            Fpfh(signed=views.seen_through).candidates(views.source, views.target, views.rng).poses
+        )
+        found += [views.polished(c.T_target_source) for c in candidates[:_POLISHED]]
+    except RegistrationError as error:
+        failure = error
+    try:
+        near = CoarseToFine().register(views.source, views.target, start, views.rng)
+        found.append(views.judged(near.T_target_source))
+    except RegistrationError as error:
+        failure = error
+    if not found and failure is not None:
+        raise failure
+    return found
+
+
+def _apart(a: Float64, b: Float64) -> float:
+    return float(np.linalg.norm(se3.log(se3.inverse(a) @ b)))
+
+
+def _polish(size: float) -> tuple[Icp, ...]:
+    """Few iterations with a wide reach, then with a narrow one; reaches are in resolutions."""
+    plain = Icp(
+        size,
+        source=Uniform(800),
+        target=All(),
+        rejectors=(MaxDistance(4.0),),
+        metric=PointToPlane(loss="tukey"),
+        stopping=SmallStep(1e-2, 8),
+        neighbours=NEIGHBOURS,
+    )
+    return plain, replace(plain, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
+
+
+def _searched(source: Frame, target: Frame, guess: Float64 | None) -> Registration | None:
+    """Register the images that both clouds came from; None where they can't be made."""
+    points = viewpoint_of(source), viewpoint_of(target)
+    if points[0] is None or points[1] is None:
+        return None
+    first, second = as_image(source, points[0]), as_image(target, points[1])
+    if first is None or second is None:
+        return None
+    (data, T_source_camera), (model, T_target_camera) = first, second
+    T_camera_target = se3.inverse(T_target_camera)
+    options = SurfaceOptions()
+    start = None if guess is None else T_camera_target @ guess @ T_source_camera
+    try:
+        found = register_pair(surface_map(data, options), surface_map(model, options), start)
+    except RegistrationError:
+        return None
+    return None if found is None else found.between(T_target_camera, se3.inverse(T_source_camera))
+
+
+def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Registration:
+    """Align all points from the best pose, and say what is believed of it.
+
+    Without a rival nothing was compared with it.
+    """
+    fine = CoarseToFine(coarsest=views.size)
+    found = fine.register(views.source, views.target, best.T_target_source, views.rng)
+    after = views.judged(found.T_target_source)
+    if after.agreement.score < best.agreement.score - _GIVEN_UP:
+        found = replace(found, T_target_source=best.T_target_source)
+        after = best
+    said = after.agreement
+    lead = None if rival is None else said.score - max(rival.agreement.score, 0.0)
+    evidence = views.evidence(after, lead, len(found.unobservable))
+    reason = evidence.objection()
+    return replace(
+        found,
+        margin=lead,
+        believed=not reason,
+        probability=evidence.probability,
+        reason=reason,
+        runner_up=None if rival is None or rival is _NOWHERE else rival.T_target_source,
+        overlap=said.overlap,
+        support=said.support,
+        contradiction=said.contradiction,
+    )
