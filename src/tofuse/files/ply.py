@@ -57,6 +57,11 @@ class Ply:
         return self._columns(("x", "y", "z"), np.float32)
 
     @property
+    def coordinates(self) -> NDArray[np.float64]:
+        """(N, 3) float64, for coordinates that float32 can't hold."""
+        return self._columns(("x", "y", "z"), np.float64)
+
+    @property
     def normals(self) -> Float32 | None:
         """(N, 3) float32, or None."""
         names = ("nx", "ny", "nz")
