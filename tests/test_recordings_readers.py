@@ -334,7 +334,7 @@ def test_xyz(tmp_path: Path) -> None:
 def test_map_coordinates_keep_their_millimetres(tmp_path: Path, suffix: str) -> None:
     """All clouds of a folder are moved by the same whole kilometres, and poses beside them too."""
     rng = np.random.default_rng(5)
-    clouds = rng.uniform(-3, 3, (2, 40, 3)) + [500_000.123, 4_000_000.456, 3]
+    clouds = np.array([500_000.123, 4_000_000.456, 3]) + rng.uniform(-3, 3, (2, 40, 3))
     for k, points in enumerate(clouds):
         path = tmp_path / f"{k}{suffix}"
         rows = "\n".join(" ".join(f"{v:.6f}" for v in row) for row in points) + "\n"

@@ -49,7 +49,7 @@ class PcdClouds:
 
 
 def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read a file as a cloud, less `shift` (3,); the declared viewpoint is the sensor's position."""
+    """Read a file as a cloud, less `shift` (3,); its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
     return cloud_frame(
         index,
