@@ -146,13 +146,18 @@ def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:
     return np.round((low + high) / 2 / _STEP_M) * _STEP_M
 
 
+def shift_words(shift: Float64) -> str:
+    """Say what a shift (3,) does to coordinates."""
+    text = ", ".join(f"{value:.0f}" for value in shift)
+    return f"coordinates are those of the files less ({text}) m"
+
+
 def tell_shift(source: FileSource, path: Path, shift: Float64) -> None:
     """Note that coordinates are those of the files less a shift (3,), and move poses alike."""
     if not shift.any():
         return
     source.metadata["shift_m"] = shift.tolist()
-    text = ", ".join(f"{value:.0f}" for value in shift)
-    source.warnings.append(f"{path}: coordinates are those of the files less ({text}) m")
+    source.warnings.append(f"{path}: {shift_words(shift)}")
     back = np.eye(4)
     back[:3, 3] = shift
     source.reference = None if source.reference is None else source.reference @ back

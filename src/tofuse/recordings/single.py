@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
+from tofuse.recordings.cloud_files import shift_words
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
 
@@ -82,7 +83,10 @@ def open_view(
             remedy=f"use a view with {MIN_POINTS} or more",
         )
     shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
-    return SingleView(name, path, recording.format, index, frame, shift, tuple(recording.warnings))
+    # Whoever asks for one view is given the shift, and told nothing of it.
+    moved = shift_words(shift)
+    warnings = tuple(line for line in recording.warnings if not line.endswith(moved))
+    return SingleView(name, path, recording.format, index, frame, shift, warnings)
 
 
 def split_name(name: str) -> tuple[str, int | None]:

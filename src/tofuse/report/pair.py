@@ -70,7 +70,6 @@ def render_pair(result: PairResult) -> str:
             for name, view in (("source", result.source), ("target", result.target))
         ],
         matrix=pair_words.matrix(result),
-        moved=pair_words.moved_center(result),
         # Only numbers and base64 are in it, so nothing can end the script element early.
         scene_json=json.dumps(packed(scene), separators=(",", ":")),
     )
@@ -78,15 +77,14 @@ def render_pair(result: PairResult) -> str:
 
 def _facts(result: PairResult, scene: PairScene) -> list[tuple[str, str]]:
     found = result.found
-    facts = [("Translation", words.length(float(np.linalg.norm(result.T_target_source[:3, 3]))))]
+    name = "Motion of the middle" if result.source.center.any() else "Translation"
+    facts = [(name, words.length(float(np.linalg.norm(result.moved_m))))]
     facts.append(("Rotation", pair_words.rotation(result).split(" about ")[0]))
     if found.overlap is not None:
         facts.append(("Overlap", pair_words.percent(found.overlap)))
     facts.append(("Rms distance", words.length(found.rms_m)))
-    sigma = result.sigma
-    if sigma is not None:
-        translation, rotation = pair_words.sigma(result).split(", ")
-        facts += [("Sigma of translation", translation), ("Sigma of rotation", rotation)]
+    if result.sigma != (None, None):
+        facts.append(("Sigma", pair_words.sigma(result)))
     if found.margin is not None:
         facts.append(("Margin", pair_words.percent(found.margin)))
     return facts
@@ -94,12 +92,15 @@ def _facts(result: PairResult, scene: PairScene) -> list[tuple[str, str]]:
 
 def _notes(result: PairResult) -> list[tuple[str, str]]:
     """What is to be known beside the figures: a heading and a sentence each."""
+    translation = pair_words.translation(result)
+    if moved := pair_words.moved_center(result):
+        translation += f"; {moved}"
     notes = [
-        ("Translation", pair_words.translation(result)),
+        ("Translation", translation),
         ("Rotation", pair_words.rotation(result)),
         ("Overlap", pair_words.overlap(result)),
     ]
-    if result.sigma is not None:
+    if result.sigma != (None, None):
         notes.append(("Sigma", f"{pair_words.sigma(result)} ({pair_words.sigma_note(result)})"))
     if free := pair_words.unobservable(result):
         notes.append(("Unobservable", f"{free}, in the axes of the source"))

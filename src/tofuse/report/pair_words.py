@@ -38,8 +38,7 @@ def moved_center(result: PairResult) -> str:
     center = result.source.center
     if not center.any():
         return ""
-    step = se3.transform(result.T_target_source, center[None])[0] - center
-    return f"moves by {vector(step, 4)} m at {vector(center, 0)}"
+    return f"moves by {vector(result.moved_m, 4)} m at {vector(center, 0)}, the middle of the source"
 
 
 def rotation(result: PairResult) -> str:
@@ -75,10 +74,13 @@ def overlap(result: PairResult) -> str:
 
 def sigma(result: PairResult) -> str:
     """Say how well the pose is known, one standard deviation in the worst observable direction."""
-    known = result.sigma
-    if known is None:
-        return "unknown"
-    return f"{1000 * known[0]:.2f} mm, {np.degrees(known[1]):.3f}\N{DEGREE SIGN}"
+    metres, radians = result.sigma
+    parts = []
+    if metres is not None:
+        parts.append(f"{1000 * metres:.2f} mm")
+    if radians is not None:
+        parts.append(f"{np.degrees(radians):.3f}\N{DEGREE SIGN}")
+    return ", ".join(parts) or "unknown"
 
 
 def sigma_note(result: PairResult) -> str:

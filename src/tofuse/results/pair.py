@@ -85,6 +85,13 @@ class PairResult:
         return self.in_files(self.found.T_target_source)
 
     @property
+    def moved_m(self) -> Float64:
+        """(3,) how the source's `center` moves: the translation, where that is the origin."""
+        center = self.source.center
+        moved: Float64 = se3.transform(self.T_target_source, center[None])[0] - center
+        return moved
+
+    @property
     def runner_up(self) -> Float64 | None:
         """(4, 4) of the best other pose, likewise; None where none was found or looked for."""
         other = self.found.runner_up
@@ -115,13 +122,20 @@ class PairResult:
         return self._observed_covariance
 
     @cached_property
-    def sigma(self) -> tuple[float, float] | None:
-        """Standard deviations (m, rad) in the worst observable direction; None if not known."""
+    def sigma(self) -> tuple[float | None, float | None]:
+        """Standard deviations (m, rad) in the worst observable direction.
+
+        None where that is not known, or no direction is observable.
+        """
         covariance = self._observed_covariance
         if covariance is None:
-            return None
+            return None, None
         worst = [float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_MOVE, _TURN)]
-        return float(np.sqrt(max(worst[0], 0.0))), float(np.sqrt(max(worst[1], 0.0)))
+        # In metres both are about as large; what is nothing beside the other is only rounding.
+        limit = 1e-12 * max(worst[0], worst[1] * self.lever_m**2)
+        known = worst[0] > limit, worst[1] * self.lever_m**2 > limit
+        move, turn = (float(np.sqrt(max(value, 0.0))) for value in worst)
+        return move if known[0] else None, turn if known[1] else None
 
     @property
     def _observed_covariance(self) -> Float64 | None:
@@ -177,7 +191,7 @@ def _unit(vectors: Float64) -> Float64:
 def pair_json(result: PairResult) -> dict[str, Any]:
     """Return the content of `registration.json`: SI units and radians, null for what is unknown."""
     found = result.found
-    sigma = result.sigma
+    sigma_m, sigma_rad = result.sigma
     covariance = result.covariance
     data: dict[str, Any] = plain(
         {
@@ -198,8 +212,8 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "runner_up": result.runner_up,
             "unobservable": found.unobservable,
             "covariance": None if covariance is None else covariance.ravel(),
-            "sigma_m": None if sigma is None else sigma[0],
-            "sigma_rad": None if sigma is None else sigma[1],
+            "sigma_m": sigma_m,
+            "sigma_rad": sigma_rad,
             "information": np.asarray(found.information).ravel(),
             "reference_point_m": result.source.center,
             "rms_m": found.rms_m,
