@@ -407,6 +407,10 @@ def test_bad_usage(words, says, capfd) -> None:
     refuses(capfd, "register", *words, says=says, prefix="tofuse register: ")
 
 
+def test_overwrite_alone_is_refused(clouds, capfd) -> None:
+    refuses(capfd, "register", *clouds, "--overwrite", says=("--overwrite", "--out"))
+
+
 def test_an_output_folder_of_others_is_refused(clouds, tmp_path, capfd, monkeypatch) -> None:
     monkeypatch.setattr(pair_module, "register", lambda *a, **k: pytest.fail("work was begun"))
     for name, content in (("photo.jpg", "mine"), ("run.json", "{}"), ("registration.json", "{}")):
@@ -488,6 +492,25 @@ def test_belief_decides_the_exit_status(
     assert again == status
     assert said["believed"] is more.get("believed")
     assert said["runner_up"] is said["margin"] is said["overlap"] is None
+
+
+def test_a_page_of_a_pair_of_which_hardly_anything_is_known(tmp_path, monkeypatch, capfd) -> None:
+    """Too few points for surfaces, no distance, and a start far away."""
+    for name in ("a&b.ply", "target.ply"):
+        write_ply(tmp_path / name, np.random.default_rng(1).normal(size=(12, 3)))
+    far = se3.exp([1e4, 0, 0, 0, 0, 1])
+    found = made(far, rms_m=float("nan"), information=np.zeros((6, 6)))
+    monkeypatch.setattr(pair_module, "register", lambda *a, **k: found)
+    out = tmp_path / "out"
+    assert call("register", tmp_path / "a&b.ply", tmp_path / "target.ply", "--out", out) == 3
+    printed = capfd.readouterr().out
+    assert "nan" not in printed
+    page = (out / "report.html").read_text()
+    assert "a&amp;b.ply registered to target.ply" in page
+    assert "a&b.ply" not in page
+    assert "No point is within" in page
+    scene = json.loads(page.split('id="scene">')[1].split("</script>")[0])
+    assert {layer["count"] for layer in scene["layers"]} == {12}
 
 
 def printed(capfd, monkeypatch, clouds, found: Registration) -> dict[str, str]:

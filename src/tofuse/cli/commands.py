@@ -130,10 +130,13 @@ def _wait() -> None:
 def register(arguments: argparse.Namespace) -> int:
     """``tofuse register``."""
     from tofuse.cli import registering
+    from tofuse.errors import InputError
     from tofuse.pipeline.pair import PairOptions, exit_status, register_files
     from tofuse.report.pair_words import belief
     from tofuse.results.pair import pair_json
 
+    if arguments.overwrite and arguments.out is None:
+        raise InputError("is only for --out", where="--overwrite", remedy="give --out as well")
     options = PairOptions(
         guess=arguments.guess,
         out=arguments.out,

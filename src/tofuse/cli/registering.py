@@ -18,7 +18,7 @@ def lines(result: PairResult) -> Lines:
     rows = words.matrix(result)
     found += [("T_target_source", rows[0]), *(("", row) for row in rows[1:])]
     found.append(("overlap", words.overlap(result)))
-    found.append(("rms distance", f"{1000 * result.found.rms_m:.2f} mm"))
+    found.append(("rms distance", words.rms(result)))
     found.append(("sigma", f"{words.sigma(result)} ({words.sigma_note(result)})"))
     if free := words.unobservable(result):
         found.append(("unobservable", f"{free} (axes of the source)"))

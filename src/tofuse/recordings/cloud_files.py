@@ -72,7 +72,8 @@ class CloudFileSource(FileSource):
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
-        frame = self._kept.pop(index) if index in self._kept else self._read(index)
+        kept = self._kept.pop(index, None)
+        frame = self._read(index) if kept is None else kept
         farthest = float(np.abs(frame.points).max(initial=0))
         if farthest > MAP_COORDINATES_M and not self._far:
             self._far = True

@@ -38,7 +38,9 @@ def moved_center(result: PairResult) -> str:
     center = result.source.center
     if not center.any():
         return ""
-    return f"moves by {vector(result.moved_m, 4)} m at {vector(center, 0)}, the middle of the source"
+    return (
+        f"moves by {vector(result.moved_m, 4)} m at {vector(center, 0)}, the middle of the source"
+    )
 
 
 def rotation(result: PairResult) -> str:
@@ -70,6 +72,12 @@ def overlap(result: PairResult) -> str:
     if not parts:
         return f"{percent(found.share)} of the source's points have a partner"
     return ", ".join(parts)
+
+
+def rms(result: PairResult) -> str:
+    """Say how far apart corresponding points are."""
+    value = result.found.rms_m
+    return f"{1000 * value:.2f} mm" if np.isfinite(value) else "unknown"
 
 
 def sigma(result: PairResult) -> str:

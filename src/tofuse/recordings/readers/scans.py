@@ -172,7 +172,8 @@ class E57Source(FileSource):
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
-        return self._kept.pop(index) if index in self._kept else self._read(index, self._shift)
+        kept = self._kept.pop(index, None)
+        return self._read(index, self._shift) if kept is None else kept
 
     def _find_shift(self) -> Float64:
         """Return what is taken off the coordinates of all scans, by the first that can be read."""
