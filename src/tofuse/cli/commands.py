@@ -136,7 +136,7 @@ def register(arguments: argparse.Namespace) -> int:
     from tofuse.results.pair import pair_json
 
     if arguments.overwrite and arguments.out is None:
-        raise InputError("is only for --out", where="--overwrite", remedy="give --out as well")
+        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
     options = PairOptions(
         guess=arguments.guess,
         out=arguments.out,
@@ -146,7 +146,7 @@ def register(arguments: argparse.Namespace) -> int:
         topic=arguments.topic,
         threads=arguments.threads,
     )
-    # With --json the one object is all that is said.
+    # With --json only the one object is printed.
     with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
         result = register_files(arguments.source, arguments.target, options, progress)
     if arguments.json:

@@ -31,7 +31,7 @@ a recording, counted from 0.
 _EXIT_REGISTER = """\
 exit status:
   0  the pose is believed
-  3  the pose is not believed, or the method can't tell; it is printed and written all the same
+  3  the pose is not believed, or cannot be verified; it is still printed and written
   2  nothing was written: one line on stderr says why
 """
 

@@ -88,7 +88,7 @@ def register_files(
 
 
 def exit_status(result: PairResult) -> int:
-    """Return 0 if the pose is believed, 3 if it is not, or can't be told."""
+    """Return 0 if the pose is believed, 3 if it is not, or cannot be verified."""
     return 0 if result.found.believed else 3
 
 

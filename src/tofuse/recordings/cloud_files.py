@@ -42,7 +42,7 @@ class CloudFileSource(FileSource):
     load_moved
         Does so in double precision, and takes a shift (3,) off the coordinates: coordinates of maps
         don't fit into float32. All files are moved by the same, found from the first that can be
-        read, which `metadata` tells as `shift_m`.
+        read, which is `shift_m` in `metadata`.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class CloudFileSource(FileSource):
         self.files = files
         self.load_frame, self.load_moved = load_frame, load_moved
         self._far = False
-        self._kept: dict[int, Frame] = {}  # read while the shift was looked for
+        self._kept: dict[int, Frame] = {}  # read to find the shift
         if is_folder(path):
             self._read_timestamps(path / "timestamps.txt")
             if is_file(path / "groundtruth.txt"):
@@ -68,7 +68,7 @@ class CloudFileSource(FileSource):
         self._shift = np.zeros(3)
         if load_moved is not None:
             self._shift = self._find_shift()
-            tell_shift(self, path, self._shift)
+            note_shift(self, path, self._shift)
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
@@ -153,7 +153,7 @@ def shift_words(shift: Float64) -> str:
     return f"coordinates are those of the files less ({text}) m"
 
 
-def tell_shift(source: FileSource, path: Path, shift: Float64) -> None:
+def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
     """Note that coordinates are those of the files less a shift (3,), and move poses alike."""
     if not shift.any():
         return

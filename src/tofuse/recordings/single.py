@@ -83,7 +83,7 @@ def open_view(
             remedy=f"use a view with {MIN_POINTS} or more",
         )
     shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
-    # Whoever asks for one view is given the shift, and told nothing of it.
+    # The shift is returned with the view, so a warning about it would mislead.
     moved = shift_words(shift)
     warnings = tuple(line for line in recording.warnings if not line.endswith(moved))
     return SingleView(name, path, recording.format, index, frame, shift, warnings)

@@ -139,7 +139,7 @@ class PairResult:
 
     @property
     def _observed_covariance(self) -> Float64 | None:
-        """(6, 6), without the unobservable directions; None where the information is no good."""
+        """(6, 6), without the unobservable directions; None where the information is unusable."""
         units = np.array([1, 1, 1, *[self.lever_m] * 3])
         information = np.asarray(self.found.information, float)
         if information.shape != (6, 6) or not np.isfinite(information).all():
@@ -159,7 +159,7 @@ class PairResult:
 
     @cached_property
     def free_motions(self) -> tuple[Float64, Float64]:
-        """Axes (a, 3) along which, and (b, 3) about which, nothing holds the source."""
+        """Axes (a, 3) along which the source can slide, and (b, 3) about which it can turn."""
         free = np.asarray(self.found.unobservable, float).reshape(-1, 6)
         if not len(free):
             return np.zeros((0, 3)), np.zeros((0, 3))

@@ -38,7 +38,7 @@ class DepthPng:
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
         if not is_file(path):
-            raise InputError("is no file", where=path, remedy="give one .png of depth")
+            raise InputError("is no file", where=path, remedy="pass one depth .png")
         camera = options.camera
         if camera is None and is_file(path.parent / "camera.json"):
             camera = path.parent / "camera.json"
@@ -53,4 +53,4 @@ def _remedy(path: Path) -> str:
     if path.parent.name == "depth" and is_file(folder / "camera.json"):
         number = files_with(path.parent, ".png").index(path)
         return f"use {folder}#{number}, which is this frame of its recording"
-    return "give --camera camera.json with lens, depth_unit_m and depth_kind"
+    return "pass --camera camera.json with lens, depth_unit_m and depth_kind"

@@ -18,8 +18,8 @@ from tofuse.recordings.cloud_files import (
     CloudFileSource,
     map_shift,
     needed_files,
+    note_shift,
     sniff_clouds,
-    tell_shift,
 )
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
@@ -49,7 +49,7 @@ class LasScans:
         files = needed_files(path, ".las", ".laz")
         shift = _shift(files[0])
         source = CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
-        tell_shift(source, path, shift)
+        note_shift(source, path, shift)
         return source
 
 
@@ -166,9 +166,9 @@ class E57Source(FileSource):
                 self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
             except InputError as error:
                 self.warnings.append(f"{error}; left out")
-        self._kept: dict[int, CloudFrame] = {}  # read while the shift was looked for
+        self._kept: dict[int, CloudFrame] = {}  # read to find the shift
         self._shift = self._find_shift()
-        tell_shift(self, path, self._shift)
+        note_shift(self, path, self._shift)
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
