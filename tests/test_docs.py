@@ -24,8 +24,11 @@ from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, methods
+from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.results.output import run_json
+from tofuse.results.pair import FILES as PAIR_FILES
+from tofuse.results.pair import pair_json
 from tofuse.results.types import Component
 from tofuse.results.verdict import REASONS
 from tofuse.sensor.models import CAMERAS
@@ -239,6 +242,18 @@ def test_every_field_of_run_json_is_documented(room_recording: Path) -> None:
     assert set(data["input"]) <= codes(meaning["input"])
     assert {"code", "frames", "ranges", "text"} <= codes(meaning["reasons"])
     assert all(set(entry) <= codes(meaning["filters"]) for entry in data["filters"].values())
+
+
+def test_every_field_of_registration_json_is_documented(room_recording: Path) -> None:
+    result = register_files(f"{room_recording}#1", f"{room_recording}#0")
+    files, fields = re.split(
+        r"^`registration.json` is .*$",
+        sections("docs/commands.md")["tofuse register"],
+        flags=re.MULTILINE,
+    )
+    assert {c for row in rows(fields) for c in codes(row[0])} == set(pair_json(result))
+    written = {row[0].strip("`") for row in rows(files) if not row[0].startswith("`--")}
+    assert written == set(PAIR_FILES)
 
 
 def documented_parts() -> dict[str, dict[str, list[str]]]:

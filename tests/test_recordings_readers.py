@@ -22,7 +22,9 @@ from made_recordings import (
 )
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import write_ply
+from tofuse.files.trajectory import write_tum
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.geometry.se3 import exp
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 
@@ -328,9 +330,45 @@ def test_xyz(tmp_path: Path) -> None:
     assert frames[4].color[0].tolist() == [51, 51, 51]
 
 
-def test_map_coordinates_warn(tmp_path: Path) -> None:
-    (tmp_path / "a.xyz").write_text("500000.123 4000000.456 3\n")
-    (warning,) = open_recording(tmp_path / "a.xyz").warnings
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
+def test_map_coordinates_keep_their_millimetres(tmp_path: Path, suffix: str) -> None:
+    """All clouds of a folder are moved by the same whole kilometres, and poses beside them too."""
+    rng = np.random.default_rng(5)
+    clouds = np.array([500_000.123, 4_000_000.456, 3]) + rng.uniform(-3, 3, (2, 40, 3))
+    for k, points in enumerate(clouds):
+        path = tmp_path / f"{k}{suffix}"
+        rows = "\n".join(" ".join(f"{v:.6f}" for v in row) for row in points) + "\n"
+        head = ""
+        if suffix == ".ply":
+            head = "ply\nformat ascii 1.0\nelement vertex 40\n"
+            head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        elif suffix == ".pcd":
+            head = "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 40\n"
+            head += "HEIGHT 1\nVIEWPOINT 500001 4000002 7 1 0 0 0\nPOINTS 40\nDATA ascii\n"
+        path.write_text(head + rows)
+    T = exp([1, 2, 3, 0.1, 0.2, 0.3])
+    write_tum(tmp_path / "groundtruth.txt", [0, 1], np.stack([np.eye(4), T]))
+    recording = open_recording(tmp_path)
+    assert recording.metadata["shift_m"] == [500_000, 4_000_000, 0]
+    assert any("less (500000, 4000000, 0) m" in line for line in recording.warnings)
+    for k, frame in enumerate(recording):
+        assert isinstance(frame, CloudFrame)
+        local = frame.points.astype(float) + recording.metadata["shift_m"]
+        np.testing.assert_allclose(local, clouds[k], rtol=0, atol=1e-5)
+        if suffix == ".pcd":
+            np.testing.assert_allclose(frame.origin, [1, 2, 7])
+    assert recording.reference is not None
+    np.testing.assert_allclose(
+        recording.reference[1] @ [1, 2, 3, 1], T @ [500_001, 4_000_002, 3, 1], atol=1e-6
+    )
+
+
+def test_clouds_too_far_apart_for_one_shift_warn(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("1 2 3\n")
+    (tmp_path / "b.xyz").write_text("500000.123 4000000.456 3\n")
+    recording = open_recording(tmp_path)
+    recording[1]
+    (warning,) = recording.warnings
     assert "kept only to 0.25 m" in warning
 
 

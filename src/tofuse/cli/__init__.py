@@ -1,7 +1,8 @@
 """The command line.
 
 Exit status: 0, a result was written and every readable frame has a pose; 3, a result was written
-but some readable frame has none; 2, nothing was written: one line on stderr says why.
+but some readable frame has none; 2, nothing was written: one line on stderr says why. Of
+`register`: 0, the pose is believed; 3, it is not, or cannot be verified.
 """
 
 from __future__ import annotations

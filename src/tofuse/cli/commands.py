@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tofuse.pipeline.run import Options
 
 _SEVERITIES = {"severe": "red", "warning": "yellow", "note": "cyan"}
+_BELIEFS = {True: "green", False: "red", None: "yellow"}
 _COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
@@ -124,6 +125,44 @@ def _wait() -> None:
         print("Ctrl-C ends the page", file=sys.stderr, flush=True)
         while not asked.wait(0.5):
             pass
+
+
+def register(arguments: argparse.Namespace) -> int:
+    """``tofuse register``."""
+    from tofuse.cli import registering
+    from tofuse.errors import InputError
+    from tofuse.pipeline.pair import PairOptions, exit_status, register_files
+    from tofuse.report.pair_words import belief
+    from tofuse.results.pair import pair_json
+
+    if arguments.overwrite and arguments.out is None:
+        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
+    options = PairOptions(
+        guess=arguments.guess,
+        out=arguments.out,
+        overwrite=arguments.overwrite,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+        threads=arguments.threads,
+    )
+    # With --json only the one object is printed.
+    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+        result = register_files(arguments.source, arguments.target, options, progress)
+    if arguments.json:
+        emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
+        return exit_status(result)
+    console = _Output(highlight=False, soft_wrap=True)
+    head, tail = belief(result)
+    color = _BELIEFS[result.found.believed]
+    console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
+    for line in registering.text(result):
+        console.print(line, markup=False)
+    for warning in pair_json(result)["warnings"]:
+        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    if options.out is not None:
+        console.print(f"see {options.out / 'report.html'}", markup=False)
+    return exit_status(result)
 
 
 def demo(arguments: argparse.Namespace) -> int:

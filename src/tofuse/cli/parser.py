@@ -23,6 +23,19 @@ exit status:
 """
 
 
+_VIEWS = """\
+A view is a file with one view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
+a recording, counted from 0.
+
+"""
+_EXIT_REGISTER = """\
+exit status:
+  0  the pose is believed
+  3  the pose is not believed, or cannot be verified; it is still printed and written
+  2  nothing was written: one line on stderr says why
+"""
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that says what is wrong in one line."""
 
@@ -69,6 +82,7 @@ def make_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"tofuse {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _run(commands)
+    _register(commands)
     _demo(commands)
     _simulate(commands)
     _inspect(commands)
@@ -174,6 +188,23 @@ def _processing(p: argparse.ArgumentParser) -> None:
 
 def _seed(p: Any) -> None:
     p.add_argument("--seed", type=_seed_number, metavar="N", help="seed of all randomness (0)")
+
+
+def _register(commands: Any) -> None:
+    p = _command(
+        commands, "register", "register two files or frames", epilog=_VIEWS + _EXIT_REGISTER
+    )
+    p.add_argument("source", metavar="SOURCE", help="the view that is moved")
+    p.add_argument("target", metavar="TARGET", help="the view that stays")
+    p.add_argument(
+        "--guess", type=Path, metavar="FILE", help="T_target_source to start from (none)"
+    )
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the result (none)")
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier one in --out")
+    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    g = p.add_argument_group("what to read")
+    _source(g)
 
 
 def _demo(commands: Any) -> None:

@@ -61,6 +61,12 @@ class Pcd:
         return np.stack([self.fields[name] for name in "xyz"], -1).astype(np.float32)
 
     @property
+    def coordinates(self) -> Float64:
+        """(N, 3) float64, for coordinates that float32 can't hold."""
+        with np.errstate(invalid="ignore"):  # damage can be any kind of not-a-number
+            return np.stack([self.fields[name] for name in "xyz"], -1).astype(np.float64)
+
+    @property
     def normals(self) -> Float32 | None:
         """(N, 3) float32, or None."""
         if not all(name in self.fields for name in _NORMALS):

@@ -57,6 +57,11 @@ class Ply:
         return self._columns(("x", "y", "z"), np.float32)
 
     @property
+    def coordinates(self) -> NDArray[np.float64]:
+        """(N, 3) float64, for coordinates that float32 can't hold."""
+        return self._columns(("x", "y", "z"), np.float64)
+
+    @property
     def normals(self) -> Float32 | None:
         """(N, 3) float32, or None."""
         names = ("nx", "ny", "nz")
@@ -368,6 +373,7 @@ def write_ply(
     scalars: Mapping[str, ArrayLike] | None = None,
     faces: ArrayLike | None = None,
     comments: tuple[str, ...] = (),
+    double: bool = False,
 ) -> None:
     """Write a cloud or a mesh, binary little endian.
 
@@ -376,7 +382,7 @@ def write_ply(
     path
         The file; see `replacing` for errors.
     points
-        (N, 3), written as float32.
+        (N, 3), written as float32, or float64 if `double`.
     normals
         (N, 3), written as float32 nx ny nz.
     color
@@ -388,16 +394,18 @@ def write_ply(
         (M, 3) vertex indices.
     comments
         Lines for the header.
+    double
+        For coordinates that float32 can't hold, as those of maps.
 
     Raises
     ------
     InputError
         If the shapes disagree.
     """
-    points = np.asarray(points, np.float32)
+    points = np.asarray(points, np.float64 if double else np.float32)
     columns: dict[str, tuple[NDArray[np.generic], str]] = {}
     groups: list[tuple[str, ArrayLike | None, str, tuple[str, ...]]] = [
-        ("points", points, "<f4", ("x", "y", "z")),
+        ("points", points, "<f8" if double else "<f4", ("x", "y", "z")),
         ("normals", normals, "<f4", ("nx", "ny", "nz")),
         ("color", color, "u1", ("red", "green", "blue")),
     ]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
@@ -22,7 +22,10 @@ Float64 = NDArray[np.float64]
 # From here on float32 steps by more than half a millimetre.
 MAP_COORDINATES_M = 8192.0
 
+_STEP_M = 1000.0  # coordinates of maps are moved by whole kilometres
+
 LoadFrame = Callable[[Path, int, float], Frame]
+LoadMoved = Callable[[Path, int, float, Float64], Frame]
 
 
 class CloudFileSource(FileSource):
@@ -36,12 +39,24 @@ class CloudFileSource(FileSource):
         In the order of frames.
     load_frame
         Reads a file, given its index and timestamp.
+    load_moved
+        Does so in double precision, and takes a shift (3,) off the coordinates: coordinates of maps
+        don't fit into float32. All files are moved by the same, found from the first that can be
+        read, which is `shift_m` in `metadata`.
     """
 
-    def __init__(self, path: Path, files: list[Path], load_frame: LoadFrame) -> None:
+    def __init__(
+        self,
+        path: Path,
+        files: list[Path],
+        load_frame: LoadFrame,
+        load_moved: LoadMoved | None = None,
+    ) -> None:
         super().__init__(np.arange(len(files), dtype=float))
-        self.files, self.load_frame = files, load_frame
+        self.files = files
+        self.load_frame, self.load_moved = load_frame, load_moved
         self._far = False
+        self._kept: dict[int, Frame] = {}  # read to find the shift
         if is_folder(path):
             self._read_timestamps(path / "timestamps.txt")
             if is_file(path / "groundtruth.txt"):
@@ -50,10 +65,15 @@ class CloudFileSource(FileSource):
                 self.reference = self._numbered_poses(path / "poses.txt")
             if is_file(path / "odometry.txt"):
                 self.odometry = tum_poses(self, path / "odometry.txt")
+        self._shift = np.zeros(3)
+        if load_moved is not None:
+            self._shift = self._find_shift()
+            note_shift(self, path, self._shift)
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
-        frame = self.load_frame(self.files[index], index, float(self.timestamps[index]))
+        kept = self._kept.pop(index, None)
+        frame = self._read(index) if kept is None else kept
         farthest = float(np.abs(frame.points).max(initial=0))
         if farthest > MAP_COORDINATES_M and not self._far:
             self._far = True
@@ -63,6 +83,26 @@ class CloudFileSource(FileSource):
                 f"{step:.2g} m; move the clouds near the origin"
             )
         return frame
+
+    def _read(self, index: int) -> Frame:
+        file, time = self.files[index], float(self.timestamps[index])
+        if self.load_moved is not None and self._shift.any():
+            return self.load_moved(file, index, time, self._shift)
+        return self.load_frame(file, index, time)
+
+    def _find_shift(self) -> Float64:
+        """Return what is taken off all coordinates, by the first file that can be read."""
+        for index in range(len(self.files)):
+            try:
+                frame = self._read(index)
+            except InputError:
+                continue
+            if len(frame):
+                shift = map_shift(frame.points.min(0), frame.points.max(0))
+                if not shift.any():
+                    self._kept[index] = frame
+                return shift
+        return np.zeros(3)
 
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):
@@ -94,6 +134,35 @@ class CloudFileSource(FileSource):
                 out[k, :3, 3] = row[1:4]
         self.warnings.append(f"{path}: read as index x y z qw qx qy qz, kept as reference only")
         return out
+
+
+def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:
+    """Return what to take off coordinates from `low` to `high` (3,), so that float32 holds them.
+
+    Zero but for coordinates of maps.
+    """
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    if max(np.abs(low).max(), np.abs(high).max()) <= MAP_COORDINATES_M:
+        return np.zeros(3)
+    return np.round((low + high) / 2 / _STEP_M) * _STEP_M
+
+
+def shift_words(shift: Float64) -> str:
+    """Say what a shift (3,) does to coordinates."""
+    text = ", ".join(f"{value:.0f}" for value in shift)
+    return f"coordinates are those of the files less ({text}) m"
+
+
+def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
+    """Note that coordinates are those of the files less a shift (3,), and move poses alike."""
+    if not shift.any():
+        return
+    source.metadata["shift_m"] = shift.tolist()
+    source.warnings.append(f"{path}: {shift_words(shift)}")
+    back = np.eye(4)
+    back[:3, 3] = shift
+    source.reference = None if source.reference is None else source.reference @ back
+    source.odometry = None if source.odometry is None else source.odometry @ back
 
 
 def cloud_files(path: Path, *suffixes: str) -> list[Path]:

@@ -138,36 +138,55 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
         warnings.append(f"{path}: frames {k - 1} and {k} have the same time")
 
 
-def ply_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
-    """Read a PLY cloud as a view; points that are not finite are dropped."""
+def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
+    """Read a PLY cloud as a view; points that are not finite are dropped.
+
+    `shift` (3,) is taken off the coordinates, m.
+    """
     ply = read_ply(path)
+    points = ply.points if shift is None else ply.coordinates
     return cloud_frame(
-        index, timestamp, ply.points, ply.normals, amplitude=ply.amplitude, color=ply.color
+        index,
+        timestamp,
+        points,
+        ply.normals,
+        amplitude=ply.amplitude,
+        color=ply.color,
+        shift=shift,
     )
 
 
 def cloud_frame(
     index: int,
     timestamp: float,
-    points: NDArray[np.float32],
+    points: NDArray[np.floating],
     normals: NDArray[np.float32] | None = None,
     *,
     amplitude: NDArray[np.float32] | None = None,
     color: NDArray[np.uint8] | None = None,
     origin: Float64 | None = None,
+    shift: Float64 | None = None,
 ) -> CloudFrame:
-    """Make a view of (N, 3) points and what is known of each, dropping what is no measurement."""
+    """Make a view of (N, 3) points and what is known of each, dropping what is no measurement.
+
+    `shift` (3,) is taken off the points, in their own precision, and off the `origin`.
+    """
+    # Not-a-number compares false; what is left has squares that float32 can hold.
+    measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
+    if shift is not None:
+        points = points - shift
+        origin = None if origin is None else origin - shift
+    with np.errstate(over="ignore", invalid="ignore"):
+        near = points.astype(np.float32, copy=False)
     frame = CloudFrame(
         index,
         timestamp,
-        points,
+        near,
         normals,
         amplitude=amplitude,
         color=color,
         origin=np.zeros(3) if origin is None else origin,
     )
-    # Not-a-number compares false; what is left has squares that float32 can hold.
-    measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
     return frame if measured.all() else frame.keep(measured)
 
 

@@ -41,11 +41,11 @@ def render(result: Reconstruction, extras: ReportExtras) -> str:
     from jinja2.utils import htmlsafe_json_dumps
 
     scene, player = shown.pop("scene"), shown.pop("player")
-    return _template().render(
+    return template("report.html.j2").render(
         **shown,
         version=__version__,
-        style=_asset("style.css"),
-        script=_asset("viewer.js"),
+        style=asset("style.css"),
+        script=asset("viewer.js"),
         first_images={} if player is None else {k: v[0] for k, v in player["images"].items()},
         first_told="" if player is None else player["told"][0],
         last_picture=0 if player is None else len(player["index"]) - 1,
@@ -55,16 +55,18 @@ def render(result: Reconstruction, extras: ReportExtras) -> str:
     )
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return the text of a file in `templates`."""
     folder = resources.files("tofuse.report") / "templates"
     return (folder / name).read_text(encoding="utf-8")
 
 
 @cache
-def _template() -> Template:
+def template(name: str) -> Template:
+    """Return the template of that name."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.from_string(_asset("report.html.j2"))
+    return environment.from_string(asset(name))

@@ -122,7 +122,7 @@ def make_scene(
 ) -> Scene:
     """Gather and thin what is to be shown; `rows` gives the row of each frame index."""
     cloud = result.cloud
-    chosen = _choose(len(cloud), MAX_POINTS)
+    chosen = choose(len(cloud), MAX_POINTS)
     points = cloud.points[chosen].astype(float) + cloud.offset
     good = np.isfinite(points).all(1)
     points, chosen = points[good], chosen[good]
@@ -137,7 +137,7 @@ def make_scene(
         _colors(cloud, chosen, points),
         None if cloud.normals is None else cloud.normals[chosen],
         len(cloud),
-        _spacing(points),
+        spacing_of(points),
         finite(result.diagnostics.sequential),
         finite(result.trajectory),
         finite(reference),
@@ -168,15 +168,15 @@ def packed(scene: Scene) -> dict[str, Any]:
         "heights": list(height_range(scene.points)),
         "yaw": YAW,
         "pitch": PITCH,
-        "points": _base64(steps),
-        "colors": _base64(scene.colors),
-        "normals": None if normals is None else _base64(np.round(normals * 127).astype(np.int8)),
+        "points": base64_of(steps),
+        "colors": base64_of(scene.colors),
+        "normals": None if normals is None else base64_of(np.round(normals * 127).astype(np.int8)),
         "mesh": None if scene.mesh is None else _packed_mesh(scene.mesh, low, extent),
         "lines": {
-            "before": _base64(camera_lines(scene.before, edge, step).astype("<f4")),
-            "after": _base64(camera_lines(scene.after, edge, step).astype("<f4")),
-            "reference": _base64(path_lines(scene.reference).astype("<f4")),
-            "loops": _base64(scene.loops.reshape(-1, 3).astype("<f4")),
+            "before": base64_of(camera_lines(scene.before, edge, step).astype("<f4")),
+            "after": base64_of(camera_lines(scene.after, edge, step).astype("<f4")),
+            "reference": base64_of(path_lines(scene.reference).astype("<f4")),
+            "loops": base64_of(scene.loops.reshape(-1, 3).astype("<f4")),
         },
     }
 
@@ -184,10 +184,10 @@ def packed(scene: Scene) -> dict[str, Any]:
 def _packed_mesh(mesh: Mesh, low: Float64, extent: Float64) -> dict[str, str]:
     color = height_colors(mesh.vertices.astype(float)) if mesh.color is None else mesh.color
     return {
-        "points": _base64(np.round((mesh.vertices - low) / extent * 65535).astype("<u2")),
-        "colors": _base64(color),
-        "normals": _base64(np.round(mesh.normals * 127).astype(np.int8)),
-        "faces": _base64(mesh.faces.astype("<u4")),
+        "points": base64_of(np.round((mesh.vertices - low) / extent * 65535).astype("<u2")),
+        "colors": base64_of(color),
+        "normals": base64_of(np.round(mesh.normals * 127).astype(np.int8)),
+        "faces": base64_of(mesh.faces.astype("<u4")),
     }
 
 
@@ -214,23 +214,37 @@ def path_lines(poses: Float64) -> Float64:
     return np.stack([centers[:-1], centers[1:]], axis=1).reshape(-1, 3)
 
 
-def still(scene: Scene, size: tuple[int, int] = (960, 600)) -> UInt8:
-    """Draw the view that the report opens with, for where there is no WebGL: (H, W, 3)."""
-    R = images.turned(YAW, PITCH)
+def still(
+    scene: Scene,
+    size: tuple[int, int] = (960, 600),
+    *,
+    yaw: float = YAW,
+    pitch: float = PITCH,
+    eye_at: tuple[Float64, float] | None = None,
+    peel: bool = True,
+    least: int = 1,
+) -> UInt8:
+    """Draw the view that the report opens with, for where there is no WebGL: (H, W, 3).
+
+    `eye_at` is the place (3,) that is looked at, and from how far (m). To `peel` is to leave out
+    surfaces that are seen from behind. Points are at least `least` pixels wide.
+    """
+    center, distance = (scene.center, 1.2 * scene.size) if eye_at is None else eye_at
+    R = images.turned(yaw, pitch)
     T = np.eye(4)
     T[:3, :3] = R
-    T[:3, 3] = -R @ scene.center
-    distance = 1.2 * scene.size
+    T[:3, 3] = -R @ center
     scale = size[1] / (2 * np.tan(0.35) * distance)
     points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
     if scene.normals is not None and len(points):
         # Surfaces that face away are walls between us and the inside.
-        eye = scene.center - R.T @ np.array([0, 0, distance])
+        eye = center - R.T @ np.array([0, 0, distance])
         towards = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
         facing = (towards * np.nan_to_num(scene.normals)).sum(1)
         colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
-        points, colors = points[facing >= 0], colors[facing >= 0]
-    radius = int(np.clip(np.ceil(scene.spacing * scale), 1, 6))
+        if peel:
+            points, colors = points[facing >= 0], colors[facing >= 0]
+    radius = int(np.clip(np.ceil(scene.spacing * scale), least, 6))
     drawn = images.splat(points, colors, T, size, scale=scale, distance=distance, radius=radius)
     out = np.empty((*drawn.shape[:2], 3), np.uint8)
     out[:] = images.BACKGROUND
@@ -258,8 +272,8 @@ def _sampled(lines: Float64, number: int = 24) -> Float64:
     return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
 
 
-def _choose(number: int, most: int) -> Integers:
-    """Choose at random, so that any even pattern of the cloud's order is gone."""
+def choose(number: int, most: int) -> Integers:
+    """Choose `most` of the points at random, so that no even pattern of their order is left."""
     if number <= most:
         return np.arange(number)
     return np.sort(np.random.default_rng([0, number]).permutation(number)[:most])
@@ -285,7 +299,8 @@ def height_range(points: Float64) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _spacing(points: Float64) -> float:
+def spacing_of(points: Float64) -> float:
+    """Return the typical distance in m between neighbours among points (N, 3)."""
     if len(points) < 2:
         return 0.01
     from scipy.spatial import cKDTree
@@ -295,5 +310,6 @@ def _spacing(points: Float64) -> float:
     return float(max(np.median(near[:, 1]), 1e-5))
 
 
-def _base64(array: NDArray[Any]) -> str:
+def base64_of(array: NDArray[Any]) -> str:
+    """Return the bytes of an array as text."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

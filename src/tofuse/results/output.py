@@ -127,7 +127,7 @@ class OutputFolder:
             )
         if not overwrite:
             raise OutputError(
-                "holds an earlier result" if "run.json" in entries else "holds a recording",
+                "holds an earlier result" if self._marker in entries else "holds a recording",
                 where=self.path,
                 remedy="give --overwrite to replace it, or another --out",
             )

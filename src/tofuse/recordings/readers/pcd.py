@@ -20,6 +20,7 @@ from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 
 @part("reader", "pcd", label="validated")
@@ -39,7 +40,7 @@ class PcdClouds:
         files = needed_files(path, ".pcd")
         camera = _camera(files)
         if camera is None:
-            return CloudFileSource(path, files, pcd_cloud)
+            return CloudFileSource(path, files, pcd_cloud, pcd_cloud)
         source = CloudFileSource(
             path, files, lambda file, index, time: pcd_image(file, index, time, camera)
         )
@@ -47,17 +48,18 @@ class PcdClouds:
         return source
 
 
-def pcd_cloud(path: Path, index: int, timestamp: float) -> CloudFrame:
-    """Read a file as a cloud; the declared viewpoint is the sensor's position."""
+def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
+    """Read a file as a cloud, less `shift` (3,); its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
     return cloud_frame(
         index,
         timestamp,
-        pcd.points,
+        pcd.points if shift is None else pcd.coordinates,
         pcd.normals,
         amplitude=pcd.amplitude,
         color=pcd.color,
         origin=pcd.viewpoint[:3],
+        shift=shift,
     )
 
 

@@ -26,4 +26,4 @@ class PlyClouds:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "ply")
-        return CloudFileSource(path, needed_files(path, ".ply"), ply_frame)
+        return CloudFileSource(path, needed_files(path, ".ply"), ply_frame, ply_frame)

@@ -15,9 +15,10 @@ from tofuse.files.reading import read_head
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import (
-    MAP_COORDINATES_M,
     CloudFileSource,
+    map_shift,
     needed_files,
+    note_shift,
     sniff_clouds,
 )
 from tofuse.recordings.frames import CloudFrame
@@ -28,7 +29,6 @@ from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 Float64 = NDArray[np.float64]
 
 MAX_POINTS = 100_000_000
-_STEP_M = 1000.0  # coordinates of maps are moved by whole kilometres
 _MISSING = "give `pip install 'tofuse[scan]'`"
 
 
@@ -49,10 +49,7 @@ class LasScans:
         files = needed_files(path, ".las", ".laz")
         shift = _shift(files[0])
         source = CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
-        if shift.any():
-            source.metadata["shift_m"] = shift.tolist()
-            text = ", ".join(f"{value:.0f}" for value in shift)
-            source.warnings.append(f"{path}: coordinates are those of the files less ({text}) m")
+        note_shift(source, path, shift)
         return source
 
 
@@ -88,9 +85,7 @@ def _shift(path: Path) -> Float64:
     low, high = np.asarray(header.mins, float), np.asarray(header.maxs, float)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return np.zeros(3)
-    if max(np.abs(low).max(), np.abs(high).max()) <= MAP_COORDINATES_M:
-        return np.zeros(3)
-    return np.round((low + high) / 2 / _STEP_M) * _STEP_M
+    return map_shift(low, high)
 
 
 def _las_frame(path: Path, index: int, timestamp: float, shift: Float64) -> CloudFrame:
@@ -171,9 +166,30 @@ class E57Source(FileSource):
                 self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
             except InputError as error:
                 self.warnings.append(f"{error}; left out")
+        self._kept: dict[int, CloudFrame] = {}  # read to find the shift
+        self._shift = self._find_shift()
+        note_shift(self, path, self._shift)
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
+        kept = self._kept.pop(index, None)
+        return self._read(index, self._shift) if kept is None else kept
+
+    def _find_shift(self) -> Float64:
+        """Return what is taken off the coordinates of all scans, by the first that can be read."""
+        for index in range(len(self.counts)):
+            try:
+                frame = self._read(index, np.zeros(3))
+            except InputError:
+                continue
+            if len(frame):
+                shift = map_shift(frame.points.min(0), frame.points.max(0))
+                if not shift.any():
+                    self._kept[index] = frame
+                return shift
+        return np.zeros(3)
+
+    def _read(self, index: int, shift: Float64) -> CloudFrame:
         where = f"{self.path}: scan {index}"
         if self.counts[index] > MAX_POINTS:
             raise InputError(f"claims {self.counts[index]} points", where=where)
@@ -196,9 +212,10 @@ class E57Source(FileSource):
         return cloud_frame(
             index,
             float(index),
-            points.astype(np.float32),
+            points,
             amplitude=None if amplitude is None else np.asarray(amplitude, np.float32),
             color=color,
+            shift=shift,
         )
 
     def _pose(self, header: Any) -> Float64:

@@ -41,17 +41,17 @@ class XyzClouds:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "xyz")
-        return CloudFileSource(path, needed_files(path, *_SUFFIXES), xyz_frame)
+        return CloudFileSource(path, needed_files(path, *_SUFFIXES), xyz_frame, xyz_frame)
 
 
-def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
-    """Read one file."""
+def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
+    """Read one file; `shift` (3,) is taken off the coordinates, m."""
     table = read_numbers(path)
     if table.shape[1] < 3:
         raise InputError(
             f"has {table.shape[1]} numbers in a line", where=path, remedy="write x y z"
         )
-    points = _float32(table[:, :3])
+    points = _float32(table[:, :3]) if shift is None else table[:, :3]
     amplitude = normals = color = None
     if table.shape[1] == 4:
         amplitude = _float32(table[:, 3])
@@ -63,7 +63,9 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
             normals = _float32(three)
         elif ((three >= 0) & (three <= 255) & (three == np.rint(three))).all():
             color = three.astype(np.uint8)
-    return cloud_frame(index, timestamp, points, normals, amplitude=amplitude, color=color)
+    return cloud_frame(
+        index, timestamp, points, normals, amplitude=amplitude, color=color, shift=shift
+    )
 
 
 def _float32(values: Float64) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@
     attribute vec3 place, color, normal;
     uniform mat4 view, lens;
     uniform vec3 low, extent, eye;
-    uniform float size, peel, shade, byHeight, most;
+    uniform float size, peel, shade, byHeight, least, most;
     uniform vec2 heights;
     varying vec3 tint;
     vec3 ramp(float t) {
@@ -26,7 +26,7 @@
       vec4 v = view * vec4(p, 1.);
       gl_Position = lens * v;
       if (peel > .5 && dot(normal, eye - p) < 0.) gl_Position = vec4(2., 2., 2., 1.);
-      gl_PointSize = clamp(size / max(-v.z, 1e-6), 1., most);
+      gl_PointSize = clamp(size / max(-v.z, 1e-6), least, most);
       tint = byHeight > .5 ? ramp(clamp((-p.y - heights.x) / heights.y, 0., 1.)) : mix(vec3(.14), vec3(1.), color);
       if (shade > .5) tint *= .6 + .4 * abs(dot(normal, normalize(eye - p)));
     }`;
@@ -82,6 +82,17 @@
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, raw, gl.STATIC_DRAW);
     mesh.count = raw.length / 4;
   }
+  // Several views in several states: each layer is drawn in one state, where its view is switched on.
+  const arrays = {};
+  for (const name in scene.arrays || {}) arrays[name] = buffer(bytes(scene.arrays[name]));
+  const layers = (scene.layers || []).map((layer) => ({
+    ...layer,
+    place: arrays[layer.points],
+    color: layer.colors ? arrays[layer.colors] : null,
+    ink: layer.color.map((value) => value / 255),
+    normal: layer.normals ? arrays[layer.normals] : null,
+  }));
+  const mode = () => { const input = box.querySelector("[name=mode]:checked"); return input ? input.value : ""; };
   const lines = {};
   for (const name in scene.lines) {
     const raw = bytes(scene.lines[name]);
@@ -111,8 +122,19 @@
 
   const start = { yaw: scene.yaw, pitch: scene.pitch, distance: 1.2 * scene.size, target: scene.center };
   const eye = {};
+  // What is to be seen: an outline of what is shown, else the corners of a box.
+  function framed() {
+    if (scene.outlines) return scene.outlines[mode()];
+    const corners = [];
+    for (let k = 0; k < 8; k++) corners.push([0, 1, 2].map((axis) => scene.box[(k >> axis) & 1][axis]));
+    return corners;
+  }
   function reset(changes) {
     Object.assign(eye, start, { target: start.target.slice() }, changes || {});
+    if (scene.outlines) {
+      const seen = framed();
+      eye.target = [0, 1, 2].map((axis) => seen.reduce((sum, point) => sum + point[axis] / seen.length, 0));
+    }
     fit();
     draw();
   }
@@ -124,8 +146,7 @@
   };
   // Moves the eye until the box fills the canvas, all but a border.
   function fit() {
-    const R = turn(), f = lens(), corners = [];
-    for (let k = 0; k < 8; k++) corners.push([0, 1, 2].map((axis) => scene.box[(k >> axis) & 1][axis]));
+    const R = turn(), f = lens(), corners = framed();
     for (let round = 0; round < 8; round++) {
       let fill = 0;
       for (let k = 0; k < 2; k++) {
@@ -180,7 +201,8 @@
     const at = [0, 1, 2].map((k) => eye.target[k] - R[2][k] * eye.distance);
 
     const surface = on("mesh") && mesh;
-    if ((on("points") && scene.count) || surface) {
+    const shown = layers.filter((layer) => layer.mode === mode() && on(layer.view));
+    if ((on("points") && scene.count) || surface || shown.length) {
       gl.useProgram(dots);
       const u = (name) => gl.getUniformLocation(dots, name);
       gl.uniformMatrix4fv(u("view"), false, view);
@@ -189,13 +211,15 @@
       gl.uniform3fv(u("extent"), scene.extent);
       gl.uniform3fv(u("eye"), at);
       gl.uniform1f(u("size"), 1.5 * scene.spacing * fy * height / 2);
+      gl.uniform1f(u("least"), layers.length ? 2 * ratio : 1);
       gl.uniform1f(u("most"), 10 * ratio);
       gl.uniform1f(u("byHeight"), on("height") ? 1 : 0);
       gl.uniform2f(u("heights"), scene.heights[0], Math.max(scene.heights[1] - scene.heights[0], 1e-6));
       const use = (set) => {
         gl.uniform1f(u("shade"), set.normal ? 1 : 0);
         attribute(dots, "place", set.place, gl.UNSIGNED_SHORT, true);
-        attribute(dots, "color", set.color, gl.UNSIGNED_BYTE, true);
+        if (set.color) attribute(dots, "color", set.color, gl.UNSIGNED_BYTE, true);
+        else plain(dots, "color", set.ink);
         if (set.normal) attribute(dots, "normal", set.normal, gl.BYTE, true);
       };
       if (surface) {
@@ -210,6 +234,15 @@
         gl.uniform1f(u("peel"), on("peel") && buffers.normal ? 1 : 0);
         use(buffers);
         gl.drawArrays(gl.POINTS, 0, scene.count);
+      }
+      for (const layer of shown) {
+        gl.uniform1f(u("peel"), 0);
+        gl.uniform3fv(u("low"), layer.low);
+        gl.uniform3fv(u("extent"), layer.extent);
+        gl.uniform1f(u("size"), 1.5 * layer.spacing * fy * height / 2);
+        if (!layer.normal) plain(dots, "normal", [0, 0, 1]);
+        use(layer);
+        gl.drawArrays(gl.POINTS, 0, layer.count);
       }
       for (const name of ["color", "normal"]) {
         const place = gl.getAttribLocation(dots, name);
@@ -232,6 +265,13 @@
     gl.bindBuffer(gl.ARRAY_BUFFER, source);
     gl.enableVertexAttribArray(place);
     gl.vertexAttribPointer(place, 3, type, scaled, 0, 0);
+  }
+
+  function plain(of, name, value) {
+    const place = gl.getAttribLocation(of, name);
+    if (place < 0) return;
+    gl.disableVertexAttribArray(place);
+    gl.vertexAttrib3fv(place, value);
   }
 
   function orbit(dx, dy) {
@@ -306,7 +346,13 @@
     if (button.dataset.view) reset(views[button.dataset.view]);
     if (button.dataset.zoom) zoom(Number(button.dataset.zoom));
   });
-  box.addEventListener("change", draw);
+  let last = framed();
+  box.addEventListener("change", () => {
+    box.dataset.mode = mode();
+    if (String(framed()) === String(last)) { draw(); return; }
+    last = framed();
+    reset();
+  });
   canvas.addEventListener("webglcontextlost", () => box.classList.replace("live", "without"));
   new ResizeObserver(draw).observe(canvas);
   box.classList.add("live");

@@ -1,0 +1,56 @@
+"""Reader of one depth image as PNG."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.images import read_header
+from tofuse.files.reading import files_with, is_file
+from tofuse.parts import part
+from tofuse.recordings.depth_images import DepthImageSource
+from tofuse.recordings.reader import SURE, ReaderOptions, Sniff
+
+
+@part("reader", "depth-png")
+@dataclass(frozen=True)
+class DepthPng:
+    """A 16-bit .png, with a camera.json given or beside it."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        try:
+            if not (is_file(path) and path.suffix.lower() == ".png"):
+                return None
+            header = read_header(path)
+        except InputError:
+            return None
+        if header.bits != 16 or header.channels != 1:
+            return None
+        return Sniff(SURE, "a 16-bit PNG")
+
+    def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
+        """See `Reader.open`."""
+        if not is_file(path):
+            raise InputError("is no file", where=path, remedy="pass one depth .png")
+        camera = options.camera
+        if camera is None and is_file(path.parent / "camera.json"):
+            camera = path.parent / "camera.json"
+        if camera is None:
+            raise InputError("is a depth image without a camera", where=path, remedy=_remedy(path))
+        return DepthImageSource([path], np.zeros(1), None, 1.0, options=ReaderOptions(camera))
+
+
+def _remedy(path: Path) -> str:
+    """Name the frame where the image is one of a native folder, which holds more than depth."""
+    folder = path.parent.parent
+    if path.parent.name == "depth" and is_file(folder / "camera.json"):
+        number = files_with(path.parent, ".png").index(path)
+        return f"use {folder}#{number}, which is this frame of its recording"
+    return "pass --camera camera.json with lens, depth_unit_m and depth_kind"

@@ -1,0 +1,106 @@
+"""One view by its name: a file that holds one, or `REC#12`, frame 12 of a recording."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.recordings.cloud_files import shift_words
+from tofuse.recordings.frames import Frame
+from tofuse.recordings.open import open_recording
+
+Float64 = NDArray[np.float64]
+
+MIN_POINTS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class SingleView:
+    """A frame, and where it comes from.
+
+    Attributes
+    ----------
+    name
+        What the person wrote.
+    path, format, index
+        The recording, its reader, and which frame of it this is.
+    frame
+        The view.
+    shift
+        (3,) m: coordinates in the file are those of the frame plus this. Not zero only for clouds
+        in the coordinates of a map.
+    warnings
+        What a person should know about how it was read.
+    """
+
+    name: str
+    path: str
+    format: str
+    index: int
+    frame: Frame
+    shift: Float64
+    warnings: tuple[str, ...] = ()
+
+
+def open_view(
+    name: str,
+    *,
+    format: str | None = None,  # noqa: A002
+    camera: Path | None = None,
+    topic: str | None = None,
+) -> SingleView:
+    """Read the view that is called `name`; options as of `open_recording`.
+
+    Raises
+    ------
+    InputError
+        If there is no such frame, the recording holds several and `name` doesn't say which, or
+        the frame can't be read or has fewer than ten points.
+    """
+    path, index = split_name(name)
+    recording = open_recording(path, format=format, camera=camera, topic=topic)
+    count = len(recording)
+    if index is None and count > 1:
+        raise InputError(
+            f"holds {count} frames",
+            where=name,
+            remedy=f"say which one: {name}#0 to {name}#{count - 1}",
+        )
+    index = index or 0
+    if index >= count:
+        held = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
+        raise InputError(f"has no frame {index}", where=path, remedy=held)
+    frame = recording[index]
+    if len(frame) < MIN_POINTS:
+        raise InputError(
+            f"has {len(frame)} valid points",
+            where=name,
+            remedy=f"use a view with {MIN_POINTS} or more",
+        )
+    shift = np.asarray(recording.metadata.get("shift_m", np.zeros(3)), float)
+    # The shift is returned with the view, so a warning about it would mislead.
+    moved = shift_words(shift)
+    warnings = tuple(line for line in recording.warnings if not line.endswith(moved))
+    return SingleView(name, path, recording.format, index, frame, shift, warnings)
+
+
+def split_name(name: str) -> tuple[str, int | None]:
+    """Return the path and the frame that `name` asks for; None where it names no frame.
+
+    A path that exists is taken as it is, with any # in it.
+    """
+    if "#" not in name or os.path.lexists(name):
+        return name, None
+    path, _, frame = name.rpartition("#")
+    if not (frame.isascii() and frame.isdecimal()):
+        raise InputError(
+            f"asks for frame {frame!r}",
+            where=name,
+            remedy="write a whole number after the #, such as recording#12",
+        )
+    return path, int(frame)

@@ -1,0 +1,321 @@
+"""Two registered views in 3D: before, after, and coloured by the distance between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.registration.shape import normals_at
+from tofuse.report import images
+from tofuse.report.scene import Scene, base64_of, choose, spacing_of, still
+from tofuse.results.pair import LocalView, PairResult
+
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+SOURCE, TARGET = (240, 160, 60), (90, 176, 245)
+MODES = ("before", "after", "distance")
+MAX_POINTS = 45_000  # of each view; about 2 MB for both
+_MAX_SEARCHED = 400_000  # of each view, in which the nearest points are looked for
+_NEIGHBOURS = 30  # that a surface is fitted to
+_DIRECTIONS = 100  # in which the outermost points are framed
+_FROM_BASE = 0.2  # of viridis: its darkest colours are lost on a dark ground
+# The colour bar ends at so many median distances, of points that are not further than so many rms.
+_CAP_MEDIANS, _MAX_RMS = 4.0, 10.0
+_NONE_CAPS = 4.0  # beyond so many ends of the colour bar a point has no counterpart
+_FAR = 2.5  # times the size of the registered scene: then the start is framed by itself
+_Z_UP = ("las", "e57")  # formats of scanners and maps; cameras look along z
+_BEHIND = 0.1  # share of the points, from which on they are not those of a camera
+_LEAST_PIXELS = 2  # side of a point
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A thinned view in its own local frame, and its distances in m to the other one."""
+
+    points: Float64
+    normals: Float64 | None
+    distance: Float64
+    total: int
+
+
+@dataclass(frozen=True, eq=False)
+class PairScene:
+    """What the page shows.
+
+    Attributes
+    ----------
+    cap_m
+        Distance at the end of the colour bar.
+    none_m
+        Beyond it a point counts as having no counterpart.
+    median_m, share
+        Median distance of the points that have one, and how many those are, 0 to 1.
+    layers
+        Points in the target's local frame, for each of `MODES` those of source and target.
+    shown, total
+        How many points are shown, and how many there are.
+    """
+
+    cap_m: float
+    none_m: float
+    median_m: float
+    share: float
+    layers: dict[str, tuple[Scene, Scene]]
+    yaw: float
+    pitch: float
+    shown: int
+    total: int
+
+
+def pair_scene(result: PairResult) -> PairScene:
+    """Thin both views and measure how far they are from each other."""
+    T = result.found.T_target_source
+    source, target = _searched(result.source.frame), _searched(result.target.frame)
+    theirs = target.points.astype(float)
+    ours = se3.transform(T, source.points.astype(float))
+    a = _shown(source, ours, theirs, len(result.source.frame))
+    b = _shown(target, theirs, ours, len(result.target.frame))
+    both = np.concatenate([a.distance, b.distance])
+    usual = _MAX_RMS * result.found.rms_m
+    near = both[both <= usual] if (both <= usual).any() else both[np.isfinite(both)]
+    cap = _round_up(max(_CAP_MEDIANS * float(np.median(near)) if len(near) else 0.0, 1e-3))
+    near = both[both <= _NONE_CAPS * cap]
+    z_up = any(_stands_up(view) for view in (result.source, result.target))
+    axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if z_up else np.eye(3)
+
+    def scene(view: _Shown, pose: Float64, colors: UInt8) -> Scene:
+        turned = axes @ pose[:3, :3]
+        points = view.points @ turned.T + axes @ pose[:3, 3]
+        normals = None if view.normals is None else view.normals @ turned.T
+        none = np.zeros((0, 4, 4))
+        return Scene(
+            points, colors, normals, view.total, spacing_of(points), none, none, none,
+            np.zeros((0, 2, 3)),
+        )  # fmt: skip
+
+    here = np.eye(4)
+    blue = scene(b, here, _flat(TARGET, len(b.points)))
+    layers = {
+        "before": (scene(a, result.start, _flat(SOURCE, len(a.points))), blue),
+        "after": (scene(a, T, _flat(SOURCE, len(a.points))), blue),
+        "distance": (
+            scene(a, T, distance_colors(a.distance, cap)),
+            scene(b, here, distance_colors(b.distance, cap)),
+        ),
+    }
+    return PairScene(
+        cap,
+        _NONE_CAPS * cap,
+        float(np.median(near)) if len(near) else float("nan"),
+        len(near) / max(len(both), 1),
+        layers,
+        *((-0.5, 0.7) if z_up else (-0.3, 0.3)),
+        shown=len(a.points) + len(b.points),
+        total=a.total + b.total,
+    )
+
+
+def distance_colors(distance: Float64, cap_m: float) -> UInt8:
+    """Colours (N, 3) of distances in m; grey where there is no counterpart."""
+    share = np.clip(distance / cap_m, 0, 1)
+    colors = images.viridis(_FROM_BASE + (1 - _FROM_BASE) * share)
+    colors[distance > _NONE_CAPS * cap_m] = images.GONE
+    return colors
+
+
+def color_bar() -> str:
+    """Return the colour bar as a CSS gradient."""
+    stops = images.viridis(np.linspace(_FROM_BASE, 1, 9))
+    return f"linear-gradient(to right, {', '.join(f'rgb({r},{g},{b})' for r, g, b in stops)})"
+
+
+def distances(points: Float64, others: Float64, chosen: NDArray[np.intp]) -> Float64:
+    """Return (n,) distances in m of the chosen ones of points (N, 3) from the surface of others.
+
+    Between means of the nearest points of both views, along the normal of the other one (as M3C2,
+    Lague et al. 2013), so that noise does not hide where the views are apart. Infinite where a
+    point does not lie over a surface of the others (M, 3).
+    """
+    from scipy.spatial import cKDTree
+
+    if min(len(points), len(others)) < _NEIGHBOURS:
+        return np.full(len(chosen), np.inf)
+    _, own = cKDTree(points).query(points[chosen], k=_NEIGHBOURS)
+    means = points[own].mean(1)
+    # What lies about the nearest point is a patch even at an edge; what is nearest may be a line.
+    tree = cKDTree(others)
+    _, nearest = tree.query(means)
+    _, near = tree.query(others[nearest], k=_NEIGHBOURS)
+    group = others[near]
+    middle = group.mean(1)
+    around = group - middle[:, None]
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    step = means - middle
+    off = np.abs((step * vectors[..., 0]).sum(1))
+    aside = np.sqrt(np.maximum((step**2).sum(1) - off**2, 0))
+    reach = np.sqrt((around**2).sum(2).max(1))
+    return np.where(aside <= reach, off, np.inf)
+
+
+def packed(scene: PairScene) -> dict[str, Any]:
+    """Return the scene for the viewer: plain data, arrays as base64 (little endian)."""
+    arrays: dict[str, str] = {}
+    layers = []
+    for mode in MODES:
+        for view, layer in zip(("source", "target"), scene.layers[mode], strict=True):
+            low = layer.points.min(0)
+            extent = np.maximum(np.ptp(layer.points, axis=0), 1e-6)
+            # What "after" and "distance" have in common is stored once.
+            place = view if view == "target" or mode != "before" else "start"
+            if place not in arrays:
+                steps = np.round((layer.points - low) / extent * 65535)
+                arrays[place] = base64_of(steps.astype("<u2"))
+                if layer.normals is not None:
+                    normals = np.round(np.nan_to_num(layer.normals.astype(float)) * 127)
+                    arrays[f"{place} normals"] = base64_of(normals.astype(np.int8))
+            colors = None
+            if mode == "distance":
+                colors = f"{view} colors"
+                arrays[colors] = base64_of(layer.colors)
+            layers.append(
+                {
+                    "mode": mode,
+                    "view": view,
+                    "count": len(layer.points),
+                    "low": low.tolist(),
+                    "extent": extent.tolist(),
+                    "spacing": layer.spacing,
+                    "points": place,
+                    "normals": f"{place} normals" if layer.normals is not None else None,
+                    "colors": colors,
+                    "color": list(SOURCE if view == "source" else TARGET),
+                }
+            )
+    seen = framing(scene)
+    whole = np.stack([seen["after"].min(0), seen["after"].max(0)])
+    return {
+        "count": 0,
+        "low": whole[0].tolist(),
+        "extent": np.ptp(whole, axis=0).tolist(),
+        "center": whole.mean(0).tolist(),
+        "size": max(float(np.linalg.norm(np.ptp(whole, axis=0))), 1e-3),
+        "box": whole.tolist(),
+        "outlines": {mode: np.round(points, 4).tolist() for mode, points in seen.items()},
+        "spacing": 0.01,
+        "heights": [0.0, 1.0],
+        "yaw": scene.yaw,
+        "pitch": scene.pitch,
+        "points": "",
+        "colors": "",
+        "normals": None,
+        "mesh": None,
+        "lines": {},
+        "arrays": arrays,
+        "layers": layers,
+    }
+
+
+def framing(scene: PairScene) -> dict[str, Float64]:
+    """Return the outline (K, 3) of what each mode shows: the same one, unless the start is far."""
+    after = np.concatenate([_outline(layer.points) for layer in scene.layers["after"]])
+    before = np.concatenate([_outline(layer.points) for layer in scene.layers["before"]])
+    both = np.concatenate([after, before])
+    if np.linalg.norm(np.ptp(both, axis=0)) <= _FAR * np.linalg.norm(np.ptp(after, axis=0)):
+        return dict.fromkeys(MODES, both)
+    return {"before": before, "after": after, "distance": after}
+
+
+def stills(scene: PairScene, size: tuple[int, int] = (720, 480)) -> dict[str, UInt8]:
+    """Draw each mode as the viewer opens with it."""
+    seen = framing(scene)
+    out = {}
+    for mode, (source, target) in scene.layers.items():
+        have = source.normals is not None and target.normals is not None
+        both = replace(
+            source,
+            points=np.concatenate([source.points, target.points]),
+            colors=np.concatenate([source.colors, target.colors]),
+            normals=np.concatenate([source.normals, target.normals]) if have else None,
+            spacing=max(source.spacing, target.spacing),
+        )
+        eye = _eye(seen[mode], images.turned(scene.yaw, scene.pitch), size)
+        out[mode] = still(
+            both,
+            size,
+            yaw=scene.yaw,
+            pitch=scene.pitch,
+            eye_at=eye,
+            peel=False,
+            least=_LEAST_PIXELS,
+        )
+    return out
+
+
+def _searched(frame: Frame) -> CloudFrame:
+    """The points of a view, so many as are searched in."""
+    keep = choose(len(frame), _MAX_SEARCHED)
+    normals = None if frame.normals is None else frame.normals[keep]
+    return CloudFrame(0, 0.0, frame.points[keep], normals, origin=frame.origin)
+
+
+def _shown(frame: CloudFrame, here: Float64, others: Float64, total: int) -> _Shown:
+    """Thin a view and measure it; `here` (N, 3) are its points in the frame of `others`."""
+    keep = choose(len(frame), MAX_POINTS)
+    normals = None
+    if len(frame) > _NEIGHBOURS:
+        normals = normals_at(frame, keep.astype(np.int64))
+    return _Shown(frame.points[keep].astype(float), normals, distances(here, others, keep), total)
+
+
+def _stands_up(local: LocalView) -> bool:
+    """Whether z is up: in maps, and with scanners, which see before them and behind."""
+    if not isinstance(local.view.frame, CloudFrame):
+        return False
+    if local.view.format in _Z_UP or local.center.any():
+        return True
+    return _BEHIND <= float((local.view.frame.points[:, 2] < 0).mean()) <= 1 - _BEHIND
+
+
+def _flat(color: tuple[int, int, int], count: int) -> UInt8:
+    return np.tile(np.array(color, np.uint8), (count, 1))
+
+
+def _outline(points: Float64) -> Float64:
+    """The outermost ones (K, 3) of points in many directions, but for outliers."""
+    low, high = np.percentile(points, [2, 98], axis=0)
+    inside = points[((points >= low) & (points <= high)).all(1)]
+    points = inside if len(inside) else points
+    k = np.arange(_DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - height**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height])
+    return points[np.unique((points @ directions).argmax(0))]
+
+
+def _eye(outline: Float64, R: Float64, size: tuple[int, int]) -> tuple[Float64, float]:
+    """What to look at, and from how far (m), so that an outline fills the picture."""
+    center = outline.mean(0)
+    extent = max(float(np.linalg.norm(np.ptp(outline, axis=0))), 1e-3)
+    distance = 1.2 * extent
+    focal = np.array([size[1] / size[0], 1.0]) / np.tan(0.35)
+    for _ in range(8):
+        view = (outline - center) @ R.T
+        seen = focal * view[:, :2] / np.maximum(view[:, 2:] + distance, 0.05 * extent)
+        low, high = seen.min(0), seen.max(0)
+        center = center + ((low + high) / 2 * distance / focal) @ R[:2]
+        distance = max(0.3 * extent, distance * (1 + ((high - low) / 2).max() / 0.85) / 2)
+    return center, distance
+
+
+def _round_up(metres: float) -> float:
+    """Return the next of 1, 2, 5, 10 ... mm."""
+    if not np.isfinite(metres):
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(metres))
+    return float(power * next(k for k in (1, 2, 5, 10) if k * power >= metres * (1 - 1e-9)))

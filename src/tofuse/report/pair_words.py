@@ -1,0 +1,159 @@
+"""A registration in words, for the page and the terminal alike."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.geometry import se3
+from tofuse.results.pair import PairResult
+
+Float64 = NDArray[np.float64]
+
+_ALONG = 0.985  # cosine from which on a direction is called by the name of an axis
+_SMALL_RAD = 1e-6
+
+
+def belief(result: PairResult) -> tuple[str, str]:
+    """Return what is believed, in two words or so, and the rest of the sentence."""
+    found = result.found
+    chance = "" if found.probability is None else f"probability {_chance(found.probability)}"
+    if found.believed:
+        return "Believed", chance
+    if found.believed is None:
+        return "Not verified", "; ".join(
+            text for text in (chance, found.reason or "the method can't verify its result") if text
+        )
+    return "Not believed", "; ".join(text for text in (chance, found.reason) if text)
+
+
+def translation(result: PairResult) -> str:
+    """Say how the origin moves."""
+    t = result.T_target_source[:3, 3]
+    return f"{vector(t, 4)} m, length {np.linalg.norm(t):.4f} m"
+
+
+def moved_center(result: PairResult) -> str:
+    """Say how the middle of a source moves that lies far from its origin; empty if it doesn't."""
+    center = result.source.center
+    if not center.any():
+        return ""
+    return (
+        f"moves by {vector(result.moved_m, 4)} m at {vector(center, 0)}, the middle of the source"
+    )
+
+
+def rotation(result: PairResult) -> str:
+    """Say by what angle about what axis the source turns."""
+    w = se3.so3_log(result.T_target_source[:3, :3])
+    angle = float(np.linalg.norm(w))
+    if angle < _SMALL_RAD:
+        return "0.000\N{DEGREE SIGN}"
+    return f"{np.degrees(angle):.3f}\N{DEGREE SIGN} about {vector(w / angle, 3)}"
+
+
+def matrix(result: PairResult) -> list[str]:
+    """Return the rows of T_target_source."""
+    T = result.T_target_source
+    wide = max(len(f"{value:.6f}") for value in T[:3, 3])
+    return [" ".join(f"{v:12.9f}" for v in row[:3]) + f"  {row[3]:{wide}.6f}" for row in T]
+
+
+def overlap(result: PairResult) -> str:
+    """Say how much of the views lies on the other; what a method doesn't know is left out."""
+    found = result.found
+    parts = []
+    if found.overlap is not None:
+        parts.append(f"{percent(found.overlap)} of the points overlap")
+    if found.support is not None:
+        parts.append(f"{percent(found.support)} support the pose")
+    if found.contradiction is not None:
+        parts.append(f"{percent(found.contradiction)} contradict it")
+    if not parts:
+        return f"{percent(found.share)} of the source's points have a partner"
+    return ", ".join(parts)
+
+
+def rms(result: PairResult) -> str:
+    """Say how far apart corresponding points are."""
+    value = result.found.rms_m
+    return f"{1000 * value:.2f} mm" if np.isfinite(value) else "unknown"
+
+
+def sigma(result: PairResult) -> str:
+    """Say how well the pose is known, one standard deviation in the worst observable direction."""
+    metres, radians = result.sigma
+    parts = []
+    if metres is not None:
+        parts.append(f"{1000 * metres:.2f} mm")
+    if radians is not None:
+        parts.append(f"{np.degrees(radians):.3f}\N{DEGREE SIGN}")
+    return ", ".join(parts) or "unknown"
+
+
+def sigma_note(result: PairResult) -> str:
+    """Say what kind of figure `sigma` is."""
+    note = "1\N{GREEK SMALL LETTER SIGMA}, worst observable direction"
+    if result.found.believed is None:
+        note += "; by the noise of the points alone, usually too small"
+    return note
+
+
+def unobservable(result: PairResult) -> str:
+    """Say which motions the data doesn't constrain, in the axes of the source; empty if none."""
+    slides, turns = result.free_motions
+    parts = []
+    if len(slides):
+        parts.append(f"sliding {_directions(slides, 'along', 'in any direction')}")
+    if len(turns):
+        parts.append(f"turning {_directions(turns, 'about', 'about any axis')}")
+    return " and ".join(parts)
+
+
+def runner_up(result: PairResult) -> str:
+    """Say how the best other pose compares, and where it is; empty if none was looked for."""
+    parts = []
+    away = result.runner_up_distance
+    if away is not None:
+        metres, angle = away
+        parts.append(f"{metres:.3f} m and {np.degrees(angle):.1f}\N{DEGREE SIGN} away")
+    if result.found.margin is not None:
+        parts.append(f"fits {percent(result.found.margin)} fewer of the points")
+    return ", ".join(parts)
+
+
+def percent(value: float) -> str:
+    """Write a share of 1 in percent, with a decimal where it is small."""
+    shown = 100 * value
+    return f"{shown:.1f} %" if 0.05 <= abs(shown) < 9.95 else f"{shown:.0f} %"
+
+
+def _chance(value: float) -> str:
+    """Write a probability, which is never certain."""
+    if value > 0.99:
+        return "above 99 %"
+    return "below 1 %" if value < 0.01 else f"{100 * value:.0f} %"
+
+
+def vector(values: ArrayLike, digits: int) -> str:
+    """Write three numbers in brackets."""
+    rounded = np.round(np.asarray(values, float), digits) + 0.0
+    return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
+
+
+def _directions(axes: Float64, one: str, all_of_them: str) -> str:
+    """Say which directions (k, 3) span."""
+    if len(axes) >= 3:
+        return all_of_them
+    if len(axes) == 2:
+        return f"{all_of_them} perpendicular to {_named(np.cross(*axes))}"
+    return f"{one} {_named(axes[0])}"
+
+
+def _named(axis: Float64) -> str:
+    """Name an axis of the source that a direction is near to, else give its components."""
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
+    k = int(np.abs(axis).argmax())
+    if abs(axis[k]) > _ALONG:
+        return f"{'xyz'[k]}"
+    return vector(axis * np.sign(axis[k]), 2)

@@ -1,0 +1,130 @@
+"""The scene of a registered pair: what is shown where, and how far apart the views are."""
+
+from __future__ import annotations
+
+import base64
+
+import numpy as np
+import pytest
+
+from registration_scenes import relief, view
+from tofuse.geometry import se3
+from tofuse.recordings.single import SingleView
+from tofuse.registration.base import Registration
+from tofuse.report import images
+from tofuse.report.pair_scene import (
+    MAX_POINTS,
+    distance_colors,
+    distances,
+    packed,
+    pair_scene,
+    stills,
+)
+from tofuse.results.pair import LocalView, PairResult
+
+T = se3.exp([0.1, -0.05, 0.02, 0.02, 0.1, -0.05])
+
+
+def local(points: np.ndarray, format: str = "ply", center=(0, 0, 0)) -> LocalView:  # noqa: A002
+    frame = view(points)
+    center = np.asarray(center, float)
+    return LocalView(SingleView("a", "a", format, 0, frame, center), frame, center)
+
+
+def pair(points: np.ndarray, others: np.ndarray, pose=T, start=None, **more) -> PairResult:
+    found = Registration(pose, True, 1, 1, 1, 0.0, 0.002, np.eye(6))
+    start = np.eye(4) if start is None else start
+    return PairResult(local(points, **more), local(others, **more), found, start)
+
+
+def sheet(seed: int, low: float = 0.0, high: float = 1.0, z: float = 1.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    flat = rng.uniform([low, 0], [high, 1], (6000, 2))
+    return np.column_stack([flat, z + rng.normal(0, 0.003, len(flat))])
+
+
+def test_distances_are_those_of_the_surfaces_not_of_the_noise() -> None:
+    ours, theirs = sheet(1, z=1.012), sheet(2)
+    found = distances(ours, theirs, np.arange(len(ours)))
+    assert np.isfinite(found).mean() > 0.97
+    assert np.median(found) == pytest.approx(0.012, abs=5e-4)
+    # Beside the other surface there is no counterpart, however near its edge is.
+    aside = distances(sheet(3, 1.1, 1.5), theirs, np.arange(6000))
+    assert np.isinf(aside).mean() > 0.97
+    assert np.isinf(distances(ours[:9], theirs, np.arange(9))).all()
+
+
+def test_colors_run_to_the_end_of_the_bar_and_then_to_grey() -> None:
+    colors = distance_colors(np.array([0, 0.005, 0.01, 0.03, 0.05, np.inf]), 0.01)
+    assert len(np.unique(colors[:3], axis=0)) == 3
+    assert (colors[3] == colors[2]).all()
+    assert (colors[4:] == images.GONE).all()
+
+
+def decoded(data: dict, mode: str, which: str) -> np.ndarray:
+    (layer,) = (x for x in data["layers"] if (x["mode"], x["view"]) == (mode, which))
+    steps = np.frombuffer(base64.b64decode(data["arrays"][layer["points"]]), "<u2")
+    assert len(steps) == 3 * layer["count"]
+    return layer["low"] + steps.reshape(-1, 3) / 65535 * np.array(layer["extent"])
+
+
+def test_layers_are_where_the_poses_put_them() -> None:
+    others, points = relief(900, 1), se3.transform(se3.inverse(T), relief(800, 2))
+    start = se3.exp([0.3, 0, 0, 0, 0, 0.2])
+    scene = pair_scene(pair(points, others, start=start))
+    data = packed(scene)
+    for mode, which, truth in (
+        ("before", "source", se3.transform(start, points)),
+        ("after", "source", se3.transform(T, points)),
+        ("distance", "source", se3.transform(T, points)),
+        ("before", "target", others),
+        ("after", "target", others),
+    ):
+        np.testing.assert_allclose(decoded(data, mode, which), truth, atol=1e-4)
+    assert scene.share > 0.8
+    assert scene.median_m < 0.01
+    assert scene.cap_m * 1000 in (1, 2, 5, 10, 20)
+    # All is framed by what is to be seen; the same, so that nothing jumps.
+    assert data["outlines"]["before"] == data["outlines"]["after"]
+
+
+def test_a_pose_that_is_wrong_shows() -> None:
+    others, points = relief(3000, 1), se3.transform(se3.inverse(T), relief(3000, 2))
+    right = pair_scene(pair(points, others))
+    wrong = pair_scene(pair(points, others, pose=se3.exp([0, 0, 0.03, 0, 0, 0]) @ T))
+    assert wrong.median_m > 4 * right.median_m
+    drawn = stills(right)
+    assert set(drawn) == {"before", "after", "distance"}
+    for image in drawn.values():
+        filled = (image != images.BACKGROUND).any(-1)
+        assert 0.1 < filled.mean() < 0.95
+        assert not filled[[0, -1]].all(1).any()
+
+
+def test_a_start_far_away_has_a_frame_of_its_own() -> None:
+    points = relief(500, 1)
+    far = se3.exp([50.0, 0, 0, 0, 0, 0])
+    data = packed(pair_scene(pair(points, points, pose=np.eye(4), start=far)))
+    before, after = (np.ptp(data["outlines"][mode], axis=0) for mode in ("before", "after"))
+    assert before[0] > 40
+    assert after[0] < 2
+
+
+def test_large_views_are_thinned() -> None:
+    many = relief(MAX_POINTS + 5000, 1)
+    scene = pair_scene(pair(many, many[:1000], pose=np.eye(4)))
+    assert (scene.shown, scene.total) == (MAX_POINTS + 1000, MAX_POINTS + 6000)
+    assert sum(len(text) for text in packed(scene)["arrays"].values()) < 2.5e6
+
+
+@pytest.mark.parametrize(
+    ("format", "center", "up"), [("ply", (0, 0, 0), False), ("las", (0, 0, 0), True),
+                                 ("ply", (5e5, 4e6, 0), True)],
+)  # fmt: skip
+def test_maps_and_scans_stand_upright(format, center, up) -> None:  # noqa: A002
+    """Down is y for the viewer; in a map up is z."""
+    points = relief(500, 1)
+    scene = pair_scene(pair(points, points, pose=np.eye(4), format=format, center=center))
+    shown = scene.layers["after"][1].points
+    turned = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
+    np.testing.assert_allclose(shown, turned if up else points, atol=1e-5)
