@@ -83,11 +83,28 @@ def test_other_clouds_stay_clouds(tmp_path: Path) -> None:
             open_recording(folder, format="grid")
 
 
-def test_a_file_with_points_left_out_is_one_bad_frame(tmp_path: Path) -> None:
+def test_points_that_were_left_out_leave_the_others_on_their_pixels(tmp_path: Path) -> None:
+    for name in ("whole", "thinned"):
+        made.make_helios(tmp_path / name)
+    path = tmp_path / "thinned" / "Image_1.ply"
+    ply = read_ply(path)
+    kept = ply.points[:, 2] > 0
+    assert not kept.all()
+    write_ply(path, ply.points[kept], scalars={"intensity": ply.amplitude[kept]})
+    whole, thinned = (open_recording(tmp_path / name)[1] for name in ("whole", "thinned"))
+    both = (whole.depth > 0) & (thinned.depth > 0)
+    # Pixels that saw nothing in the first file have no ray.
+    assert both.sum() > 0.8 * (whole.depth > 0).sum() >= 0.8 * (thinned.depth > 0).sum()
+    np.testing.assert_allclose(thinned.depth[both], whole.depth[both], rtol=1e-3)
+    np.testing.assert_array_equal(thinned.amplitude_image[both], whole.amplitude_image[both])
+
+
+def test_points_off_the_rays_are_one_bad_frame(tmp_path: Path) -> None:
     made.make_helios(tmp_path / "a")
     path = tmp_path / "a" / "Image_1.ply"
     points = read_ply(path).points
-    write_ply(path, points[points[:, 2] > 0])
+    points = points[points[:, 2] > 0]
+    write_ply(path, points + np.array([0.5 * points[:, 2].mean() / 32, 0, 0]))
     recording = open_recording(tmp_path / "a")
     assert len(recording[0]) > 100
     with pytest.raises(UnreadableFrameError, match="export all points"):

@@ -250,10 +250,11 @@ def test_the_finest_level_is_coarser_where_noise_is_thicker():
     sizes = []
     for noise in (0.0, 0.02):
         noisy = plane + rng(1).normal(0, noise, plane.shape) * [0, 0, 1]
-        sizes.append(CoarseToFine()._finest(view(noisy), view(noisy))[0])
+        sizes.append(CoarseToFine().finest(view(noisy), view(noisy), 0.01)[0])
     assert sizes[1] > 2 * sizes[0]
     given = CoarseToFine(resolution=0.1, metric=PointToPlane())
-    assert given._finest(view(plane), view(plane))[0] == 0.1
+    found = given.register(view(plane), view(plane), np.eye(4), rng(2))
+    assert found.points == len(averaged(view(plane), 0.1))
 
 
 @pytest.mark.parametrize(

@@ -149,10 +149,10 @@ class _PairwiseTracker(Tracker):
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 
     def _links(self, frame: Frame) -> tuple[Link, ...]:
-        """Registrations to views of other components that are believed."""
+        """The registration to the last view of another component, if it is believed."""
         others = [p for p in self._placed if p.component != self._component]
-        found = [self._register(frame, p) for p in others]
-        return tuple(r.link(frame) for r in found if r is not None and r.believed)
+        found = self._register(frame, others[-1]) if others else None
+        return (found.link(frame),) if found is not None and found.believed else ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,7 @@ def default(kind: ViewKind) -> Config:
                 max_yaw_rad=0.8,
                 min_gap=30,
                 per_frame=6,
-                confirmation=Confirmation(registrations=(AnyPair(),)),
+                confirmation=Confirmation(registrations=(AnyPair(search=False),)),
             ),
             refinement=Planes(),
         )

@@ -94,7 +94,16 @@ def reconstruct(
                 remedy="check that the files are complete, or give --format",
             )
         result = tracked.mapper.finish(stages)
-    return replace(result, recording=describe(recording))
+    return _described(result, describe(recording))
+
+
+def _described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
+    """Say what a result, and those of its components, were made of."""
+    components = tuple(
+        c if c.result is None else replace(c, result=_described(c.result, recording))
+        for c in result.components
+    )
+    return replace(result, recording=recording, components=components)
 
 
 @dataclass(eq=False)

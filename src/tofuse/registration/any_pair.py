@@ -13,8 +13,8 @@ from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.cloud_pair import register_clouds
-from tofuse.registration.view_pair import register_pair
+from tofuse.registration.cloud_pair import follow_clouds, register_clouds
+from tofuse.registration.view_pair import follow, register_pair
 
 Float64 = NDArray[np.float64]
 
@@ -28,8 +28,15 @@ class AnyPair(Registrar):
 
     Two images are registered by what both cameras saw (`registration.view_pair`), and where they
     have too little surface for that, like clouds (`registration.cloud_pair`).
+
+    Attributes
+    ----------
+    search
+        Whether poses are searched where the one that the guess leads to is not certain. Else that
+        one is judged by itself.
     """
 
+    search: bool = True
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def register(
@@ -44,7 +51,13 @@ class AnyPair(Registrar):
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
             options = SurfaceOptions()
-            found = register_pair(surface_map(source, options), surface_map(target, options), guess)
+            data, model = surface_map(source, options), surface_map(target, options)
+            if self.search or guess is None:
+                found = register_pair(data, model, guess)
+            else:
+                found = follow(data, model, guess)
             if found is not None:
                 return found
-        return register_clouds(source, target, guess, rng)
+        if self.search or guess is None:
+            return register_clouds(source, target, guess, rng)
+        return follow_clouds(source, target, guess, rng)

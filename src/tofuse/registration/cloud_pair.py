@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
-from tofuse.recordings.frames import Frame
+from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
@@ -25,7 +25,6 @@ from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
 from tofuse.registration.confidence import CERTAIN, CloudEvidence
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.icp import Icp
-from tofuse.registration.reduce import reduced
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
@@ -43,10 +42,12 @@ _POLISHED = 8
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
 # Of a pose at the guess and one that leads by less than this share of the points, the first.
 _LEAD = 0.02
+# Support below which the guess is also followed from coarse to fine.
+_LEAST_SUPPORT = 1 / 3
 # Score that may be lost by noise alone when a pose is aligned once more.
 _GIVEN_UP = 0.02
-# Finest resolution in spacings of some thousand points.
-_FINER = 0.5
+# Finest resolution in spacings of so many points.
+_FINER, _SPACED = 0.5, 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,8 @@ class _Pose:
 
     T_target_source: Float64
     agreement: Agreement
+    # Where it was followed from; None for poses that were searched.
+    guess: Float64 | None = None
 
 
 # Where nothing fits: the rival of a pose that has no other.
@@ -73,8 +76,8 @@ class _Views:
 
     @classmethod
     def of(cls, source: Frame, target: Frame, rng: np.random.Generator) -> _Views:
-        size = _FINER * max(spacing(source), spacing(target))
-        size, data, model = reduced(source, target, size, _POINTS)
+        size = max(_finest(source), _finest(target))
+        size, data, model = CoarseToFine(points=_POINTS).finest(source, target, size)
         maps = CloudMap.of(data, size, source), CloudMap.of(model, size, target)
         return cls(source, target, *maps, rng)
 
@@ -116,6 +119,12 @@ class _Views:
         return bool(shift > _DISTINCT * self.size or turned > _DISTINCT_RAD)
 
 
+def _finest(view: Frame) -> float:
+    """Spacing of a view's points in m, but not much finer than that of some thousand of them."""
+    share = min(1.0, _SPACED / max(len(view), 1))
+    return spacing(view) * max(_FINER, float(np.sqrt(share)))
+
+
 def register_clouds(
     source: Frame,
     target: Frame,
@@ -133,17 +142,40 @@ def register_clouds(
     always_search
         Whether to search even if the pose that was followed from the guess is as good as certain.
 
+    Returns
+    -------
+    Where the views fit only with the source 10, 100 or 1000 times as large, or as small, the pose
+    is of that, it is not believed, and the reason says so.
+
     Raises
     ------
     RegistrationError
         If there are too few points, or too few of them correspond anywhere.
     """
+    power = _power_of_scale(source, target)
+    if power and not always_search:
+        scale = 10.0**power
+        found = _registered_scaled(source, target, scale, rng)
+        if found is not None:
+            reason = f"the views fit with the source {scale:g} times as large: check its unit"
+            return replace(found, believed=False, reason=reason)
+    return _registered(source, target, guess, rng, always_search=always_search)
+
+
+def _registered(
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    rng: np.random.Generator,
+    *,
+    always_search: bool = False,
+) -> Registration:
     views = _Views.of(source, target, rng)
     start = np.eye(4) if guess is None else guess
-    near = views.polished(start)
+    near = replace(views.polished(start), guess=start)
     if views.evidence(near).probability >= CERTAIN and not always_search:
         found = _registration(views, near)
-        if (found.probability or 0.0) >= CERTAIN:
+        if (found.probability or 0.0) >= CERTAIN and not len(found.unobservable):
             return found
     seen = _searched(source, target, guess)
     if seen is not None and seen.believed and not always_search:
@@ -159,15 +191,39 @@ def register_clouds(
     return _registration(views, best, next(others, _NOWHERE))
 
 
+def _power_of_scale(source: Frame, target: Frame) -> int:
+    """Power of ten by which the target is larger than the source, -3 to 3; 0 if it is not."""
+    spread = [np.ptp(np.percentile(v.points, [5, 95], axis=0), axis=0) for v in (source, target)]
+    small, large = (float(np.linalg.norm(s)) for s in spread)
+    if small == 0 or large == 0:
+        return 0
+    power = round(float(np.log10(large / small)))
+    return power if abs(power) <= 3 else 0
+
+
+def _registered_scaled(
+    source: Frame, target: Frame, scale: float, rng: np.random.Generator
+) -> Registration | None:
+    """Register the source with its lengths scaled; None where that is not believed."""
+    points = source.points * np.float32(scale)
+    scaled = CloudFrame(source.index, source.timestamp, points, origin=scale * source.origin)
+    try:
+        found = _registered(scaled, target, None, rng)
+    except RegistrationError:
+        return None
+    return found if found.believed else None
+
+
 def follow_clouds(
     source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
 ) -> Registration:
     """Register two clouds from a guess (4, 4) alone; see `register_clouds`."""
     views = _Views.of(source, target, rng)
-    near = views.polished(guess)
+    near = replace(views.polished(guess), guess=guess)
     if views.evidence(near).probability < CERTAIN:
         far = CoarseToFine().register(source, target, guess, rng)
-        near = max(near, views.judged(far.T_target_source), key=lambda p: p.agreement.score)
+        other = replace(views.judged(far.T_target_source), guess=guess)
+        near = max(near, other, key=lambda pose: pose.agreement.score)
     return _registration(views, near)
 
 
@@ -187,9 +243,11 @@ def _proposed(views: _Views, start: Float64) -> list[_Pose]:
         found += [views.polished(c.T_target_source) for c in candidates[:_POLISHED]]
     except RegistrationError as error:
         failure = error
+    if any(pose.agreement.support > _LEAST_SUPPORT for pose in found):
+        return found
     try:
         near = CoarseToFine().register(views.source, views.target, start, views.rng)
-        found.append(views.judged(near.T_target_source))
+        found.append(replace(views.judged(near.T_target_source), guess=start))
     except RegistrationError as error:
         failure = error
     if not found and failure is not None:
@@ -239,18 +297,23 @@ def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Reg
 
     Without a rival nothing was compared with it.
     """
-    fine = CoarseToFine(coarsest=views.size)
-    found = fine.register(views.source, views.target, best.T_target_source, views.rng)
+    T = best.T_target_source
+    averaged = views.there.view, views.here.view
+    found = CoarseToFine().at(views.size, *averaged, T, T if best.guess is None else best.guess)
     after = views.judged(found.T_target_source)
     if after.agreement.score < best.agreement.score - _GIVEN_UP:
-        found = replace(found, T_target_source=best.T_target_source)
+        found = replace(found, T_target_source=T)
         after = best
     said = after.agreement
     lead = None if rival is None else said.score - max(rival.agreement.score, 0.0)
+    if lead is not None and len(found.unobservable):
+        lead = min(lead, 0.0)  # poses along these directions fit as well
     evidence = views.evidence(after, lead, len(found.unobservable))
     reason = evidence.objection()
     return replace(
         found,
+        # Planes that neighbours are fitted to share their points, and so their errors.
+        information=found.information / NEIGHBOURS,
         margin=lead,
         believed=not reason,
         probability=evidence.probability,

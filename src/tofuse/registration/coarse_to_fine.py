@@ -132,7 +132,11 @@ class CoarseToFine(Registrar):
                     f"has {len(view)} points, {FEWEST_PAIRS} are needed",
                     where=f"frame {view.index}",
                 )
-        fine = self._finest(source, target)
+        if self.resolution is None:
+            fine = self.finest(source, target, max(spacing(source), spacing(target)))
+        else:
+            size = self.resolution
+            fine = size, averaged(source, size), averaged(target, size)
         levels = [fine]
         most = _extent(fine[2]) / _EXTENT_SHARE
         most = most if self.coarsest is None else min(most, self.coarsest)
@@ -153,11 +157,22 @@ class CoarseToFine(Registrar):
                     raise
                 continue  # too few pairs at this level: a finer one may have enough
             T = found.T_target_source
-        if len(found.unobservable) == 0:
-            return found
-        hold = Hold.of(found.unobservable, data.points.astype(np.float64))
-        T = T @ hold.along(se3.inverse(T) @ guess)
-        return icp.register(data, model, T, rng, hold)
+        return _kept(found, icp, data, model, guess, rng)
+
+    def at(
+        self,
+        resolution: float,
+        data: CloudFrame,
+        model: CloudFrame,
+        T_start: Float64,
+        guess: Float64,
+    ) -> Registration:
+        """Register two clouds that were averaged to a resolution in m, from a start (4, 4).
+
+        Directions that they don't constrain stay as they are in the guess (4, 4).
+        """
+        icp, rng = self._icp(resolution, 1e-3), np.random.default_rng(0)  # nothing is drawn
+        return _kept(icp.register(data, model, T_start, rng), icp, data, model, guess, rng)
 
     def _icp(self, resolution: float, epsilon: float) -> Icp:
         return Icp(
@@ -170,11 +185,15 @@ class CoarseToFine(Registrar):
             neighbours=self.neighbours,
         )
 
-    def _finest(self, source: Frame, target: Frame) -> tuple[float, CloudFrame, CloudFrame]:
-        if self.resolution is not None:
-            size = self.resolution
-            return size, averaged(source, size), averaged(target, size)
-        size = max(spacing(source), spacing(target))
+    def finest(
+        self, source: Frame, target: Frame, size: float
+    ) -> tuple[float, CloudFrame, CloudFrame]:
+        """Average both views to `size` m, or more: until there are few points, with little noise.
+
+        Returns
+        -------
+        The resolution in m, and both averaged views.
+        """
         size, data, model = reduced(source, target, size, self.points)
         # Averaging thins noise, but not what is rough in itself: that keeps its first size.
         first = size, data, model
@@ -188,6 +207,23 @@ class CoarseToFine(Registrar):
     def _roughness(self, view: CloudFrame) -> float:
         rough = shape_at(view, np.arange(len(view)), self.neighbours).roughness
         return float(np.nanmedian(rough)) if np.isfinite(rough).any() else 0.0
+
+
+def _kept(
+    found: Registration,
+    icp: Icp,
+    data: CloudFrame,
+    model: CloudFrame,
+    guess: Float64,
+    rng: np.random.Generator,
+) -> Registration:
+    """The registration with degenerate directions as they are in the guess."""
+    if len(found.unobservable) == 0:
+        return found
+    hold = Hold.of(found.unobservable, data.points.astype(np.float64))
+    T = found.T_target_source
+    T = T @ hold.along(se3.inverse(T) @ guess)
+    return icp.register(data, model, T, rng, hold)
 
 
 def spacing(view: Frame) -> float:

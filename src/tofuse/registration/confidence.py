@@ -36,7 +36,7 @@ _FOLLOWED = np.array([0.35, 6.54, -1.09])
 # ``benchmarks/cloud_pairs.py fit``. On scenes that took no part the area under the ROC curve is
 # 0.96 and 0.85; of 47 poses that were believed after a search 1 was wrong.
 _CLOUDS_SEARCHED = np.array([-1.66, 5.94, 2.58, -1.14, -4.00, -0.42])
-_CLOUDS_FOLLOWED = np.array([-3.76, 10.01, -3.61, -0.12])
+_CLOUDS_FOLLOWED = np.array([-3.76, 10.01, -3.61, -2.0, -0.12])
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,9 @@ class CloudEvidence:
 
     @property
     def followed(self) -> Float64:
-        """(4,) regressors of a pose that was followed from a guess."""
-        return np.array([1, self.support, self.contradiction, not self.seen_through], float)
+        """(5,) regressors of a pose that was followed from a guess."""
+        degenerate, unknown = self.degenerate > 0, not self.seen_through
+        return np.array([1, self.support, self.contradiction, degenerate, unknown], float)
 
     @property
     def probability(self) -> float:

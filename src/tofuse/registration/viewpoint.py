@@ -24,12 +24,15 @@ UInt8 = NDArray[np.uint8]
 
 # Points that are looked at, and neighbours whose distance shows how dense points are.
 _LOOKED_AT, _SAMPLE, _NEIGHBOURS = 50_000, 2000, 8
-# Points chosen at random spread the logarithm of that distance by about 0.2, a scanner's grid with
-# its poles by 0.3; along surfaces that are seen askance, or at different distances, it is more.
-_EVEN, _MORE_EVEN = 0.35, 0.7
+# Spread of the logarithm of that distance, as a standard deviation: points of an image that are
+# chosen at random have about 0.2, those of a scanner's grid with its poles 0.3. Surfaces that are
+# seen from elsewhere mostly have more; this share of the spread along the surfaces is the most.
+_EVEN_IMAGE, _EVEN_SPHERE, _MORE_EVEN = 0.25, 0.35, 0.55
+# Length of the mean direction of what surrounds the viewpoint.
+_ALL_AROUND = 0.5
 # Neighbours in direction that differ by this share of the range are on different surfaces, and the
 # share of points where that may be: outlines.
-_JUMP, _OUTLINES = 0.1, 0.15
+_JUMP, _OUTLINES = 0.1, 0.12
 _QUARTILES = 1.349  # of a normal distribution, in standard deviations
 # Half the angle of a cone that an image can show, rad, and the share of points outside at most.
 _WIDEST, _OUTSIDE = 0.9, 0.01
@@ -68,7 +71,9 @@ def viewpoint_of(view: Frame) -> Viewpoint | None:
     apart = np.sqrt(squared[:, -1])
     _, along = KdTree(points).neighbours(points[some], _NEIGHBOURS + 1)
     even, over = _spread(apart), _spread(np.sqrt(along[:, -1]))
-    if jumps.mean() > _OUTLINES or even > min(_EVEN, _MORE_EVEN * over):
+    around = np.linalg.norm(directions.mean(0)) < _ALL_AROUND
+    most = _EVEN_SPHERE if around else _EVEN_IMAGE
+    if jumps.mean() > _OUTLINES or even > min(most, _MORE_EVEN * over):
         return None
     # So many points share the circle around one; all points of the view are closer together.
     thinned = np.sqrt(len(points) / max(len(view), 1))

@@ -38,6 +38,8 @@ _AMPLITUDES = ("intensity", "amplitude", "i")
 MAX_POINTS = 1 << 22
 # Nothing that a ToF camera sees is 50 m away on average, nor as near as 50 mm.
 MM_FROM = 50.0
+# Points without a grid are on the ray of a pixel within this share of a pixel, most of them.
+_OFF_RAY, _ON_RAYS = 0.3, 0.8
 
 
 @part("reader", "grid")
@@ -165,13 +167,11 @@ class _Frames:
 
     def load(self, path: Path, index: int, timestamp: float) -> RangeFrame:
         cells = read_cells(path)
-        if len(cells.points) != self.raster.width * self.raster.height:
-            raise InputError(
-                f"has {len(cells.points)} points, not {self.raster.width} x {self.raster.height}",
-                where=path,
-                remedy="export all points, invalid ones too",
-            )
-        points = _moved(self.raster.image(cells.points) * np.float32(self.scale), self.behind)
+        whole = len(cells.points) == self.raster.width * self.raster.height
+        points = self.raster.image(cells.points) if whole else cells.points
+        points = _moved(points * np.float32(self.scale), self.behind)
+        if not whole:
+            points, cells = self._placed(points, cells, path)
         return organised_frame(
             points,
             self.camera,
@@ -182,9 +182,41 @@ class _Frames:
             color=cells.color,
         )
 
+    def _placed(self, points: Float32, cells: Cells, path: Path) -> tuple[Float32, Cells]:
+        """Put the points (n, 3) of a file without invalid ones where the rays of pixels are."""
+        from scipy.spatial import cKDTree
+
+        rays = self.camera.rays().reshape(-1, 2)
+        known = np.flatnonzero(np.isfinite(rays).all(-1))
+        seen = np.flatnonzero(np.isfinite(points).all(-1) & (points[:, 2] > 0))
+        off, near = cKDTree(rays[known]).query(points[seen, :2] / points[seen, 2:])
+        pixel = self.raster.width * self.raster.height
+        step = float(np.ptp(rays[known], axis=0).max()) / max(self.raster.width, self.raster.height)
+        # Pixels that never saw anything in the files looked at have no ray.
+        on = off < _OFF_RAY * step
+        at, seen = known[near[on]], seen[on]
+        if len(points) > pixel or len(np.unique(at)) < len(at) or np.mean(on) < _ON_RAYS:
+            raise InputError(
+                f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "
+                "they are not on the rays of those before it",
+                where=path,
+                remedy="export all points, invalid ones too",
+            )
+        image = np.full((pixel, 3), np.nan, np.float32)
+        image[at] = points[seen]
+        light, color = cells.amplitude, cells.color
+        if light is not None:
+            light, chosen = np.zeros(pixel, np.float32), light[seen]
+            light[at] = chosen
+        if color is not None:
+            color, picked = np.zeros((pixel, 3), np.uint8), color[seen]
+            color[at] = picked
+        shape = (self.raster.height, self.raster.width, 3)
+        return image.reshape(shape), Cells(image, light, color)
+
 
 def _moved(points: Float32, behind: float) -> Float32:
-    """Return points (H, W, 3) as seen from `behind` metres farther back; the origin stays."""
+    """Return points (..., 3) as seen from `behind` metres farther back; the origin stays."""
     z = np.where(points[..., 2] > 0, points[..., 2] + np.float32(behind), points[..., 2])
     return np.concatenate([points[..., :2], z[..., None]], axis=-1)
 

@@ -1,0 +1,341 @@
+"""Clouds that may be far apart: their viewpoints, what they say of a pose, and the pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from registration_scenes import box_walls, bumpy_ball, turn
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.odometry.pairwise import Pairwise
+from tofuse.recordings.frames import CloudFrame
+from tofuse.registration.base import Registration
+from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
+from tofuse.registration.reduce import averaged
+from tofuse.registration.viewpoint import RangeSphere, as_image, viewpoint_of
+from tofuse.simulation import scene as scenes
+from tofuse.simulation.record import plan
+
+ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
+
+
+def scanned(at, heading, count=60_000, seed=0, name="flat"):
+    """A scan with equal angles, z up, at a place of a simulated flat: its pose and points."""
+    built, _ = scenes.build(name, seed=0)
+    rows = int(np.sqrt(count / 2))
+    up, around = np.meshgrid(
+        np.linspace(-1.2, 1.5, rows), np.linspace(-np.pi, np.pi, 2 * rows, False), indexing="ij"
+    )
+    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
+    rays = rays.reshape(-1, 3)
+    T = se3.exp([0, 0, 0, 0, 0, heading])
+    T[:3, 3] = at
+    distance = built.cast(T[:3, 3], rays @ T[:3, :3].T).distance.astype(float)
+    seen = np.isfinite(distance)
+    distance += np.random.default_rng(seed).normal(0, 0.003, len(distance))
+    return T, (rays[seen] * distance[seen, None]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """Of one room of the flat, from two places."""
+    (T_a, a), (T_b, b) = scanned([-2.6, -2.5, 1.3], 0.4), scanned([-1.6, -2.2, 1.3], 2.6, seed=1)
+    return b, a, se3.inverse(T_a) @ T_b
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Two images of a furnished room, and the second one's pose in the first."""
+    made = plan("room", every=8, frames=3)
+    rendered = [r.frame for r in made.frames(None)]
+    return rendered[0], rendered[2], se3.inverse(made.poses[0]) @ made.poses[2]
+
+
+def off(T, true, points):
+    """Error in m at the middle of the source, and in degrees."""
+    middle = np.median(points, 0)[None].astype(float)
+    gap = se3.transform(T, middle) - se3.transform(true, middle)
+    return np.linalg.norm(gap), np.degrees(se3.angle(se3.inverse(true) @ T))
+
+
+# Viewpoints
+
+
+def test_points_of_an_image_show_that_they_were_seen_from_their_origin(frames):
+    for frame in frames[:2]:
+        found = viewpoint_of(CloudFrame.of(frame.points))
+        assert found is not None
+        pixel = viewpoint_of(frame)
+        # Pixels at the borders are closer together in angle than those in the middle.
+        assert 0.8 * pixel.spacing < found.spacing < 1.1 * pixel.spacing
+        thinned = frame.points[np.random.default_rng(0).permutation(len(frame))[:5000]]
+        found = viewpoint_of(CloudFrame.of(thinned))
+        assert found.spacing == pytest.approx(pixel.spacing * np.sqrt(len(frame) / 5000), rel=0.2)
+
+
+def test_a_scan_shows_where_it_was_seen_from(scans):
+    assert viewpoint_of(CloudFrame.of(scans[0])) is not None
+    origin = np.array([3.0, 4.0, -2.0])
+    moved = CloudFrame(0, 0.0, scans[0] + origin.astype(np.float32), origin=origin)
+    np.testing.assert_array_equal(viewpoint_of(moved).origin, origin)
+
+
+def test_points_that_were_seen_from_elsewhere_show_none(frames, scans):
+    """Mostly: from some places the surfaces of a small image look as evenly sampled."""
+    rng = np.random.default_rng(4)
+    for points in (frames[0].points, scans[0]):
+        found = []
+        for _ in range(20):
+            T = se3.exp(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-2, 2, 3)])
+            found.append(viewpoint_of(CloudFrame.of(se3.transform(T, points.astype(float)))))
+        assert sum(v is not None for v in found) <= 7
+
+
+def test_points_that_are_spread_evenly_over_the_surface_show_none(frames):
+    even = averaged(CloudFrame.of(frames[0].points), 0.08)
+    assert viewpoint_of(even) is None
+    assert viewpoint_of(CloudFrame.of(np.zeros((100, 3)))) is None
+    assert viewpoint_of(CloudFrame.of(frames[0].points[:20])) is None
+
+
+def test_the_image_of_a_cloud_is_the_one_it_came_from(frames):
+    frame = frames[0]
+    color = np.random.default_rng(0).integers(0, 255, (*frame.depth.shape, 3)).astype(np.uint8)
+    frame = replace(frame, color_image=color)
+    cloud = CloudFrame(3, 4.0, frame.points, color=frame.color, amplitude=frame.amplitude)
+    image, T = as_image(cloud, viewpoint_of(cloud))
+    np.testing.assert_array_equal(T, np.eye(4))
+    assert (image.index, image.timestamp) == (3, 4.0)
+    assert 0.7 * frame.depth.shape[1] < image.depth.shape[1] <= frame.depth.shape[1]
+    # Each point of the image lies on the surface that the camera saw.
+    pixel = np.round(frame.camera.project(image.points)).astype(int)
+    inside = (pixel >= 0).all(1) & (pixel < frame.depth.shape[::-1]).all(1)
+    z = frame.z[pixel[inside, 1], pixel[inside, 0]]
+    assert np.mean(np.abs(image.points[inside, 2] - z) < 0.05 * z) > 0.95
+    assert image.color_image[image.valid].any()
+    assert np.isin(image.amplitude, frame.amplitude).all()
+
+
+def test_a_cloud_with_z_up_is_seen_by_a_camera_that_stands_upright(frames):
+    # x forward, y left, z up, as scanners have it.
+    axes = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float)
+    cloud = CloudFrame.of(frames[0].points @ axes.T)
+    image, T = as_image(cloud, viewpoint_of(cloud))
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    assert np.degrees(np.arccos(T[:3, 1] @ [0, 0, -1])) < 30  # y is down
+    near, _ = tofuse.kernels.kdtree.KdTree(cloud.points).nearest(
+        se3.transform(T, image.points.astype(float)), 0.1
+    )
+    assert np.mean(near >= 0) > 0.95
+
+
+def test_no_image_holds_a_whole_sphere(scans):
+    cloud = CloudFrame.of(scans[0])
+    assert as_image(cloud, viewpoint_of(cloud)) is None
+
+
+def test_a_sphere_knows_what_was_seen_through(scans):
+    cloud = CloudFrame.of(scans[0])
+    sphere = RangeSphere.of(cloud, viewpoint_of(cloud))
+    points = scans[0][::50].astype(float)
+    assert np.nanmedian(sphere.before(0.5 * points) / np.linalg.norm(0.5 * points, axis=1)) > 0.9
+    assert np.mean(sphere.before(points) <= 1e-3) > 0.99
+    assert np.nanmax(sphere.before(1.5 * points)) <= 0
+    # Nothing was seen straight down.
+    assert np.isnan(sphere.before(np.array([[0.0, 0, -1]]))).all()
+
+
+# Agreement
+
+
+def maps(source, target, size=0.12):
+    views = CloudFrame.of(source), CloudFrame.of(target)
+    return [CloudMap.of(averaged(v, size), size, v) for v in views]
+
+
+def test_the_right_pose_is_supported_and_not_contradicted(scans):
+    source, target, true = scans
+    said = cloud_agreement(*maps(source, target), true)
+    assert said.support > 0.6
+    assert said.contradiction < 0.01
+    assert said.rms_m < 0.03
+
+
+def test_a_wrong_pose_is_contradicted_by_free_space(scans):
+    source, target, true = scans
+    views = maps(source, target)
+    right = cloud_agreement(*views, true)
+    for wrong in (turn([0, 0, 1], 180), se3.exp([0.6, 0, 0, 0, 0, 0]), turn([1, 0, 0], 20)):
+        said = cloud_agreement(*views, true @ wrong)
+        assert said.violation > 0.02
+        assert said.score < right.score - 0.2
+    # Without viewpoints nothing is known of free space.
+    blind = maps(se3.transform(ANYWHERE, source.astype(float)), target)
+    assert blind[0].sphere is None
+    said = cloud_agreement(blind[0], replace(blind[1], sphere=None), turn([0, 0, 1], 180))
+    assert said.violation == 0
+
+
+def test_agreement_is_the_same_both_ways(scans):
+    source, target, true = scans
+    a, b = maps(source, target)
+    there, back = cloud_agreement(a, b, true), cloud_agreement(b, a, se3.inverse(true))
+    assert there.score == pytest.approx(back.score, abs=1e-9)
+    assert there.support == pytest.approx(back.support, abs=1e-9)
+
+
+# Registration
+
+
+def test_scans_with_any_heading(scans):
+    source, target, true = scans
+    found = tofuse.register(source, target)
+    assert off(found.T_target_source, true, source)[0] < 0.02
+    assert off(found.T_target_source, true, source)[1] < 0.5
+    assert found.believed
+    assert found.probability > 0.9
+    assert found.contradiction < 0.01
+
+
+def test_clouds_of_which_nothing_is_known_under_any_rotation(frames):
+    target, source, true = frames
+    moved = se3.transform(ANYWHERE, source.points.astype(float))
+    found = tofuse.register(moved, target.points)
+    shift, angle = off(found.T_target_source, true @ se3.inverse(ANYWHERE), moved)
+    assert shift < 0.1
+    assert angle < 4
+
+
+def test_a_tenth_of_the_points(scans):
+    source, target, true = scans
+    few = source[np.random.default_rng(2).permutation(len(source))[: len(source) // 10]]
+    for pair, T in (((few, target), true), ((target, few), se3.inverse(true))):
+        found = tofuse.register(*pair)
+        assert off(found.T_target_source, T, pair[0])[0] < 0.05
+        assert off(found.T_target_source, T, pair[0])[1] < 1.5
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 20.0])
+def test_lengths_do_not_matter(scans, scale):
+    source, target, true = scans
+    scaled = true.copy()
+    scaled[:3, 3] *= scale
+    found = tofuse.register(source * scale, target * scale)
+    assert off(found.T_target_source, scaled, source * scale)[0] < 0.02 * scale
+    assert found.believed
+
+
+def test_views_that_share_nothing_are_not_believed(scans, frames):
+    for source, target in (
+        (bumpy_ball(5000, 1), scans[0]),
+        (frames[0].points, bumpy_ball(5000, 1) * 4),
+        (np.random.default_rng(0).normal(size=(3000, 3)), scans[1]),
+    ):
+        try:
+            found = tofuse.register(source, target)
+        except tofuse.RegistrationError:
+            continue
+        assert found.believed is False
+        assert found.reason
+
+
+def test_a_corridor_that_fits_in_several_ways_is_not_believed():
+    """Two parallel walls and a floor: along them nothing tells where."""
+    found = tofuse.register(box_walls(6000, 1, 0.003, "xy"), box_walls(6000, 0, 0.003, "xy"))
+    assert found.believed is False
+    assert "degenerate" in found.reason
+    assert len(found.unobservable) >= 1
+
+
+@pytest.mark.parametrize("scale", [0.001, 0.01, 1000.0])
+def test_other_units_are_named(scans, scale):
+    source, target, _ = scans
+    found = tofuse.register(source * scale, target)
+    assert found.believed is False
+    assert f"{1 / scale:g} times as large" in found.reason
+    assert "unit" in found.reason
+
+
+def test_a_guess_decides_between_poses_that_are_alike():
+    """A square room without anything in it is the same after a quarter turn."""
+    walls = box_walls(8000, 0, 0.003, "xyz")
+    other = box_walls(8000, 1, 0.003, "xyz")
+    guess = se3.exp([0.02, -0.01, 0.01, 0.01, 0.02, -0.01])
+    found = tofuse.register(other, walls, guess=guess)
+    assert off(found.T_target_source, np.eye(4), other)[0] < 0.01
+
+
+def test_the_same_whatever_the_threads(scans):
+    source, target, _ = scans
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            found.append(tofuse.register(source, target))
+    np.testing.assert_array_equal(found[0].T_target_source, found[1].T_target_source)
+    assert found[0].probability == found[1].probability
+
+
+def test_lines_planes_and_points_get_an_honest_answer():
+    rng = np.random.default_rng(0)
+    plane = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0] + [0, 0, 2]
+    line = rng.uniform(-1, 1, (3000, 1)) * [1.0, 0.2, 0.1] + [0, 0, 2]
+    same = np.ones((3000, 3))
+    ten = rng.normal(size=(10, 3))
+    for points in (plane, line, same, ten):
+        try:
+            found = tofuse.register(points, points)
+        except tofuse.TofuseError:
+            continue
+        assert found.believed is False
+
+
+def test_an_image_and_a_cloud_and_a_wide_image(frames):
+    target, source, true = frames
+    found = tofuse.register(source, CloudFrame.of(target.points))
+    assert off(found.T_target_source, true, source.points)[0] < 0.05
+    assert found.believed
+
+
+def test_registration_between_other_frames():
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(6, 6))
+    T, T_a, T_b = (se3.exp(rng.normal(size=6)) for _ in range(3))
+    slide = np.array([[1.0, 0, 0, 0, 0, 0]])
+    found = Registration(T, True, 1, 1, 1, 0.0, 0.0, A @ A.T, slide, runner_up=np.eye(4))
+    moved = found.between(T_a, T_b)
+    np.testing.assert_allclose(moved.T_target_source, T_a @ T @ T_b)
+    np.testing.assert_allclose(moved.runner_up, T_a @ T_b)
+    # A motion of b is the same motion in the source's frame.
+    xi = 1e-6 * rng.normal(size=6)
+    inside = se3.log(T_b @ se3.exp(xi) @ se3.inverse(T_b))
+    assert xi @ moved.information @ xi == pytest.approx(inside @ found.information @ inside)
+    there = se3.log(T_b @ se3.exp(1e-6 * moved.unobservable[0]) @ se3.inverse(T_b))
+    np.testing.assert_allclose(np.abs(there / np.linalg.norm(there)), np.abs(slide[0]), atol=1e-6)
+
+
+# From view to view
+
+
+def test_views_are_chained_and_unbelieved_ones_begin_a_component(scans):
+    source, target, true = scans
+    tracker = Pairwise().start(0)
+    views = [target, source, bumpy_ball(5000, 1), source + np.float32(1e-4)]
+    steps = [tracker.push(replace(CloudFrame.of(p), index=k)) for k, p in enumerate(views)]
+    assert [s.status for s in steps] == ["tracked"] * 4
+    assert [s.component for s in steps] == [0, 0, 1, 2]
+    assert off(steps[1].T_component_camera, true, source)[0] < 0.02
+    assert not steps[1].doubtful
+    # What begins the last component is linked with the first.
+    assert [(link.i, link.j) for link in steps[3].links] == [(1, 3)]
+    assert off(steps[3].links[0].T_i_j, np.eye(4), source)[0] < 0.01
+    lost = tracker.push(replace(CloudFrame.of(target[:5]), index=4))
+    assert lost.status == "lost"
+    assert "5 valid points" in lost.reason
+    for bad in ({"references": 0}, {"minimum_points": 0}, {"probable": 2.0}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            Pairwise(**bad)
