@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +17,27 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.any_pair import AnyPair
-from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.base import Registration
 from tofuse.registration.verification import Link
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+
+
+# Searches of which the motion must have foretold the end, of one more.
+_PROVEN = 2
+# Poses that differ by this share of the extent are the same.
+_SAME = 0.03
 
 
 @part("odometry", "pairwise")
 @dataclass(frozen=True)
 class Pairwise(Odometry):
     """Registers each view to the one before; where that is not believed, to earlier ones.
+
+    Once the motion has led to where searches ended, it is followed without a search, as far as the
+    views agree there; along degenerate directions it goes on. In views in no order, or far apart,
+    it does not, and each pair is searched.
 
     A view whose best pose is not believed, but more probable than not, keeps it and is marked as
     doubtful. Else it begins a component of its own; registrations to views of other components that
@@ -44,7 +55,7 @@ class Pairwise(Odometry):
         Least probability of a pose that is not believed, but kept.
     """
 
-    registration: Registrar = field(default_factory=AnyPair)
+    registration: AnyPair = field(default_factory=AnyPair)
     references: int = 6
     minimum_points: int = 10
     probable: float = 0.5
@@ -83,10 +94,14 @@ class _PairwiseTracker(Tracker):
         self._component = -1
         self._connected = True  # whether links join the component to an earlier one
         self._motion: Float64 | None = None
+        self._following = replace(options.registration, search=False)
+        # Whether what the motion led to was what a search found, in the last few views.
+        self._steady: deque[bool] = deque(maxlen=_PROVEN + 1)
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
         self._motion = None
+        self._steady.clear()
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
@@ -97,26 +112,41 @@ class _PairwiseTracker(Tracker):
             self._motion = None
             return Step("lost", f"{len(frame)} valid points, {least} are needed", None)
         own = [p for p in reversed(self._placed) if p.component == self._component]
+        near = self._followed(frame, own[0]) if own else None
+        steady = sum(self._steady) >= _PROVEN
+        if steady and near is not None and near.believed:
+            return self._follow(frame, near)
         doubtful: list[_Registered] = []
         for each in own:
-            found = self._register(frame, each)
+            found = self._searched(frame, each)
             if found is not None and found.believed:
+                if each is own[0]:
+                    self._steady.append(near is not None and near.agrees(found, frame.points))
                 return self._follow(frame, found)
             if found is not None:
                 doubtful.append(found)
         links = self._links(frame)
-        likely = max(doubtful, key=lambda r: r.probability, default=None)
-        if likely is not None and not links and likely.probability >= self._options.probable:
-            return self._follow(frame, likely)
-        return self._begin(frame, links, likely)
+        # The latest views share most with this one.
+        probable = [r for r in doubtful if r.probability >= self._options.probable]
+        if probable and not links:
+            return self._follow(frame, probable[0])
+        return self._begin(frame, links, doubtful[0] if doubtful else None)
 
-    def _register(self, frame: Frame, to: _Placed) -> _Registered | None:
-        """Register to an earlier view; the motion so far predicts that from the last one alone."""
-        last = to is self._placed[-1]
-        guess = self._motion if last and self._motion is not None else np.eye(4)
+    def _followed(self, frame: Frame, last: _Placed) -> _Registered | None:
+        """Register to the last view from where the motion so far leads to."""
+        guess = np.eye(4) if self._motion is None else self._motion
+        return self._registered(frame, last, guess, self._following)
+
+    def _searched(self, frame: Frame, to: _Placed) -> _Registered | None:
+        """Register to an earlier view, wherever it is."""
+        return self._registered(frame, to, None, self._options.registration)
+
+    def _registered(
+        self, frame: Frame, to: _Placed, guess: Float64 | None, method: AnyPair
+    ) -> _Registered | None:
         rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, to.frame.index])
         try:
-            return _Registered(to, self._options.registration.register(frame, to.frame, guess, rng))
+            return _Registered(to, method.register(frame, to.frame, guess, rng))
         except RegistrationError:
             return None
 
@@ -139,19 +169,19 @@ class _PairwiseTracker(Tracker):
             doubtful=not found.believed,
         )
 
-    def _begin(self, frame: Frame, links: tuple[Link, ...], likely: _Registered | None) -> Step:
+    def _begin(self, frame: Frame, links: tuple[Link, ...], refused: _Registered | None) -> Step:
         """Begin a component."""
         self._component += 1
         self._connected = self._component == 0 or bool(links)
         self._motion = None
         self._placed.append(_Placed(frame, np.eye(4), self._component))
-        reason = "" if likely is None else f"not connected: {likely.registration.reason}"
+        reason = "" if refused is None else f"not connected: {refused.registration.reason}"
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 
     def _links(self, frame: Frame) -> tuple[Link, ...]:
         """The registration to the last view of another component, if it is believed."""
         others = [p for p in self._placed if p.component != self._component]
-        found = self._register(frame, others[-1]) if others else None
+        found = self._searched(frame, others[-1]) if others else None
         return (found.link(frame),) if found is not None and found.believed else ()
 
 
@@ -165,6 +195,14 @@ class _Registered:
     @property
     def believed(self) -> bool:
         return bool(self.registration.believed)
+
+    def agrees(self, other: _Registered, points: Float32) -> bool:
+        """Whether both take points (n, 3) to the same place, as far as their extent tells."""
+        ours, theirs = (r.registration.T_target_source for r in (self, other))
+        gap = se3.transform(ours, points) - se3.transform(theirs, points)
+        extent = np.ptp(np.percentile(points, [5, 95], axis=0), axis=0)
+        rms = np.sqrt((gap**2).sum(1).mean())
+        return bool(rms <= _SAME * np.linalg.norm(extent))
 
     @property
     def probability(self) -> float:

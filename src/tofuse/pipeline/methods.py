@@ -63,6 +63,7 @@ def default(kind: ViewKind) -> Config:
     if kind == "cloud":
         return replace(
             base,
+            filters=(),  # where a cloud was seen from shows in how its points are spread
             odometry=Pairwise(),
             loops=Nearby(
                 max_distance_m=1.5,

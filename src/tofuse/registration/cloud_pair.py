@@ -24,6 +24,7 @@ from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agre
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
 from tofuse.registration.confidence import CERTAIN, CloudEvidence
 from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Uniform
@@ -188,7 +189,15 @@ def _registered(
         alike = [p for p in poses if p.agreement.score >= best.agreement.score - _LEAD]
         best = min(alike, key=lambda p: _apart(p.T_target_source, guess))
     others = (p for p in poses if views.differ(p.T_target_source, best.T_target_source))
-    return _registration(views, best, next(others, _NOWHERE))
+    found = _registration(views, best, next(others, _NOWHERE))
+    if guess is None or best.guess is not None or not len(found.unobservable):
+        return found
+    # What differs along degenerate directions alone stays as in the guess.
+    hold = Hold.of(found.unobservable, views.there.view.points.astype(np.float64))
+    across = hold.across(se3.inverse(near.T_target_source) @ found.T_target_source)
+    if views.differ(near.T_target_source, near.T_target_source @ across):
+        return found
+    return _registration(views, near, best)
 
 
 def _power_of_scale(source: Frame, target: Frame) -> int:

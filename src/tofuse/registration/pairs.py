@@ -213,6 +213,8 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
     together = (pairs.target_normals * pairs.source_normals).sum(1)
     turned = pairs.source_normals * np.sign(together)[:, None]
     pairs = replace(pairs, source_normals=turned).keep(np.abs(together) > _ALIKE)
+    if not len(pairs):
+        return np.eye(6)
     unit = pairs.resolution
     scale = unit * np.array([1, 1, 1, 1 / pairs.size, 1 / pairs.size, 1 / pairs.size])
     C = cross_information(pairs, variance) * scale[:, None] * scale

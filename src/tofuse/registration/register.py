@@ -53,7 +53,7 @@ def register(
     -------
     The `T_target_source` maps points of the source into the target's frame, m. `believed` says
     whether it is to be believed, `probability` how probably it is right (images: within 5 % of the
-    depth and 4 degrees; clouds: within 2 % of the extent), and `reason` why it is not believed: too
+    depth and 4 degrees; clouds: within 5 % of the extent), and `reason` why it is not believed: too
     little support or too little lead over `runner_up`, contradiction, degenerate directions.
     `converged` says none of that. Directions along which the views could slide (three on a flat
     wall) are in `unobservable`, and stay as they are in the guess. A `method` that says nothing of

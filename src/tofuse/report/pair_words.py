@@ -114,6 +114,8 @@ def runner_up(result: PairResult) -> str:
     """Say how the best other pose compares, and where it is; empty if none was looked for."""
     parts = []
     away = result.runner_up_distance
+    if away is None and result.found.margin is not None:
+        return "no other pose fits"
     if away is not None:
         metres, angle = away
         parts.append(f"{metres:.3f} m and {np.degrees(angle):.1f}\N{DEGREE SIGN} away")
