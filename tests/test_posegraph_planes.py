@@ -175,6 +175,28 @@ def test_a_view_of_another_place_is_not_dragged_about():
     assert error.mean() < 2 * peaks_bound(0.02)
 
 
+def test_the_two_sides_of_a_wall_stay_apart():
+    """Two rooms, each seen from within, with a thin wall between them; the rest is seen by both."""
+    rng = np.random.default_rng(0)
+
+    def seen(from_x, wall_x):
+        wall = np.c_[np.full(1500, wall_x), rng.uniform(-2, 2, (1500, 2))]
+        floor = np.c_[rng.uniform(-2.5, 2.5, (1500, 2)), np.full(1500, -2.0)]
+        end = np.c_[rng.uniform(-2.5, 2.5, 1500), np.full(1500, 2.5), rng.uniform(-2, 2, 1500)]
+        far = np.c_[np.full(500, 2.5), rng.uniform(1.5, 2.5, 500), rng.uniform(-2, 2, 500)]
+        points = np.concatenate([wall, floor, end, far]) + rng.normal(0, 0.003, (5000, 3))
+        return points - [from_x, 0, 0]
+
+    truth = np.stack([se3.exp([x, 0, 0, 0, 0, 0]) for x in (0.0, 0.3, 2.5, 2.8)])
+    truth[:, 0, 3] += -1.5
+    views = [
+        CloudFrame(k, float(k), seen(T[0, 3], -0.06 if T[0, 3] < 0 else 0.06).astype(np.float32))
+        for k, T in enumerate(truth)
+    ]
+    found = refined(Planes(), views, truth)
+    assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
+
+
 def test_frames_that_are_not_kept_follow():
     views, truth = peaks_views(0.03, 0)
     part = Planes()

@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
+from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.odometry.pairwise import Pairwise
@@ -339,3 +340,18 @@ def test_views_are_chained_and_unbelieved_ones_begin_a_component(scans):
     for bad in ({"references": 0}, {"minimum_points": 0}, {"probable": 2.0}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             Pairwise(**bad)
+
+
+def test_a_folder_of_scans_becomes_one_model(tmp_path):
+    """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
+    places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))
+    taken = [scanned(at, heading, seed=k) for k, (at, heading) in enumerate(places)]
+    (tmp_path / "scans").mkdir()
+    for k, (_, points) in enumerate(taken):
+        write_ply(tmp_path / "scans" / f"{k}.ply", points)
+    result = tofuse.reconstruct(tofuse.open(tmp_path / "scans"))
+    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 3
+    for k, (T, points) in enumerate(taken):
+        true = se3.inverse(taken[0][0]) @ T
+        assert off(result.trajectory[k], true, points)[0] < 0.02
+        assert off(result.trajectory[k], true, points)[1] < 0.3

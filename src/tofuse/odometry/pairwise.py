@@ -18,6 +18,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
+from tofuse.registration.confidence import CERTAIN
 from tofuse.registration.verification import Link
 
 Float32 = NDArray[np.float32]
@@ -114,7 +115,7 @@ class _PairwiseTracker(Tracker):
         own = [p for p in reversed(self._placed) if p.component == self._component]
         near = self._followed(frame, own[0]) if own else None
         steady = sum(self._steady) >= _PROVEN
-        if steady and near is not None and near.believed:
+        if steady and near is not None and near.needs_no_search:
             return self._follow(frame, near)
         doubtful: list[_Registered] = []
         for each in own:
@@ -195,6 +196,12 @@ class _Registered:
     @property
     def believed(self) -> bool:
         return bool(self.registration.believed)
+
+    @property
+    def needs_no_search(self) -> bool:
+        """Whether a pose that was followed is certain, or the best that a search could say."""
+        sure = self.probability >= CERTAIN or len(self.registration.unobservable) > 0
+        return self.believed and sure
 
     def agrees(self, other: _Registered, points: Float32) -> bool:
         """Whether both take points (n, 3) to the same place, as far as their extent tells."""

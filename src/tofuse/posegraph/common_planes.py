@@ -44,6 +44,9 @@ CHANCE = 0.003
 _BOLDEST = 0.5
 # Cells much thinner than the others are so by chance.
 _THINNEST = 0.25
+# Cosine below which it does not show which side of a plane a view is on, and the thickness of each
+# side by which two sides are apart.
+_ASKANCE, _LAYERS = 0.15, 3.0
 
 
 @dataclass(frozen=True)
@@ -323,12 +326,27 @@ def _means(x: Float64, cell: Int64) -> Float64:
 
 
 def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
-    """Give each point to the nearest centre, and fit the planes."""
+    """Give each point to the nearest centre, and fit the planes.
+
+    The two sides of a wall may be nearer to each other than a cell is wide: what was seen from
+    opposite sides is cut in two.
+    """
     x = points.world(poses)
     cell, _ = KdTree(centres).nearest(x)
+    cells = _fitted(points, x, cell, len(centres))
+    behind = _seen_from_behind(cells, poses)
+    if not behind.any():
+        return cells
+    cell[cells.order[behind]] += len(centres)
+    _, cell = np.unique(cell, return_inverse=True)
+    cell = cell.ravel().astype(np.int64)
+    return _fitted(points, x, cell, int(cell.max()) + 1)
+
+
+def _fitted(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
+    """Sort points (M, 3) of the world into cells (M,), and fit the planes."""
     # Points are in the order of their views already.
     order = np.argsort(cell, kind="stable")
-    size = len(centres)
     start = np.searchsorted(cell[order], np.arange(size + 1)).astype(np.int64)
     x, view = x[order], points.view[order]
     mean, axes = np.empty((size, 3)), np.empty((size, 3, 3))
@@ -339,6 +357,28 @@ def _cells(points: _Points, poses: Float64, centres: Float64) -> _Cells:
 
     run_chunks(work, size)
     return _Cells(order, start, points.p[order], x, view, mean, axes, spread, views)
+
+
+def _seen_from_behind(cells: _Cells, poses: Float64) -> NDArray[np.bool_]:
+    """(M,) points, by cell, of the back of what has two sides that are apart."""
+    size = len(cells.mean)
+    cell = np.repeat(np.arange(size), np.diff(cells.start))
+    towards = poses[cells.view, :3, 3] - cells.mean[cell]
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    normal = cells.axes[cell, 0]
+    cosine = (towards * normal).sum(1)
+    height = ((cells.x - cells.mean[cell]) * normal).sum(1)
+    sides = [cosine > _ASKANCE, cosine < -_ASKANCE]
+    middles, squares, counts = [], np.zeros(size), np.zeros(size)
+    for side in sides:
+        count = np.bincount(cell, side, size)
+        middle = np.bincount(cell, np.where(side, height, 0.0), size) / np.maximum(count, 1)
+        squares += np.bincount(cell, np.where(side, (height - middle[cell]) ** 2, 0.0), size)
+        counts += count
+        middles.append(np.where(count > 0, middle, np.nan))
+    thick = np.sqrt(squares / np.maximum(counts, 1))
+    apart = middles[0] - middles[1] > _LAYERS * thick  # never where one side has no points
+    return sides[1] & apart[cell]
 
 
 def _system(
