@@ -197,6 +197,7 @@ CASES = {
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
     "disconnected": in_components(apart((7, 8))),
     "bridged_gap": in_components(Component(((5, 8),), np.eye(4), "motion")),
+    "single_link": replace(evidence(), hanging=(5, 6, 7, 8)),
     "moving_objects": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
@@ -437,6 +438,12 @@ def test_disconnected_parts_are_named() -> None:
     (bridged,) = judge(CASES["bridged_gap"])[1]
     text = "Frames 5-8 are connected to the rest by extrapolated motion only."
     assert (bridged.text, bridged.ranges) == (text, ((5, 8),))
+    (hanging,) = judge(CASES["single_link"])[1]
+    text = (
+        "Frames 5-8 are connected to the rest by a single registration, which no other view "
+        "confirms."
+    )
+    assert (hanging.text, hanging.ranges) == (text, ((5, 8),))
 
 
 def test_parts_of_several_stretches_and_lost_frames() -> None:

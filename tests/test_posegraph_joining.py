@@ -245,6 +245,37 @@ def test_a_single_link_waits_for_links_elsewhere() -> None:
         assert_joined(group, parts, path)
 
 
+def views_in_no_order(off):
+    """A few frames of a walk, then single ones; a certain link between the first two is off."""
+    order = [0, 1, 2, 14, 4, 16, 6, 18, 8, 12, 10]
+    path = [PATH[k] for k in order]
+    frames = [range(3), *([k] for k in range(3, len(order)))]
+    parts = [stretch(c, some, path, every=1) for c, some in enumerate(frames)]
+    a, b = parts[0].views[0], parts[1].views[0]
+    T = se3.inverse(path[a.index]) @ path[b.index] @ off
+    return path, parts, link_of(a, b, T)
+
+
+def test_what_hangs_on_a_single_link_is_reconsidered() -> None:
+    """When the two views were joined there was nothing else to compare them with."""
+    path, parts, wrong = views_in_no_order(se3.exp([0.8, 0, -0.9, 0, 1.8, 0]))
+    (group,) = Joining().join(parts, [wrong])
+    assert_joined(group, parts, path)
+    assert all(join.link is not wrong for join in group.joins)
+
+
+def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) -> None:
+    """Without a motion between them, a single link need not wait; but not where it says one."""
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "reconsider", lambda _: None)
+    joiner = joining._Joiner(Joining(), three[:2])
+    joiner.decide()
+    a, b = joiner._islands
+    right = se3.inverse(PATH[0]) @ PATH[12]
+    assert joiner._is_near(a, b, right, joining.IN_SIGHT)
+    assert not joiner._is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), joining.IN_SIGHT)
+
+
 def test_between_recordings_no_motion_is_known(monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
     path, parts, link = turned_back(0.0)

@@ -19,6 +19,7 @@ from tofuse.pipeline.frame_log import FrameLog
 from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.progress import Progress, Stopwatch
 from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
 from tofuse.posegraph.joining import Join
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop, Loops
@@ -227,6 +228,7 @@ class BackEnd:
                 tuple(
                     e.record.index for e in self._posed if e.step is not None and e.step.doubtful
                 ),
+                self._on_a_single_link(loops),
             )
             verdict, reasons = judge(evidence)
         return Reconstruction(
@@ -304,6 +306,23 @@ class BackEnd:
             finite = C is not None and bool(np.isfinite(C).all())
             out.append(replace(entry.record, covariance=C) if finite else entry.record)
         return tuple(out)
+
+    def _on_a_single_link(self, loops: Sequence[LoopRecord]) -> tuple[int, ...]:
+        """Frames that a single link connects with the first one, and no other one confirms it."""
+        if not self._joins:
+            return ()
+        component_of = {e.record.index: e.step.component for e in self._posed if e.step is not None}
+        pairs = [(j.link.i, j.link.j) for j in self._joins]
+        # Another registration of the same two views confirms nothing.
+        known = {frozenset(pair) for pair in pairs}
+        pairs += [(p.i, p.j) for p in loops if p.accepted and frozenset((p.i, p.j)) not in known]
+        edges = [(component_of[i], component_of[j]) for i, j in pairs]
+        first = component_of[self._posed[0].record.index]
+        hanging: set[int] = set()
+        for k, sides in cut_edges(edges).items():
+            if k < len(self._joins) and self._joins[k].how == "links":
+                hanging |= sides[1] if first in sides[0] else sides[0]
+        return tuple(index for index, c in component_of.items() if c in hanging)
 
     def _sightings(self, graph: PoseGraph) -> Sightings | None:
         """What overlapping images say of the final poses."""

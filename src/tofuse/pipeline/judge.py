@@ -96,6 +96,8 @@ class Evidence:
         (frame index, fraction of the image) where moving objects were found.
     doubtful
         Indices of the frames that fit worse than this camera's views usually do.
+    hanging
+        Indices of the frames that a single registration connects with the first one.
     """
 
     records: tuple[FrameRecord, ...]
@@ -115,6 +117,7 @@ class Evidence:
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
+    hanging: tuple[int, ...] = ()
 
     @property
     def everything(self) -> tuple[Range, ...]:
@@ -188,7 +191,7 @@ def _poses(e: Evidence) -> Iterator[Reason]:
 
 
 def _connections(e: Evidence) -> Iterator[Reason]:
-    """What is not connected to the main component, or by extrapolated motion only."""
+    """What is not connected to the main component, or by one link or extrapolated motion only."""
     apart = [c for c in e.components if not c.connected]
     if apart:
         joined = [r for c in e.components if c.connected for r in c.frames]
@@ -207,6 +210,13 @@ def _connections(e: Evidence) -> Iterator[Reason]:
             "extrapolated motion only."
         )
         yield Reason("bridged_gap", bridged, text)
+    hanging = e.runs_of(e.hanging)
+    if hanging:
+        text = (
+            f"{_sentence(hanging)} {'is' if is_one(hanging) else 'are'} connected to the rest by a "
+            "single registration, which no other view confirms."
+        )
+        yield Reason("single_link", hanging, text)
 
 
 def _listed(parts: Sequence[tuple[Range, ...]]) -> str:

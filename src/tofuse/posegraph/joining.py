@@ -5,8 +5,9 @@ from candidates that look alike in the end. No link decides by itself whether tw
 joined. Those between the same two components are reduced to the largest set that agrees pairwise
 (Mangelson 2018); what this set says is verified with several views of both sides, as to support and
 to free space; it must have no rival, and the camera must have been able to get there. All this is
-decided when everything was seen: best first, each join with what was joined before. A component
-that nothing joins stays one of its own.
+decided when everything was seen: best first, each join with what was joined before. What then still
+hangs on a single link is taken apart again, and compared with other places for all that was joined
+to both sides since. A component that nothing joins stays one of its own.
 """
 
 from __future__ import annotations
@@ -26,12 +27,14 @@ from tofuse.geometry import se3
 from tofuse.kernels.motion import moved, twist_between
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.motion import HANDHELD
+from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.posegraph.views import PosedView
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.verification import (
+    IN_SIGHT,
     PATIENT,
     Belief,
     Link,
@@ -50,8 +53,6 @@ View = PosedView[SurfaceMap]
 _LEARN = 16
 # View pairs that verify a join, beside those of the links; and the overlap that says something.
 _VERIFY, _OVERLAP = 8, 0.2
-# Views further apart, as a sum of the fraction of the depth and rad, hardly overlap.
-_IN_SIGHT = 1.2
 # Contradiction is unusual beyond so many standard deviations above the median of neighbours.
 # Wrong poses within one scene contradict by more than the last number, whatever neighbours do.
 _SIGMAS, _LEAST_SPREAD, _MAX_CONTRADICTION = 3.0, 0.02, 0.2
@@ -197,6 +198,7 @@ class Joining:
             joiner.add(link)
         joiner.decide()
         joiner.look_for_more()
+        joiner.reconsider()
         joiner.decide(single=True)
         if self.bridge:
             joiner.bridge_gaps()
@@ -220,6 +222,7 @@ class _Joiner:
         self._poses = {int(f): T for s in stretches for f, T in zip(s.frames, s.poses, strict=True)}
         self._islands = [_Island({s.component: np.eye(4)}) for s in stretches]
         self._links: list[Link] = []
+        self._tried: set[tuple[int, int]] = set()  # pairs of views that were registered
         self._refused: set[tuple[int, ...]] = set()
         # Frames of each component that links or verification ask about.
         self._nodes = {s.component: {v.index for v in s.views} for s in stretches}
@@ -233,9 +236,12 @@ class _Joiner:
         steps = [_speeds(s, end=True) for s in stretches]
         known = np.concatenate(steps)
         # (2,) m and rad by the unit of time that the camera hardly exceeds.
-        self._speed = (
-            _HARDLY * np.quantile(known, 0.9, axis=0) if len(known) else np.full(2, np.inf)
-        )
+        # Motions that the tracker could not follow may have been faster than any that it did.
+        unknown = np.full((_not_followed(stretches), 2), np.inf)
+        speeds = np.concatenate([known, unknown])
+        self._speed = np.full(2, np.inf)
+        if len(known):
+            self._speed = _HARDLY * np.quantile(speeds, 0.9, axis=0, method="higher")
         self._learn_from_neighbours()
 
     def add(self, link: Link) -> None:
@@ -263,12 +269,21 @@ class _Joiner:
                     proposals.append((-weight, a, b, chosen))
             for _, a, b, chosen in sorted(proposals, key=lambda p: p[:3]):
                 first, second = self._islands[a], self._islands[b]
-                if len(chosen) < 2 and not (single or self._is_near(first, second, _IN_SIGHT)):
+                if len(chosen) < 2 and not (single or self._need_not_wait(first, second, chosen)):
                     continue
                 if self._join(first, second, chosen):
                     break
             else:
                 return
+
+    def _need_not_wait(self, a: _Island, b: _Island, links: list[Link]) -> bool:
+        """Whether to join two islands before everything was tried, for a single link."""
+        T_a_b = self._T_a_b(a, b, _best(links))
+        if np.isfinite(self._speed).all():
+            return self._is_near(a, b, T_a_b, IN_SIGHT)
+        # Views in no order are joined one by one: each is one more to compare the next with. What
+        # then hangs on one link is reconsidered.
+        return any(link.certain for link in links) or bool(self._confirming(a, b, T_a_b, links))
 
     def _links_between(self) -> dict[tuple[int, int], list[Link]]:
         """Links by the positions (a, b), a < b, of the islands that they are between."""
@@ -289,7 +304,7 @@ class _Joiner:
         component = np.array([self._component_of[v.index] for v in views])
         i, j = np.nonzero(np.triu(component[:, None] != component))
         order = np.lexsort((j, i, far[i, j]))
-        tried = {(link.i, link.j) for link in self._links}
+        tried = self._tried | {(link.i, link.j) for link in self._links}
         between: dict[tuple[int, int], int] = {}
         for k in order.tolist():
             if self._searches < 1 or len(self._islands) < 2:
@@ -302,10 +317,43 @@ class _Joiner:
             if between[ends] > _TRIES:
                 continue
             tried.add((first.index, second.index))
+            self._tried.add((first.index, second.index))
             link = self._registered(first, second)
             if link is not None:
                 self.add(link)
                 self.decide()
+
+    def reconsider(self) -> None:
+        """Take apart what hangs on a single link, and look for other places.
+
+        When it was joined, one of the sides may have been a single view, of which nothing else
+        could be compared.
+        """
+        weak = [join for island in self._islands for join in self._single_links(island)]
+        for join in weak:
+            self._cut(join)
+        if weak:
+            self._proposals.clear()
+            self._refused.clear()
+            self._paths.clear()
+            self.look_for_more()
+
+    def _single_links(self, island: _Island) -> dict[Join, tuple[frozenset[int], frozenset[int]]]:
+        """The joins without which it would fall apart, and the components of both sides."""
+        found = cut_edges([self._components(join) for join in island.joins])
+        return {island.joins[k]: sides for k, sides in found.items()}
+
+    def _components(self, join: Join) -> tuple[int, int]:
+        return self._component_of[join.link.i], self._component_of[join.link.j]
+
+    def _cut(self, join: Join) -> None:
+        """Make two islands of one that a join alone holds together."""
+        whole = self._island_of(self._components(join)[0])
+        self._islands.remove(whole)
+        for side in self._single_links(whole)[join]:
+            T = {c: whole.T[c] for c in whole.T if c in side}
+            inside = [j for j in whole.joins if j is not join and self._components(j)[0] in side]
+            self._islands.append(_Island(T, inside))
 
     def bridge_gaps(self) -> None:
         """Connect what comes right after a short gap by the motion before and after it."""
@@ -486,7 +534,7 @@ class _Joiner:
 
     def _join(self, a: _Island, b: _Island, links: list[Link]) -> bool:
         """Join two islands if what links say is verified."""
-        best = max(links, key=lambda link: (link.certain, _weight(link)))
+        best = _best(links)
         T_a_b = self._T_a_b(a, b, best)
         extra = self._confirming(a, b, T_a_b, links)
         certain = any(link.certain for link in links)
@@ -530,7 +578,7 @@ class _Joiner:
             between = se3.inverse(Ta[p]) @ Tb
             apart = np.linalg.norm(between[:, :3, 3], axis=1) / v.view.depth
             away = apart + np.asarray(se3.angle(between))
-            near += [(float(away[q]), p, int(q)) for q in np.flatnonzero(away < _IN_SIGHT)]
+            near += [(float(away[q]), p, int(q)) for q in np.flatnonzero(away < IN_SIGHT)]
         found = []
         for _, p, q in sorted(near)[: 3 * _VERIFY]:
             T = se3.inverse(Ta[p]) @ Tb[q]
@@ -569,15 +617,18 @@ class _Joiner:
             overlap += seen.overlap
             against += seen.violation + seen.clash
         limit = self._contradiction
-        if self._is_near(a, b, _NEAR):  # what contradicts has moved, or is an error of the pose
+        if self._is_near(a, b, T_a_b, _NEAR):
+            # What contradicts has moved, or is an error of the pose.
             limit = max(limit, _SAME_PLACE)
         return overlap > 0 and against / overlap > limit
 
-    def _is_near(self, a: _Island, b: _Island, far: float) -> bool:
-        """Whether the camera had no time to get `far` between the two sides.
+    def _is_near(self, a: _Island, b: _Island, T_a_b: Float64, far: float) -> bool:
+        """Whether the camera had no time to get `far` between the two sides, and T_a_b agrees.
 
-        A fraction of the depth, and rad.
+        A fraction of the depth, and rad. A pose that puts it further away than it can be has not
+        the short time for it, but against it.
         """
+        T = {**a.T, **_moved(b.T, T_a_b)}
         for c in a.T:
             for d in b.T:
                 before, after = self._in_time(c, d)
@@ -586,7 +637,10 @@ class _Joiner:
                     continue
                 reach = self._speed * elapsed
                 if reach[0] < far * before.depth and reach[1] < far:
-                    return True
+                    between = _over_the_gap(before, after, T)
+                    metres = float(np.linalg.norm(between[:3, 3]))
+                    if metres < far * before.depth and float(se3.angle(between)) < far:
+                        return True
         return False
 
     def _in_time(self, c: int, d: int) -> tuple[Stretch, Stretch]:
@@ -613,15 +667,13 @@ class _Joiner:
 
     def _reachable(self, a: _Island, b: _Island, T_a_b: Float64) -> bool:
         """Whether the camera can have got from the one side to the other in the time it had."""
+        T = {**a.T, **_moved(b.T, T_a_b)}
         for c in a.T:
             for d in b.T:
-                first, second = self._stretches[c], self._stretches[d]
+                first, second = self._in_time(c, d)
                 if first.recording != second.recording:
                     continue
-                T_c, T_d = a.T[c], T_a_b @ b.T[d]
-                if first.frames[0] > second.frames[0]:
-                    first, second, T_c, T_d = second, first, T_d, T_c
-                between = se3.inverse(T_c @ first.poses[-1]) @ T_d @ second.poses[0]
+                between = _over_the_gap(first, second, T)
                 reach = _reach(first, second)
                 depth = first.depth
                 if (
@@ -630,6 +682,28 @@ class _Joiner:
                 ):
                     return False
         return True
+
+
+def _moved(T: Mapping[int, Float64], T_other: Float64) -> dict[int, Float64]:
+    """Poses of components in another frame."""
+    return {c: np.asarray(T_other @ T_c, np.float64) for c, T_c in T.items()}
+
+
+def _over_the_gap(before: Stretch, after: Stretch, T: Mapping[int, Float64]) -> Float64:
+    """The motion from the end of one component to the begin of another, with T by component."""
+    end = T[before.component] @ before.poses[-1]
+    return np.asarray(se3.inverse(end) @ T[after.component] @ after.poses[0], np.float64)
+
+
+def _best(links: Sequence[Link]) -> Link:
+    """The link that the others are taken to confirm."""
+    return max(links, key=lambda link: (link.certain, _weight(link)))
+
+
+def _not_followed(stretches: Sequence[Stretch]) -> int:
+    """How often a component ends, and the next frame begins another one of the recording."""
+    first = {(s.recording, int(s.frames[0])) for s in stretches}
+    return sum((s.recording, int(s.frames[-1]) + 1) in first for s in stretches)
 
 
 def _key(a: _Island, b: _Island, between: Sequence[Link]) -> tuple[int, ...]:

@@ -15,6 +15,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "lost_frames": ("degraded", "Some readable frames have no pose."),
     "disconnected": ("degraded", "The recording falls into disconnected parts."),
     "bridged_gap": ("degraded", "Parts are connected by extrapolated motion only."),
+    "single_link": ("degraded", "Parts are connected by a single registration."),
     "images_differ": ("degraded", "Overlapping frames agree less than consecutive ones do."),
     "jumped": ("degraded", "A frame's pose jumps away from the predicted motion."),
     "doubtful_poses": ("degraded", "Frames fit worse than this camera's views usually do."),
@@ -52,6 +53,8 @@ ADVICE: dict[str, str] = {
     "disconnected": "Record again with overlap between these parts, or keep them as models of "
     "their own.",
     "bridged_gap": "Distances across the gap are not measured; check one that you know.",
+    "single_link": "Another place may look alike; record again with more overlap between these "
+    "parts.",
     "images_differ": "Surfaces may be doubled there; measure distances elsewhere.",
     "doubtful_poses": "Check the model there, or record that part again.",
     "weak_registration": "Smaller steps between frames, or more structure in view, would help.",

@@ -1,0 +1,48 @@
+"""Frames that a single link connects with the rest are told of."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tofuse.pipeline.backend import BackEnd
+from tofuse.posegraph.graph import LoopRecord
+from tofuse.posegraph.joining import Join
+from tofuse.registration.agreement import Agreement
+from tofuse.registration.verification import Link
+
+SEEN = Agreement(0.5, 0.5, 0.0, 0.0, 0.01, 100, 0.5)
+# Frames 0 to 8, three in each component.
+POSED = [
+    SimpleNamespace(record=SimpleNamespace(index=k), step=SimpleNamespace(component=k // 3))
+    for k in range(9)
+]
+
+
+def join(i, j, how="links", needed=True):
+    return Join(Link(i, j, np.eye(4), np.eye(6), SEEN, 0.2, True, "made"), how, needed)
+
+
+def loop(i, j, accepted=True):
+    return LoopRecord(i, j, accepted, "made")
+
+
+@pytest.mark.parametrize(
+    ("joins", "loops", "expected"),
+    [
+        ([], [], ()),
+        ([join(2, 3), join(5, 6)], [], (3, 4, 5, 6, 7, 8)),
+        ([join(2, 3), join(1, 4, needed=False), join(5, 6)], [], (6, 7, 8)),
+        ([join(6, 5), join(2, 3), join(1, 4)], [], (6, 7, 8)),
+        ([join(2, 3), join(5, 6)], [loop(0, 8)], ()),
+        ([join(2, 3), join(5, 6)], [loop(0, 8, accepted=False)], (3, 4, 5, 6, 7, 8)),
+        # The same two views once more, and a loop within a component.
+        ([join(2, 3), join(5, 6)], [loop(3, 2), loop(6, 8), loop(4, 7)], (3, 4, 5, 6, 7, 8)),
+        ([join(2, 3, "motion"), join(5, 6)], [], (6, 7, 8)),
+    ],
+)
+def test_frames_on_a_single_link(joins, loops, expected) -> None:
+    end = SimpleNamespace(_joins=joins, _posed=POSED)
+    assert BackEnd._on_a_single_link(end, loops) == expected

@@ -1,0 +1,23 @@
+"""Edges that alone hold a graph together."""
+
+from __future__ import annotations
+
+import pytest
+
+from tofuse.posegraph.cut_edges import cut_edges
+
+
+@pytest.mark.parametrize(
+    ("edges", "expected"),
+    [
+        ([], {}),
+        ([(4, 2)], {0: ({4}, {2})}),
+        ([(0, 1), (1, 0)], {}),
+        ([(0, 1), (1, 2), (2, 0)], {}),
+        ([(0, 1), (1, 2), (2, 0), (5, 2), (5, 7), (7, 5)], {3: ({5, 7}, {0, 1, 2})}),
+        ([(0, 1), (1, 2)], {0: ({0}, {1, 2}), 1: ({0, 1}, {2})}),
+        ([(0, 1), (1, 1), (8, 9)], {0: ({0}, {1}), 2: ({8}, {9})}),
+    ],
+)
+def test_edges_without_which_a_graph_falls_apart(edges, expected) -> None:
+    assert cut_edges(edges) == expected
