@@ -280,8 +280,7 @@ def searched_link(
     """Register two views by an exhaustive search.
 
     A pose that leads clearly is certain. So is one that leads by less where other evidence agrees:
-    the views are adjacent in time and the pose leaves them in sight, or an alignment from the
-    identity ends there.
+    the views are adjacent in time, or an alignment from the identity ends there.
 
     Returns
     -------
@@ -312,8 +311,7 @@ def link_of(
     at = [Target(target, np.eye(4))]
     aligned = align(source, at, match.T_target_source, _AFTER_SEARCH)
     T = aligned.T_world_source
-    expected = adjacent and is_in_sight(T, target.depth)
-    doubt = "" if expected else belief.objection(match, alone=True)
+    doubt = "" if adjacent else belief.objection(match, alone=True)
     if doubt and len(aligned.unobservable):
         # All poses along it fit, and the one with most overlap leads: that is no evidence.
         return None, f"{len(aligned.unobservable)} directions are degenerate, and {doubt}"
@@ -419,16 +417,6 @@ def finely_scaled(usual: UsualFit) -> AgreementOptions:
         # Twice as much is where an albedo begins to count against a pose.
         albedo=2 * _NO_CONFLICT * usual.albedo,
     )
-
-
-def is_in_sight(T_target_source: Float64, depth: float) -> bool:
-    """Whether a pose (4, 4) leaves the source, and what it sees, in sight of the target.
-
-    What speaks for a registration because the camera had no time to get far speaks for such poses
-    only.
-    """
-    away = np.linalg.norm(T_target_source[:3, 3]) / depth + se3.angle(T_target_source)
-    return bool(away < IN_SIGHT)
 
 
 # From one place no view is so many times deeper than another of the same scene.
