@@ -10,6 +10,7 @@ fits the logistic models of `tofuse.registration.confidence` to simulated pairs.
 
     python benchmarks/cloud_pairs.py table [--data ../shared/data] [--kinds scans]
     python benchmarks/cloud_pairs.py fit
+    python benchmarks/cloud_pairs.py viewpoints
 
 Simulated scenes are made once and kept in benchmarks/out/recordings/pairs.
 """
@@ -21,7 +22,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -343,45 +343,86 @@ def _print_decoys(names: list[str], data: Path, most: int) -> None:
 
 
 def print_fit(data: Path, most: int) -> None:
-    """Coefficients of both models, and what they are worth for kinds left out."""
-    names = [kind.name for kind in KINDS.values() if kind.fitted]
+    """Coefficients of both models, and what those in use are worth for kinds that took no part."""
+    fitted = [kind.name for kind in KINDS.values() if kind.fitted]
+    others = [kind.name for kind in KINDS.values() if not kind.fitted]
+    titles = (
+        "Searched: constant, root of margin, support, contradiction, degenerate, unseen",
+        "Followed: constant, support, contradiction, unseen",
+    )
+    mine, theirs = (samples(names, data, most) for names in (fitted, others))
+    for title, rows, held_out in zip(titles, mine, theirs, strict=True):
+        pairs.print_fit(title, pairs.stacked([row[:3] for row in rows]))
+        p = np.array([row[3] for row in held_out])
+        right = np.array([row[1] for row in held_out], bool)
+        believed = p >= pairs.BELIEVED
+        print(f"\nas in use, on {len(p)} poses of {', '.join(others)}:")
+        print(f"area under the ROC curve {pairs.roc_area(p, right):.3f}, believed", end=" ")
+        print(f"{believed.sum()}, of these wrong {(believed & ~right).sum()}")
+
+
+# Regressors, whether the pose is right, number of the family, and the probability in use.
+Row = tuple[Float64, bool, int, float]
+
+
+def samples(names: list[str], data: Path, most: int) -> tuple[list[Row], list[Row]]:
+    """Poses that were searched, and that were followed from guesses without degenerate directions.
+
+    A part of the pairs is of different places.
+    """
     families = sorted({kind.family for kind in KINDS.values()})
-    searched: list[tuple[Float64, bool, int]] = []
-    followed: list[tuple[Float64, bool, int]] = []
+    searched: list[Row] = []
+    followed: list[Row] = []
     rng = np.random.default_rng([1, 7])
-    todo = [(p, n) for n in names for p in KINDS[n].make(data, most, rng)]
+    todo = []
+    for name in names:
+        try:
+            todo += [(pair, name) for pair in KINDS[name].make(data, most, rng)]
+        except FileNotFoundError:
+            print(f"{name}: no data")
     todo += list(decoys(names, data, most, rng))
     for pair, name in todo:
-        family = families.index(KINDS[name].family)
         views = CloudFrame.of(pair.source, index=1), CloudFrame.of(pair.target)
+        known = None not in (viewpoint_of(views[0]), viewpoint_of(views[1]))
         start = np.eye(4) if pair.true is None else pair.true
         for guess in (None, *(start @ _off_by(m, d, rng) for m, d in pairs.GUESSES)):
+            rng_pair = np.random.default_rng(0)
             try:
-                register = (
-                    follow_clouds
-                    if guess is not None
-                    else partial(register_clouds, always_search=True)
-                )
-                found = register(*views, guess, np.random.default_rng(0))
+                if guess is None:
+                    found = register_clouds(*views, None, rng_pair, always_search=True)
+                else:
+                    found = follow_clouds(*views, guess, rng_pair)
             except RegistrationError:
                 continue
             assert found.support is not None
             assert found.contradiction is not None
+            degenerate = len(found.unobservable)
             evidence = CloudEvidence(
-                found.support,
-                found.contradiction,
-                found.margin,
-                len(found.unobservable),
-                None not in (viewpoint_of(views[0]), viewpoint_of(views[1])),
+                found.support, found.contradiction, found.margin, degenerate, known
             )
-            if guess is not None and evidence.degenerate:
-                continue
-            row = evidence.searched if guess is None else evidence.followed
-            rows = searched if guess is None else followed
-            rows.append((row, pair.is_right(found.T_target_source), family))
-    titles = ("Searched: constant, root of margin, support, contradiction, degenerate, unseen",)
-    pairs.print_fit(titles[0], pairs.stacked(searched))
-    pairs.print_fit("Followed: constant, support, contradiction, unseen", pairs.stacked(followed))
+            right, family = pair.is_right(found.T_target_source), families.index(KINDS[name].family)
+            if guess is None:
+                searched.append((evidence.searched, right, family, evidence.probability))
+            elif not degenerate:
+                followed.append((evidence.followed, right, family, evidence.probability))
+    return searched, followed
+
+
+def print_viewpoints(names: list[str], data: Path, most: int) -> None:
+    """Of how many clouds the origin counts as the viewpoint, where it is and where it is not."""
+    counts = {False: [0, 0], True: [0, 0]}
+    for name in names:
+        try:
+            made = list(KINDS[name].make(data, most, np.random.default_rng([1, 5])))
+        except FileNotFoundError:
+            continue
+        count = counts[name.endswith("-moved")]
+        for points in (points for pair in made for points in (pair.source, pair.target)):
+            count[0] += viewpoint_of(CloudFrame.of(points)) is not None
+            count[1] += 1
+    for moved, (found, total) in counts.items():
+        where = "another frame" if moved else "the camera's frame"
+        print(f"in {where} the origin counts as the viewpoint of {found} of {total} clouds")
 
 
 def _off_by(metres: float, degrees: float, rng: np.random.Generator) -> Float64:
@@ -392,13 +433,15 @@ def _off_by(metres: float, degrees: float, rng: np.random.Generator) -> Float64:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["table", "fit"])
+    parser.add_argument("what", choices=["table", "fit", "viewpoints"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--pairs", type=int, default=8, help="of each step")
     given = parser.parse_args(arguments)
     if given.what == "table":
         print_table(given.kinds, given.data, given.pairs)
+    elif given.what == "viewpoints":
+        print_viewpoints(given.kinds, given.data, given.pairs)
     else:
         print_fit(given.data, given.pairs)
 

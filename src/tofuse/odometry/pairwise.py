@@ -19,11 +19,11 @@ from tofuse.registration.agreement import Agreement
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import CERTAIN
+from tofuse.registration.reduce import extent
 from tofuse.registration.verification import Link
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-
 
 # Searches of which the motion must have foretold the end, of one more.
 _PROVEN = 2
@@ -207,9 +207,8 @@ class _Registered:
         """Whether both take points (n, 3) to the same place, as far as their extent tells."""
         ours, theirs = (r.registration.T_target_source for r in (self, other))
         gap = se3.transform(ours, points) - se3.transform(theirs, points)
-        extent = np.ptp(np.percentile(points, [5, 95], axis=0), axis=0)
         rms = np.sqrt((gap**2).sum(1).mean())
-        return bool(rms <= _SAME * np.linalg.norm(extent))
+        return bool(rms <= _SAME * extent(points))
 
     @property
     def probability(self) -> float:

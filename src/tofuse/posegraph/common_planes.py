@@ -21,6 +21,7 @@ from tofuse.kernels import planes as kernels
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.sparse import Factor, PairSystem
+from tofuse.registration.reduce import extent
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -233,7 +234,7 @@ def _sizes(points: _Points, poses: Float64, options: PlaneOptions) -> Float64:
     The first is some steps above the smallest whose cells are flat already, as far as the poses
     to start from are good for; all of them where none is flat.
     """
-    sizes, first = [options.coarsest * _extent(points.world(poses))], 0
+    sizes, first = [options.coarsest * extent(points.world(poses))], 0
     while sizes[-1] > 0:
         cells = _cells(points, poses, _centres(points, poses, sizes[-1]))
         thick, wide, most = cells.typical()
@@ -299,13 +300,6 @@ def _bounded(points: _Points, poses: Float64, step: Float64, most: float) -> tup
         if mean.max() <= most:
             return step, float(motion.mean())
         step = step * min(0.9 * most / mean.max(), 0.9)
-
-
-def _extent(x: Float64) -> float:
-    if not len(x):
-        return 0.0
-    low, high = np.percentile(x, [5, 95], axis=0)
-    return float(np.linalg.norm(high - low))
 
 
 def _centres(points: _Points, poses: Float64, size: float, shift: float = 0.0) -> Float64:

@@ -12,7 +12,10 @@ from scipy.sparse.csgraph import connected_components
 Edge = tuple[int, int]
 
 
-def cut_edges(edges: Sequence[Edge]) -> dict[int, tuple[frozenset[int], frozenset[int]]]:
+Sides = tuple[frozenset[int], frozenset[int]]
+
+
+def cut_edges(edges: Sequence[Edge]) -> dict[int, Sides]:
     """Find the edges without which a graph falls apart.
 
     Parameters
@@ -22,24 +25,23 @@ def cut_edges(edges: Sequence[Edge]) -> dict[int, tuple[frozenset[int], frozense
 
     Returns
     -------
-    By position of such an edge the nodes that are connected with its first end without it, and
-    those that are connected with its second one.
+    By position of such an edge its `sides_without`.
     """
-    nodes = sorted({node for edge in edges for node in edge})
-    row = {node: k for k, node in enumerate(nodes)}
-    ends = np.array([(row[a], row[b]) for a, b in edges], np.intp).reshape(-1, 2)
     parallel = Counter(frozenset(edge) for edge in edges)
-    found = {}
-    for k, (a, b) in enumerate(edges):
-        if a == b or parallel[frozenset((a, b))] > 1:
-            continue
-        rest = np.delete(ends, k, axis=0)
-        graph = csr_array((np.ones(len(rest)), tuple(rest.T)), shape=(len(nodes), len(nodes)))
-        _, label = connected_components(graph, directed=False)
-        first, second = label[row[a]], label[row[b]]
-        if first != second:
-            found[k] = (
-                frozenset(node for node in nodes if label[row[node]] == first),
-                frozenset(node for node in nodes if label[row[node]] == second),
-            )
-    return found
+    alone = [k for k, (a, b) in enumerate(edges) if a != b and parallel[frozenset((a, b))] == 1]
+    found = {k: sides_without(edges, k) for k in alone}
+    return {k: sides for k, sides in found.items() if not sides[0] & sides[1]}
+
+
+def sides_without(edges: Sequence[Edge], k: int) -> Sides:
+    """The nodes that are connected with either end of edge k without it."""
+    nodes = sorted({node for edge in edges for node in edge})
+    row = {node: n for n, node in enumerate(nodes)}
+    rest = np.array([(row[a], row[b]) for n, (a, b) in enumerate(edges) if n != k], np.intp)
+    rest = rest.reshape(-1, 2)
+    graph = csr_array((np.ones(len(rest)), tuple(rest.T)), shape=(len(nodes), len(nodes)))
+    _, label = connected_components(graph, directed=False)
+    first, second = (
+        frozenset(node for node in nodes if label[row[node]] == label[row[end]]) for end in edges[k]
+    )
+    return first, second

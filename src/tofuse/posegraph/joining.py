@@ -27,7 +27,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.motion import moved, twist_between
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.motion import HANDHELD
-from tofuse.posegraph.cut_edges import cut_edges
+from tofuse.posegraph.cut_edges import cut_edges, sides_without
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.posegraph.views import PosedView
 from tofuse.registration.agreement import Agreement, agreement
@@ -329,7 +329,11 @@ class _Joiner:
         When it was joined, one of the sides may have been a single view, of which nothing else
         could be compared.
         """
-        weak = [join for island in self._islands for join in self._single_links(island)]
+        weak = [
+            island.joins[k]
+            for island in self._islands
+            for k in cut_edges([self._components(join) for join in island.joins])
+        ]
         for join in weak:
             self._cut(join)
         if weak:
@@ -338,11 +342,6 @@ class _Joiner:
             self._paths.clear()
             self.look_for_more()
 
-    def _single_links(self, island: _Island) -> dict[Join, tuple[frozenset[int], frozenset[int]]]:
-        """The joins without which it would fall apart, and the components of both sides."""
-        found = cut_edges([self._components(join) for join in island.joins])
-        return {island.joins[k]: sides for k, sides in found.items()}
-
     def _components(self, join: Join) -> tuple[int, int]:
         return self._component_of[join.link.i], self._component_of[join.link.j]
 
@@ -350,7 +349,8 @@ class _Joiner:
         """Make two islands of one that a join alone holds together."""
         whole = self._island_of(self._components(join)[0])
         self._islands.remove(whole)
-        for side in self._single_links(whole)[join]:
+        edges = [self._components(other) for other in whole.joins]
+        for side in sides_without(edges, whole.joins.index(join)):
             T = {c: whole.T[c] for c in whole.T if c in side}
             inside = [j for j in whole.joins if j is not join and self._components(j)[0] in side]
             self._islands.append(_Island(T, inside))
@@ -556,7 +556,7 @@ class _Joiner:
 
     def _merge(self, a: _Island, b: _Island, link: Link, joins: list[Join]) -> None:
         T_a_b = self._T_a_b(a, b, link)
-        a.T.update({c: T_a_b @ T for c, T in b.T.items()})
+        a.T.update(_moved(b.T, T_a_b))
         a.joins += [*b.joins, *joins]
         for join in joins:
             self._remember_ends(join.link)

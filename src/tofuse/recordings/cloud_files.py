@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +25,7 @@ MAP_COORDINATES_M = 8192.0
 
 _STEP_M = 1000.0  # coordinates of maps are moved by whole kilometres
 
+F = TypeVar("F", bound=Frame)
 LoadFrame = Callable[[Path, int, float], Frame]
 LoadMoved = Callable[[Path, int, float, Float64], Frame]
 
@@ -67,7 +69,7 @@ class CloudFileSource(FileSource):
                 self.odometry = tum_poses(self, path / "odometry.txt")
         self._shift = np.zeros(3)
         if load_moved is not None:
-            self._shift = self._find_shift()
+            self._shift, self._kept = find_shift(self._read, len(files))
             note_shift(self, path, self._shift)
 
     def load(self, index: int) -> Frame:
@@ -89,20 +91,6 @@ class CloudFileSource(FileSource):
         if self.load_moved is not None and self._shift.any():
             return self.load_moved(file, index, time, self._shift)
         return self.load_frame(file, index, time)
-
-    def _find_shift(self) -> Float64:
-        """Return what is taken off all coordinates, by the first file that can be read."""
-        for index in range(len(self.files)):
-            try:
-                frame = self._read(index)
-            except InputError:
-                continue
-            if len(frame):
-                shift = map_shift(frame.points.min(0), frame.points.max(0))
-                if not shift.any():
-                    self._kept[index] = frame
-                return shift
-        return np.zeros(3)
 
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):
@@ -134,6 +122,22 @@ class CloudFileSource(FileSource):
                 out[k, :3, 3] = row[1:4]
         self.warnings.append(f"{path}: read as index x y z qw qx qy qz, kept as reference only")
         return out
+
+
+def find_shift(read: Callable[[int], F], count: int) -> tuple[Float64, dict[int, F]]:
+    """Return what to take off all coordinates (3,), by the first frame that can be read.
+
+    And that frame by its index, if nothing is taken off, so that it need not be read again.
+    """
+    for index in range(count):
+        try:
+            frame = read(index)
+        except InputError:
+            continue
+        if len(frame):
+            shift = map_shift(frame.points.min(0), frame.points.max(0))
+            return shift, {} if shift.any() else {index: frame}
+    return np.zeros(3), {}
 
 
 def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:

@@ -18,7 +18,7 @@ from tofuse.registration.view_pair import follow, register_pair
 
 Float64 = NDArray[np.float64]
 
-_FEWEST_POINTS = 10
+FEWEST_POINTS = 10
 
 
 @part("registration", "any-pair")
@@ -47,7 +47,7 @@ class AnyPair(Registrar):
         Of poses that can't be told apart the one at the guess is taken.
         """
         for view in (source, target):
-            if len(view) < _FEWEST_POINTS:
+            if len(view) < FEWEST_POINTS:
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
             options = SurfaceOptions()

@@ -96,8 +96,8 @@ class Registration:
         T_source_b
             Maps b into the source's frame.
         """
-        inward = se3.adjoint(T_source_b)
-        free = self.unobservable @ np.linalg.inv(inward).T
+        inward, outward = se3.adjoint(T_source_b), se3.adjoint(se3.inverse(T_source_b))
+        free = self.unobservable @ outward.T
         lengths = np.linalg.norm(free, axis=1, keepdims=True)
         other = self.runner_up
         return replace(

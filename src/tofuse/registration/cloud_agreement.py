@@ -1,13 +1,14 @@
-"""What two clouds say of a pose between them: surfaces that lie on each other, and free space.
+"""How well two clouds agree at a pose: surfaces that coincide, and free space.
 
 As `agreement`, for views without a camera. How close surfaces have to lie follows from how rough
-they are at the resolution that they are compared at. What was seen through is known only of views
-whose viewpoint is known.
+they are at the resolution that they are compared at. Free space is known only for views with a
+known viewpoint.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.shape import shape_at, tree_of
-from tofuse.registration.viewpoint import RangeSphere, viewpoint_of
+from tofuse.registration.viewpoint import RangeSphere, Viewpoint, viewpoint_of
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -37,13 +38,13 @@ _ALIKE = 0.75
 # what surfaces may differ by.
 _IN_FRONT = 0.02
 # How many supporting points one in free space outweighs: most points of a wrong pose lie on some
-# surface, as walls are alike, but hardly one of the right pose where the other view saw through.
+# surface, as walls are alike, but hardly one of the right pose lies in free space.
 _VIOLATION_WEIGHT = 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class CloudMap:
-    """A cloud that was averaged to a resolution, with its surfaces and what it saw through.
+    """A cloud averaged to a resolution, with its surfaces and its free space.
 
     Attributes
     ----------
@@ -57,8 +58,8 @@ class CloudMap:
         Resolution, m.
     samples
         (m, 3) some of the points that were averaged, m.
-    sphere
-        What was seen in each direction; None where the viewpoint is not known.
+    viewpoint, sphere
+        Where it was seen from, and how far in each direction; None where that is not known.
     """
 
     view: CloudFrame
@@ -66,6 +67,7 @@ class CloudMap:
     sigma: float
     size: float
     samples: Float64
+    viewpoint: Viewpoint | None
     sphere: RangeSphere | None
 
     @classmethod
@@ -74,17 +76,18 @@ class CloudMap:
         shape = shape_at(view, np.arange(len(view)), NEIGHBOURS)
         rough = shape.roughness[np.isfinite(shape.roughness)]
         sigma = float(np.median(rough)) * size if len(rough) else size
-        seen = viewpoint_of(whole)
-        sphere = None if seen is None else RangeSphere.of(whole, seen)
+        viewpoint = viewpoint_of(whole)
+        sphere = None if viewpoint is None else RangeSphere.of(whole, viewpoint)
         samples = whole.points[:: max(1, -(-len(whole) // _COMPARED))].astype(np.float64)
-        return cls(view, shape.normals, sigma, size, samples, sphere)
+        return cls(view, shape.normals, sigma, size, samples, viewpoint, sphere)
 
     @property
     def tree(self) -> KdTree:
         """Over the averaged points."""
         return tree_of(self.view)
 
-    def some(self) -> tuple[Float64, Float64]:
+    @cached_property
+    def compared(self) -> tuple[Float64, Float64]:
         """Evenly chosen points (n, 3) on surfaces, and their normals (n, 3)."""
         known = np.flatnonzero(np.isfinite(self.normals).all(1))
         known = known[:: max(1, -(-len(known) // _COMPARED))]
@@ -100,8 +103,8 @@ def tolerance(source: CloudMap, target: CloudMap) -> float:
 def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Agreement:
     """Judge a pose (4, 4) by what both views saw.
 
-    `overlap` counts points that are near a surface or in space that was seen through. Without a
-    known viewpoint nothing is known of the latter.
+    `overlap` counts points that are near a surface or in free space. Without a known viewpoint
+    free space is unknown.
     """
     within = tolerance(source, target)
     ways = ((source, target, T_target_source), (target, source, se3.inverse(T_target_source)))
@@ -113,7 +116,7 @@ def cloud_agreement(source: CloudMap, target: CloudMap, T_target_source: Float64
         violation=float(free),
         clash=0.0,
         rms_m=float(np.sqrt(squares / on_surface)) if on_surface else np.inf,
-        points=sum(len(view.some()[0]) for view in (source, target)),
+        points=sum(len(view.compared[0]) for view in (source, target)),
         score=float(on_surface - _VIOLATION_WEIGHT * free),
     )
 
@@ -122,7 +125,7 @@ def _one_way(
     seen: CloudMap, by: CloudMap, T: Float64, within: float
 ) -> tuple[float, float, float, float]:
     """Shares of the points near a surface, on one and in free space; mean square distance, m^2."""
-    points, normals = seen.some()
+    points, normals = seen.compared
     if not len(points):
         return 0.0, 0.0, 0.0, 0.0
     points, normals = se3.transform(T, points), normals @ T[:3, :3].T

@@ -26,12 +26,14 @@ from tofuse.registration.confidence import CERTAIN, CloudEvidence
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
+from tofuse.registration.reduce import extent
 from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.sample_consensus import are_distinct
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
 from tofuse.registration.view_pair import register_pair
-from tofuse.registration.viewpoint import as_image, viewpoint_of
+from tofuse.registration.viewpoint import as_image
 
 Float64 = NDArray[np.float64]
 
@@ -87,9 +89,9 @@ class _Views:
         return self.here.size
 
     @property
-    def seen_through(self) -> bool:
-        """Whether it is known of both what they saw through."""
-        return self.there.sphere is not None and self.here.sphere is not None
+    def knows_free_space(self) -> bool:
+        """Whether the viewpoints of both, and so their free space, are known."""
+        return self.there.viewpoint is not None and self.here.viewpoint is not None
 
     def judged(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.there, self.here, T))
@@ -109,15 +111,13 @@ class _Views:
         self, pose: _Pose, lead: float | None = None, degenerate: int = 0
     ) -> CloudEvidence:
         said = pose.agreement
-        through = self.seen_through
+        through = self.knows_free_space
         return CloudEvidence(said.support, said.contradiction, lead, degenerate, through)
 
     def differ(self, a: Float64, b: Float64) -> bool:
         """Whether two poses take the middle of the source elsewhere, or turn it otherwise."""
-        middle = np.median(self.there.view.points, 0)[None].astype(np.float64)
-        shift = np.linalg.norm(se3.transform(a, middle) - se3.transform(b, middle))
-        turned = se3.angle(se3.inverse(a) @ b)
-        return bool(shift > _DISTINCT * self.size or turned > _DISTINCT_RAD)
+        points = self.there.view.points.astype(np.float64)
+        return are_distinct(a, b, points, metres=_DISTINCT * self.size, rad=_DISTINCT_RAD)
 
 
 def _finest(view: Frame) -> float:
@@ -178,7 +178,7 @@ def _registered(
         found = _registration(views, near)
         if (found.probability or 0.0) >= CERTAIN and not len(found.unobservable):
             return found
-    seen = _searched(source, target, guess)
+    seen = _searched(views, guess)
     if seen is not None and seen.believed and not always_search:
         return seen
     poses = [near] if seen is None else [near, views.judged(seen.T_target_source)]
@@ -202,11 +202,10 @@ def _registered(
 
 def _power_of_scale(source: Frame, target: Frame) -> int:
     """Power of ten by which the target is larger than the source, -3 to 3; 0 if it is not."""
-    spread = [np.ptp(np.percentile(v.points, [5, 95], axis=0), axis=0) for v in (source, target)]
-    small, large = (float(np.linalg.norm(s)) for s in spread)
-    if small == 0 or large == 0:
+    there, here = extent(source.points), extent(target.points)
+    if there == 0 or here == 0:
         return 0
-    power = round(float(np.log10(large / small)))
+    power = round(float(np.log10(here / there)))
     return power if abs(power) <= 3 else 0
 
 
@@ -247,7 +246,9 @@ def _proposed(views: _Views, start: Float64) -> list[_Pose]:
     found, failure = [], None
     try:
         candidates = (
-            Fpfh(signed=views.seen_through).candidates(views.source, views.target, views.rng).poses
+            Fpfh(signed=views.knows_free_space)
+            .candidates(views.source, views.target, views.rng)
+            .poses
         )
         found += [views.polished(c.T_target_source) for c in candidates[:_POLISHED]]
     except RegistrationError as error:
@@ -282,12 +283,12 @@ def _polish(size: float) -> tuple[Icp, ...]:
     return plain, replace(plain, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
 
 
-def _searched(source: Frame, target: Frame, guess: Float64 | None) -> Registration | None:
+def _searched(views: _Views, guess: Float64 | None) -> Registration | None:
     """Register the images that both clouds came from; None where they can't be made."""
-    points = viewpoint_of(source), viewpoint_of(target)
-    if points[0] is None or points[1] is None:
+    there, here = views.there.viewpoint, views.here.viewpoint
+    if there is None or here is None:
         return None
-    first, second = as_image(source, points[0]), as_image(target, points[1])
+    first, second = as_image(views.source, there), as_image(views.target, here)
     if first is None or second is None:
         return None
     (data, T_source_camera), (model, T_target_camera) = first, second

@@ -19,7 +19,7 @@ from tofuse.registration.hold import Hold
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
 from tofuse.registration.pairs import FEWEST_PAIRS
-from tofuse.registration.reduce import averaged, reduced
+from tofuse.registration.reduce import averaged, extent, reduced
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All
 from tofuse.registration.shape import shape_at
@@ -138,7 +138,7 @@ class CoarseToFine(Registrar):
             size = self.resolution
             fine = size, averaged(source, size), averaged(target, size)
         levels = [fine]
-        most = _extent(fine[2]) / _EXTENT_SHARE
+        most = extent(fine[2].points) / _EXTENT_SHARE
         most = most if self.coarsest is None else min(most, self.coarsest)
         while levels[-1][0] * 2 < most:
             resolution = 2 * levels[-1][0]
@@ -200,7 +200,9 @@ class CoarseToFine(Registrar):
         while max(self._roughness(data), self._roughness(model)) > _ROUGHEST:
             size *= _COARSER
             data, model = averaged(source, size), averaged(target, size)
-            if min(len(data), len(model)) < _SMALLEST_LEVEL or size * _FINEST > _extent(model):
+            if min(len(data), len(model)) < _SMALLEST_LEVEL or size * _FINEST > extent(
+                model.points
+            ):
                 return first
         return size, data, model
 
@@ -235,9 +237,3 @@ def spacing(view: Frame) -> float:
     distances: NDArray[np.float64] = np.sqrt(squared[:, 1])
     positive = distances[distances > 0]
     return float(np.median(positive)) if len(positive) else 0.01
-
-
-def _extent(view: CloudFrame) -> float:
-    """Return the diagonal in m of the middle 90 % of the points along each axis."""
-    low, high = np.percentile(view.points, [5, 95], axis=0)
-    return float(np.linalg.norm(high - low))

@@ -110,21 +110,21 @@ class CloudEvidence:
     ----------
     support, contradiction, margin, degenerate
         See `Evidence`.
-    seen_through
-        Whether it is known of both clouds what they saw through.
+    knows_free_space
+        Whether the viewpoints of both clouds are known.
     """
 
     support: float
     contradiction: float
     margin: float | None
     degenerate: int
-    seen_through: bool
+    knows_free_space: bool
 
     @property
     def searched(self) -> Float64:
         """(6,) regressors of a pose that was compared with others."""
         lead = np.sqrt(max(self.margin or 0.0, 0.0))
-        unknown = not self.seen_through
+        unknown = not self.knows_free_space
         return np.array(
             [1, lead, self.support, self.contradiction, self.degenerate > 0, unknown], float
         )
@@ -135,7 +135,7 @@ class CloudEvidence:
 
         Not how many directions are degenerate: along these it stays where the guess is.
         """
-        return np.array([1, self.support, self.contradiction, not self.seen_through], float)
+        return np.array([1, self.support, self.contradiction, not self.knows_free_space], float)
 
     @property
     def probability(self) -> float:
@@ -151,7 +151,7 @@ class CloudEvidence:
         said = [f"{self.support:.0%} of the points of both views support the pose"]
         if self.margin is not None:
             said.append(f"it leads the next one by {max(self.margin, 0.0):.1%} of them")
-        if self.seen_through:
+        if self.knows_free_space:
             said.append(f"{self.contradiction:.0%} of the overlap lie in free space")
         if self.degenerate:
             said.append(f"{self.degenerate} directions are degenerate")

@@ -23,6 +23,7 @@ from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,
     Way,
+    are_distinct,
     consensus,
     motion_of,
     registration_of,
@@ -151,7 +152,16 @@ class Fpfh(Registrar):
         distinct: list[Candidate] = []
         for one in sorted(settled, key=lambda c: -c.share):
             # What settles where a better one does is no rival.
-            if all(_apart(one.T_target_source, c.T_target_source, there, size) for c in distinct):
+            if all(
+                are_distinct(
+                    one.T_target_source,
+                    c.T_target_source,
+                    there.points,
+                    metres=_DISTINCT * size,
+                    rad=_DISTINCT_RAD,
+                )
+                for c in distinct
+            ):
                 distinct.append(one)
         return Candidates(size, pairs, tuple(distinct))
 
@@ -271,11 +281,3 @@ def _fitting(
     turned = source.normals @ T[:3, :3].T
     alike = np.abs((turned * target.normals[nearest]).sum(1)) > _ALIKE
     return (squared < far * far) & alike, nearest
-
-
-def _apart(T: Float64, other: Float64, view: Described, size: float) -> bool:
-    """Whether two motions take a view to different places."""
-    middle = np.median(view.points, 0)[None]
-    shift = np.linalg.norm(se3.transform(T, middle) - se3.transform(other, middle))
-    turned = se3.angle(se3.inverse(T) @ other)
-    return bool(shift > _DISTINCT * size or turned > _DISTINCT_RAD)

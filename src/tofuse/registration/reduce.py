@@ -5,8 +5,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.recordings.frames import CloudFrame, Frame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+def extent(points: Float32 | Float64) -> float:
+    """Return the diagonal in m of the middle 90 % of points (n, 3) along each axis; 0 of none."""
+    if not len(points):
+        return 0.0
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def averaged(view: Frame, size: float) -> CloudFrame:

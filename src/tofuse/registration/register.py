@@ -8,12 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
-from tofuse.registration.any_pair import AnyPair
+from tofuse.registration.any_pair import FEWEST_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
 
 Float64 = NDArray[np.float64]
 
-_FEWEST_POINTS = 10
 _FURTHEST_M = 1e9
 # Clouds that are further apart have different frames.
 _OTHER_FRAME_M = 1e4
@@ -131,11 +130,11 @@ def _cloud(points: ArrayLike, name: str) -> Float64:
             remedy="give a frame, or (N, 3) numbers in metres",
         )
     good = array[np.isfinite(array).all(1)].astype(np.float64)
-    if len(good) < _FEWEST_POINTS:
+    if len(good) < FEWEST_POINTS:
         raise InputError(
             f"has {len(good)} finite points",
             where=name,
-            remedy=f"give {_FEWEST_POINTS} or more",
+            remedy=f"give {FEWEST_POINTS} or more",
         )
     if np.abs(good).max() > _FURTHEST_M:
         raise InputError(

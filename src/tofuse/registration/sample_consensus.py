@@ -160,6 +160,14 @@ def consensus(pairs: Pairs, options: ConsensusOptions, rng: np.random.Generator)
     return found
 
 
+def are_distinct(T: Float64, other: Float64, points: Float64, *, metres: float, rad: float) -> bool:
+    """Whether two motions (4, 4) differ in where they put, or turn, the middle of points (n, 3)."""
+    middle = np.median(points, 0)[None]
+    shift = np.linalg.norm(se3.transform(T, middle) - se3.transform(other, middle))
+    turned = se3.angle(se3.inverse(T) @ other)
+    return bool(shift > metres or turned > rad)
+
+
 def motion_of(pairs: Pairs) -> Float64:
     """(4, 4) the motion with the least weighted squares (Arun et al. 1987, Umeyama 1991).
 

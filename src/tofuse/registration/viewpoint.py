@@ -1,8 +1,8 @@
-"""Clouds that were seen from one point: how that shows, and the images that they came from.
+"""The viewpoint of a cloud: whether it is the origin, and the image seen from there.
 
-From where a sensor was, each direction shows one surface, and the directions of the points are
-spread more evenly than the points themselves are over the surfaces. Then the cloud also says what
-was seen through, and can be compared like an image.
+From a sensor's position each direction shows one surface, and the points are spaced more evenly in
+direction than over the surfaces. A cloud with a known viewpoint also shows free space, and can be
+compared like an image.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +17,7 @@ from tofuse.geometry.quaternion import to_matrix
 from tofuse.parts import part
 from tofuse.recordings.cloud_files import (
     CloudFileSource,
+    find_shift,
     map_shift,
     needed_files,
     note_shift,
@@ -166,28 +168,14 @@ class E57Source(FileSource):
                 self.reference[k] = read_matrix_pose(pose, f"{path}: scan {k}")
             except InputError as error:
                 self.warnings.append(f"{error}; left out")
-        self._kept: dict[int, CloudFrame] = {}  # read to find the shift
-        self._shift = self._find_shift()
+        unmoved = partial(self._read, shift=np.zeros(3))
+        self._shift, self._kept = find_shift(unmoved, len(self.counts))
         note_shift(self, path, self._shift)
 
     def load(self, index: int) -> CloudFrame:
         """See `FileSource.load`."""
         kept = self._kept.pop(index, None)
         return self._read(index, self._shift) if kept is None else kept
-
-    def _find_shift(self) -> Float64:
-        """Return what is taken off the coordinates of all scans, by the first that can be read."""
-        for index in range(len(self.counts)):
-            try:
-                frame = self._read(index, np.zeros(3))
-            except InputError:
-                continue
-            if len(frame):
-                shift = map_shift(frame.points.min(0), frame.points.max(0))
-                if not shift.any():
-                    self._kept[index] = frame
-                return shift
-        return np.zeros(3)
 
     def _read(self, index: int, shift: Float64) -> CloudFrame:
         where = f"{self.path}: scan {index}"
