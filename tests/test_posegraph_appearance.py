@@ -88,14 +88,16 @@ def drifted(truth, degrees):
     return np.stack(T)
 
 
-def found_in(views, poses, **options):
+def found_in(views, poses, sigma=0.0, **options):
     store = ViewStore(ALL)
     loops = Revisits(spacing=ALL, belief=QUICK, **options).start(0, (), store)
     frame = room(0.0, 0)
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)
         loops.push(replace(frame, index=view.index), T)
-    return loops.finish(dict(enumerate(poses)))
+    half = len(poses) // 2  # from there on the poses are off by this
+    unsure = {k: sigma**2 * np.eye(6) * (k >= half) for k in range(len(poses))}
+    return loops.finish(dict(enumerate(poses)), unsure)
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +143,9 @@ def test_what_would_need_too_much_drift_is_another_place(once_round):
     options = {"appearance": Appearance(most=2)}
     reasons = [c.record.reason for c in found_in(views, still, **options) if not c.record.accepted]
     assert any("can't have drifted so far" in reason for reason in reasons)
+    # Unless the poses say that they are so uncertain.
+    found = found_in(views, still, sigma=2.0, **options)
+    assert any(c.record.accepted and c.record.j - c.record.i >= 16 for c in found)
 
 
 # How alike
@@ -224,7 +229,7 @@ def test_drift_grows_with_the_path():
     assert options.plausible(se3.exp(np.array([0, 0, 0, 0, 0.15, 0])), path, 2.0)
     off = se3.exp(np.array([0, 0, 0, 0, 0.25, 0]))
     assert not options.plausible(off, path, 2.0)
-    assert options.plausible(off, path, 2.0, unsure=0.1)
+    assert options.plausible(off, path, 2.0, unsure_rad=0.1)
 
 
 @pytest.mark.parametrize("options", [{"most": -1}, {"unlike": 0.0}, {"drift": 2}, {"shift": 0.6}])

@@ -182,7 +182,7 @@ def test_every_candidate_is_recorded_and_what_a_person_gives_counts():
     for k in range(22):
         if k != 5:  # lost
             loops.push(view(k), poses[k])
-    closed = loops.finish({k: poses[k] for k in range(22) if k != 5})
+    closed = loops.finish({k: poses[k] for k in range(22) if k != 5}, {})
     pairs = {(c.record.i, c.record.j): c for c in closed}
     assert list(pairs) == [(3, 17), (0, 20), (1, 21), (5, 21)]
     np.testing.assert_array_equal(pairs[0, 20].T_i_j, by_hand)

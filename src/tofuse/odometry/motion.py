@@ -244,7 +244,8 @@ def jumps(
     """Positions of poses (4, 4) that the motion before does not lead to, and how far off they are.
 
     None is a frame without a pose; `moments` say when each was taken; `interruptions` are positions
-    at which a recording or a component begins.
+    to which no motion leads: where a recording or a component begins, or where the motion before
+    was not measured.
     """
     motion = Motion()
     found = []

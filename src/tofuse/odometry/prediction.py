@@ -54,6 +54,33 @@ def prediction_sigma(poses: Float64, unobservable: Sequence[Float64]) -> tuple[f
     return float(rms[0] * UNITS[0]), float(rms[1] * UNITS[3])
 
 
+def runs(unobservable: Sequence[Float64]) -> NDArray[np.intp]:
+    """For how many frames in a row, this one included, some direction was degenerate; (N,)."""
+    weak = np.array([len(u) > 0 for u in unobservable], np.intp)
+    count = np.cumsum(weak)
+    last_constrained = np.maximum.accumulate(np.where(weak == 0, count, 0))
+    return np.asarray(count - last_constrained, np.intp)
+
+
+def growth(run: int, frames: int) -> float:
+    """How many times the error of one prediction the motion over some frames is off by.
+
+    The velocity is what is extrapolated. Where nothing measures it, it does a random walk, and
+    after n frames the position is off by the root of the sum of squares 1 to n: as much as if the
+    k-th of n independent motions were off by k times the error of one prediction.
+
+    Parameters
+    ----------
+    run
+        For how many frames in a row, the last of these included, a direction was degenerate.
+    frames
+        Over how many frames the motion is.
+    """
+    first = max(run - frames, 0)
+    k = np.arange(first + 1, max(run, first + frames) + 1, dtype=float)
+    return float(np.sqrt((k * k).sum()))
+
+
 def with_prediction(
     information: Float64, unobservable: Float64, sigma: tuple[float, float]
 ) -> Float64:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.evaluation.sightings import Sightings, sightings
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
-from tofuse.odometry.prediction import prediction_sigma, with_prediction
+from tofuse.odometry.prediction import growth, prediction_sigma, runs, with_prediction
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
@@ -147,7 +147,10 @@ class BackEnd:
     def _close(self) -> Closed:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
-            loops = with_joins(self._kept.loops.finish(self._poses), self._joins)
+            tracked = self.graph(())
+            unsure = dict(zip(tracked.ids.tolist(), pose_covariances(tracked), strict=True))
+            found = self._kept.loops.finish(self._poses, unsure)
+            loops = with_joins(found, self._joins)
             graph = self.graph(loops)
         sequential = led = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
@@ -266,7 +269,8 @@ class BackEnd:
         again = () if refined is None else refined.edges
         replaced = {index for edge in again for index in (edge.i, edge.j)}
         place = {index: k for k, index in enumerate(ids)}
-        sigma = prediction_sigma(tracked, [e.record.unobservable for e in self._posed])
+        unobservable = [e.record.unobservable for e in self._posed]
+        sigma, run = prediction_sigma(tracked, unobservable), runs(unobservable)
         times = {e.record.index: e.record.timestamp for e in self._posed}
         interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
         sequence = []
@@ -277,12 +281,12 @@ class BackEnd:
             if {step.reference, index} <= replaced:
                 continue
             r = step.registration
-            # What was predicted frame by frame since then adds up; over longer intervals than usual
-            # errors of the velocity grow with the square of the time.
+            # Over longer intervals than usual errors of a prediction grow with the time squared.
             frames = abs(place[index] - place[step.reference])
             elapsed = abs(times[index] - times[step.reference])
             longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
-            predicted = (sigma[0] * frames * longer**2, sigma[1] * frames * longer**2)
+            times_one = growth(int(run[place[index]]), frames) * longer**2
+            predicted = (sigma[0] * times_one, sigma[1] * times_one)
             information = with_prediction(r.information, r.unobservable, predicted)
             sequence.append(Measured(step.reference, index, r.T_target_source, information))
         needed = [

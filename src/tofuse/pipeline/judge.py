@@ -235,7 +235,9 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     has_pose = e.in_main
     poses = [next(posed) if has else None for has in has_pose]
     moments = [Moment(r.index, r.timestamp) for r in e.records]
-    found = jumps(poses, moments, {*e.interruptions, *_crossings(e.records, has_pose)})
+    unmeasured = {k + 1 for k, record in enumerate(e.records) if len(record.unobservable)}
+    unexpected = {*e.interruptions, *_crossings(e.records, has_pose), *unmeasured}
+    found = jumps(poses, moments, unexpected)
     frames = [e.records[k].index for k, _ in found]
     if len(found) > max(UNORDERED, UNORDERED_SHARE * sum(has_pose)):
         text = (

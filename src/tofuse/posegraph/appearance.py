@@ -95,7 +95,14 @@ class Appearance:
                 mine.append((i, j))
         return chosen, refused
 
-    def plausible(self, between: Float64, path: Float64, depth: float, unsure: float = 0.0) -> bool:
+    def plausible(
+        self,
+        between: Float64,
+        path: Float64,
+        depth: float,
+        unsure_share: float = 0.0,
+        unsure_rad: float = 0.0,
+    ) -> bool:
         """Whether the trajectory may be off by so much.
 
         Parameters
@@ -106,16 +113,16 @@ class Appearance:
             (N, 4, 4) T_world_camera from the earlier view to the later one.
         depth
             Of what they see, m: a view that turns is off to the side as well, by about that.
-        unsure
-            Added to what it may be off, in rad and as a share of the depth.
+        unsure_share, unsure_rad
+            Added to what it may be off, as a fraction of the depth and in rad.
         """
         steps = se3.inverse(path[:-1]) @ path[1:]
         length = float(np.linalg.norm(steps[:, :3, 3], axis=1).sum())
         turned = float(np.sum(se3.angle(steps)))
         return bool(
             np.linalg.norm(between[:3, 3])
-            <= self.drift * (length + depth * turned) + unsure * depth
-            and se3.angle(between) <= self.drift * (turned + length / depth) + unsure
+            <= self.drift * (length + depth * turned) + unsure_share * depth
+            and se3.angle(between) <= self.drift * (turned + length / depth) + unsure_rad
         )
 
 

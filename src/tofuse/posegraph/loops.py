@@ -99,7 +99,9 @@ class Loops(Protocol):
         """
         ...
 
-    def finish(self, poses: Mapping[int, Float64]) -> list[ClosedLoop]:
+    def finish(
+        self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
+    ) -> list[ClosedLoop]:
         """Return every candidate and given loop with its decision, in the order of j, then i.
 
         Parameters
@@ -107,6 +109,9 @@ class Loops(Protocol):
         poses
             (4, 4) in one frame, by index of the frames that are looked at: components may have
             been joined since they were added.
+        covariances
+            (6, 6) of these before any loop is closed, relative to the first, as right
+            perturbations; NaN where unknown.
         """
         ...
 

@@ -105,7 +105,9 @@ class _NearbyLoops(Loops):
         found = [loop for (_, j), loop in self._closed.items() if j == newest]
         return (lambda: found) if found else None
 
-    def finish(self, poses: Mapping[int, Float64]) -> list[ClosedLoop]:
+    def finish(
+        self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
+    ) -> list[ClosedLoop]:
         """See `Loops.finish`."""
         for loop in self._given_loops:
             self._closed[loop.i, loop.j] = given_loop(loop, self._poses, self._confirm)

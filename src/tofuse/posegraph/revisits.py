@@ -24,6 +24,7 @@ from tofuse.posegraph.loops import (
     given_loop,
     in_order,
 )
+from tofuse.posegraph.trust import relative_sigmas
 from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import Frame
 from tofuse.registration.likeness import look_of
@@ -50,6 +51,8 @@ _LEAST_OVERLAP = 0.3
 _LEARN = 40
 # A search leaves errors of about this size, m and rad.
 _AFTER_SEARCH = 0.03
+# The trajectory may be off by so many of its standard deviations.
+_SIGMAS = 3.0
 
 
 @part("loops", "revisits")
@@ -166,6 +169,7 @@ class _RevisitLoops(Loops):
         self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
         self._usual = UsualFit(options.unusual)
         self._learnt: set[tuple[int, int]] = set()
+        self._covariances: dict[int, Float64] = {}
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Loops.push`."""
@@ -192,9 +196,11 @@ class _RevisitLoops(Loops):
 
         return work
 
-    def finish(self, poses: Mapping[int, Float64]) -> list[ClosedLoop]:
+    def finish(
+        self, poses: Mapping[int, Float64], covariances: Mapping[int, Float64]
+    ) -> list[ClosedLoop]:
         """See `Loops.finish`. What a person gives takes the place of what was found."""
-        self._poses = dict(poses)
+        self._poses, self._covariances = dict(poses), dict(covariances)
         posed = self._chosen.of(poses)
         self._learn(posed)
         surfaces = [p.view for p in posed]
@@ -331,9 +337,15 @@ class _RevisitLoops(Loops):
         path = np.stack(
             [self._poses[k] for k in sorted(self._poses) if target.index <= k <= source.index]
         )
-        off = se3.inverse(se3.inverse(path[0]) @ path[-1]) @ T
+        T_target_source = se3.inverse(path[0]) @ path[-1]
+        off = se3.inverse(T_target_source) @ T
         depth = 0.5 * (target.depth + source.depth)
-        return self._options.appearance.plausible(off, path, depth, unsure)
+        metres, radians = relative_sigmas(
+            T_target_source, self._covariances[target.index], self._covariances[source.index]
+        )
+        return self._options.appearance.plausible(
+            off, path, depth, unsure + _SIGMAS * metres / depth, unsure + _SIGMAS * radians
+        )
 
     def _same(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
         """Whether the loop k, m, beside the loop i, j, puts the camera of j where that does."""

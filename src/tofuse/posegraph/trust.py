@@ -60,6 +60,30 @@ def pose_covariances(graph: PoseGraph) -> Float64:
     return out
 
 
+def relative_sigmas(T_i_j: Float64, C_i: Float64, C_j: Float64) -> tuple[float, float]:
+    """Largest standard deviation (m, rad) of the motion between two poses of a chain.
+
+    Along a chain of measurements C_j = Ad(T_j_i) C_i Ad(T_j_i)^T + C_i_j; what is measured between
+    the two is left when the first part is taken away.
+
+    Parameters
+    ----------
+    T_i_j
+        (4, 4).
+    C_i, C_j
+        (6, 6) relative to the first pose, as right perturbations. NaN gives 0: nothing is known.
+    """
+    A = se3.adjoint(se3.inverse(T_i_j))
+    C = C_j - A @ C_i @ A.T
+    if not np.isfinite(C).all():
+        return 0.0, 0.0
+    metres, radians = (
+        float(np.sqrt(max(np.linalg.eigvalsh(C[k, k])[-1], 0.0)))
+        for k in (slice(0, 3), slice(3, 6))
+    )
+    return metres, radians
+
+
 def expected_error(graph: PoseGraph, sigmas: float = 2.0) -> tuple[float, float]:
     """Rms position error of the trajectory, aligned with the truth, that the graph leaves room for.
 
