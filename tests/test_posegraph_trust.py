@@ -17,7 +17,7 @@ from tofuse.posegraph.trust import (
     expected_error,
     loop_errors,
     pose_covariances,
-    relative_sigmas,
+    relative_covariance,
     without_left_out,
 )
 
@@ -128,7 +128,7 @@ def test_left_out_edges_are_gone() -> None:
     assert kept.weights[-1] == 2 * LEFT_OUT
 
 
-def test_the_sigmas_between_two_poses_of_a_chain_are_those_of_the_edges_between() -> None:
+def test_the_covariance_between_two_poses_of_a_chain_is_that_of_the_edges_between() -> None:
     rng = np.random.default_rng(3)
     motions = se3.exp(0.3 * rng.standard_normal((6, 6)))
     poses = [np.eye(4)]
@@ -137,8 +137,8 @@ def test_the_sigmas_between_two_poses_of_a_chain_are_those_of_the_edges_between(
     sigmas = rng.uniform(0.5, 2, (6, 6)) * [0.01, 0.01, 0.01, 0.005, 0.005, 0.005]
     edges = [Measured(k, k + 1, motions[k], np.diag(1 / sigmas[k] ** 2)) for k in range(6)]
     C = pose_covariances(build_graph(range(7), np.stack(poses), edges, ()))
-    metres, radians = relative_sigmas(se3.inverse(poses[2]) @ poses[3], C[2], C[3])
-    np.testing.assert_allclose([metres, radians], [sigmas[2, :3].max(), sigmas[2, 3:].max()])
-    far = relative_sigmas(se3.inverse(poses[2]) @ poses[6], C[2], C[6])
-    assert far[0] > metres
-    assert relative_sigmas(np.eye(4), np.full((6, 6), np.nan), C[3]) == (0.0, 0.0)
+    between = relative_covariance(se3.inverse(poses[2]) @ poses[3], C[2], C[3])
+    np.testing.assert_allclose(between, np.diag(sigmas[2] ** 2), atol=1e-12)
+    far = relative_covariance(se3.inverse(poses[2]) @ poses[6], C[2], C[6])
+    assert np.linalg.eigvalsh(far - np.diag(sigmas[5] ** 2)).min() > 0
+    assert not relative_covariance(np.eye(4), np.full((6, 6), np.nan), C[3]).any()

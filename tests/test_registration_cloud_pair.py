@@ -11,13 +11,14 @@ import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.odometry.pairwise import Pairwise
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.registration.reduce import averaged
-from tofuse.registration.viewpoint import RangeSphere, as_image, viewpoint_of
+from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 from tofuse.simulation import scene as scenes
 from tofuse.simulation.record import plan
 
@@ -119,6 +120,18 @@ def test_the_image_of_a_cloud_is_the_one_it_came_from(frames):
     assert np.mean(np.abs(image.points[inside, 2] - z) < 0.05 * z) > 0.95
     assert image.color_image[image.valid].any()
     assert np.isin(image.amplitude, frame.amplitude).all()
+
+
+def test_pixels_show_a_slanted_plane_where_their_centres_see_it() -> None:
+    """Points lie anywhere in their pixels; what they are off by must not move the surface."""
+    xy = np.random.default_rng(4).uniform(-0.5, 0.5, (60_000, 2))
+    z = 2.0 / (1 - 0.6 * xy[:, 0] + 0.3 * xy[:, 1])  # a plane, slanted by more than 30 degrees
+    points = np.column_stack([xy * z[:, None], z])
+    camera = Pinhole(100, 100, 100.0, 100.0, 49.5, 49.5)
+    image = rendered(CloudFrame.of(points), camera)
+    rays = camera.rays()[3:-3, 3:-3]
+    expected = 2.0 / (1 - 0.6 * rays[..., 0] + 0.3 * rays[..., 1])
+    np.testing.assert_allclose(image.depth[3:-3, 3:-3], expected, rtol=2e-5)
 
 
 def test_a_cloud_with_z_up_is_seen_by_a_camera_that_stands_upright(frames):

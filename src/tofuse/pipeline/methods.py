@@ -70,7 +70,7 @@ def default(kind: ViewKind) -> Config:
                 max_yaw_rad=0.8,
                 min_gap=30,
                 per_frame=6,
-                confirmation=Confirmation(registrations=(AnyPair(search=False),)),
+                confirmation=Confirmation(registrations=(AnyPair(),)),
             ),
             refinement=Planes(),
         )

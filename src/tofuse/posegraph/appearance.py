@@ -19,6 +19,8 @@ Float64 = NDArray[np.float64]
 _BESIDE, _TOGETHER = 3, 2
 # How far apart views that look alike may stand: rad, and share of the depth.
 ALIKE = 0.35
+# The trajectory may be off by so many of its standard deviations.
+_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,8 @@ class Appearance:
         between: Float64,
         path: Float64,
         depth: float,
-        unsure_share: float = 0.0,
-        unsure_rad: float = 0.0,
+        covariance: Float64 | None = None,
+        unsure: float = 0.0,
     ) -> bool:
         """Whether the trajectory may be off by so much.
 
@@ -113,16 +115,22 @@ class Appearance:
             (N, 4, 4) T_world_camera from the earlier view to the later one.
         depth
             Of what they see, m: a view that turns is off to the side as well, by about that.
-        unsure_share, unsure_rad
-            Added to what it may be off, as a fraction of the depth and in rad.
+        covariance
+            (6, 6) of the motion between the views, of `between` as a right perturbation. Where it
+            is wide, as along a bare wall, drift may be larger in that direction.
+        unsure
+            Added to what it may be off, in rad and as a share of the depth.
         """
         steps = se3.inverse(path[:-1]) @ path[1:]
         length = float(np.linalg.norm(steps[:, :3, 3], axis=1).sum())
         turned = float(np.sum(se3.angle(steps)))
-        return bool(
-            np.linalg.norm(between[:3, 3])
-            <= self.drift * (length + depth * turned) + unsure_share * depth
-            and se3.angle(between) <= self.drift * (turned + length / depth) + unsure_rad
+        far = self.drift * (length + depth * turned) + unsure * depth
+        wide = self.drift * (turned + length / depth) + unsure
+        C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance
+        off = np.concatenate([between[:3, 3], se3.log(between)[3:]])
+        return all(
+            off[k] @ np.linalg.solve(C[k, k] + limit**2 * np.eye(3), off[k]) <= 1
+            for k, limit in ((slice(0, 3), far), (slice(3, 6), wide))
         )
 
 

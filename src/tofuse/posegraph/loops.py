@@ -187,9 +187,9 @@ class Confirmation:
     def confirm(self, source: Frame, target: Frame, guess: Float64, *, seed: int) -> ClosedLoop:
         """Decide whether two views form a loop.
 
-        Starts from the guess and, as the trajectory may be far off, from the identity; the
-        better end counts: one that is good enough before one that is not, then the one with more
-        corresponding points.
+        Starts from the guess and, as the trajectory may be far off, from the identity, unless the
+        method looks for rival poses itself; the better end counts: one that is good enough before
+        one that is not, then the one with more corresponding points.
 
         Parameters
         ----------
@@ -208,6 +208,8 @@ class Confirmation:
                 found.append(self._register(source, target, start, seed))
             except RegistrationError as error:
                 failure = failure or str(error)
+            if found and found[-1].believed is not None:
+                break  # it looked for other poses itself
         if not found:
             return ClosedLoop(LoopRecord(i, j, False, f"not registered: {failure}"))
         best = max(found, key=lambda r: (not self.objection(r), r.share, -r.error))

@@ -24,7 +24,7 @@ from tofuse.posegraph.loops import (
     given_loop,
     in_order,
 )
-from tofuse.posegraph.trust import relative_sigmas
+from tofuse.posegraph.trust import relative_covariance
 from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import Frame
 from tofuse.registration.likeness import look_of
@@ -51,8 +51,6 @@ _LEAST_OVERLAP = 0.3
 _LEARN = 40
 # A search leaves errors of about this size, m and rad.
 _AFTER_SEARCH = 0.03
-# The trajectory may be off by so many of its standard deviations.
-_SIGMAS = 3.0
 
 
 @part("loops", "revisits")
@@ -340,12 +338,10 @@ class _RevisitLoops(Loops):
         T_target_source = se3.inverse(path[0]) @ path[-1]
         off = se3.inverse(T_target_source) @ T
         depth = 0.5 * (target.depth + source.depth)
-        metres, radians = relative_sigmas(
+        C = relative_covariance(
             T_target_source, self._covariances[target.index], self._covariances[source.index]
         )
-        return self._options.appearance.plausible(
-            off, path, depth, unsure + _SIGMAS * metres / depth, unsure + _SIGMAS * radians
-        )
+        return self._options.appearance.plausible(off, path, depth, C, unsure)
 
     def _same(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
         """Whether the loop k, m, beside the loop i, j, puts the camera of j where that does."""

@@ -60,10 +60,10 @@ def pose_covariances(graph: PoseGraph) -> Float64:
     return out
 
 
-def relative_sigmas(T_i_j: Float64, C_i: Float64, C_j: Float64) -> tuple[float, float]:
-    """Largest standard deviation (m, rad) of the motion between two poses of a chain.
+def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
+    """Covariance (6, 6) of the motion between two poses of a chain, as a right perturbation of j.
 
-    Along a chain of measurements C_j = Ad(T_j_i) C_i Ad(T_j_i)^T + C_i_j; what is measured between
+    Along a chain of measurements C_j = Ad(T_j_i) C_i Ad(T_j_i)^T + C_i_j; what was measured between
     the two is left when the first part is taken away.
 
     Parameters
@@ -75,13 +75,7 @@ def relative_sigmas(T_i_j: Float64, C_i: Float64, C_j: Float64) -> tuple[float, 
     """
     A = se3.adjoint(se3.inverse(T_i_j))
     C = C_j - A @ C_i @ A.T
-    if not np.isfinite(C).all():
-        return 0.0, 0.0
-    metres, radians = (
-        float(np.sqrt(max(np.linalg.eigvalsh(C[k, k])[-1], 0.0)))
-        for k in (slice(0, 3), slice(3, 6))
-    )
-    return metres, radians
+    return C if np.isfinite(C).all() else np.zeros((6, 6))
 
 
 def expected_error(graph: PoseGraph, sigmas: float = 2.0) -> tuple[float, float]:

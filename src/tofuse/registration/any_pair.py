@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import RegistrationError
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
 from tofuse.registration.view_pair import follow, register_pair
+from tofuse.registration.viewpoint import as_image, viewpoint_of
 
 Float64 = NDArray[np.float64]
 
@@ -26,8 +28,9 @@ FEWEST_POINTS = 10
 class AnyPair(Registrar):
     """Two views that may be far apart: the pose, and whether it is to be believed.
 
-    Two images are registered by what both cameras saw (`registration.view_pair`), and where they
-    have too little surface for that, like clouds (`registration.cloud_pair`).
+    Images, and clouds that were seen from their origin, are registered by what both cameras saw
+    (`registration.view_pair`). Other clouds, those for which that pose is not believed, and images
+    with too little surface for it are registered as clouds (`registration.cloud_pair`).
 
     Attributes
     ----------
@@ -49,15 +52,49 @@ class AnyPair(Registrar):
         for view in (source, target):
             if len(view) < FEWEST_POINTS:
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
+        searches = self.search or guess is None
+        seen = _registered_as_images(source, target, guess, search=searches)
+        are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
+        if seen is not None and (seen.believed or are_images):
+            return seen
+        if not searches and guess is not None:
+            return follow_clouds(source, target, guess, rng)
+        return register_clouds(source, target, guess, rng, seen)
+
+
+def _registered_as_images(
+    source: Frame, target: Frame, guess: Float64 | None, *, search: bool
+) -> Registration | None:
+    """Register what both cameras saw; None where a view is no image, or has too little surface.
+
+    Raises
+    ------
+    RegistrationError
+        If two range images are of different scale.
+    """
+    first, second = _as_image(source), _as_image(target)
+    if first is None or second is None:
+        return None
+    (data, T_source_camera), (model, T_target_camera) = first, second
+    T_camera_source, T_camera_target = se3.inverse(T_source_camera), se3.inverse(T_target_camera)
+    start = None if guess is None else T_camera_target @ guess @ T_source_camera
+    try:
+        if search or start is None:
+            found = register_pair(data, model, start)
+        else:
+            found = follow(data, model, start)
+    except RegistrationError:
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
-            options = SurfaceOptions()
-            data, model = surface_map(source, options), surface_map(target, options)
-            if self.search or guess is None:
-                found = register_pair(data, model, guess)
-            else:
-                found = follow(data, model, guess)
-            if found is not None:
-                return found
-        if self.search or guess is None:
-            return register_clouds(source, target, guess, rng)
-        return follow_clouds(source, target, guess, rng)
+            raise
+        return None  # as clouds, the unit of one of them may be found to be wrong
+    return None if found is None else found.between(T_target_camera, T_camera_source)
+
+
+def _as_image(view: Frame) -> tuple[SurfaceMap, Float64] | None:
+    """A view as its camera saw it, and T_view_camera (4, 4); None for clouds from no viewpoint."""
+    options = SurfaceOptions()
+    if isinstance(view, RangeFrame):
+        return surface_map(view, options), np.eye(4)
+    viewpoint = viewpoint_of(view)
+    image = None if viewpoint is None else as_image(view, viewpoint)
+    return None if image is None else (surface_map(image[0], options), image[1])

@@ -1,10 +1,9 @@
 """Two clouds that may be far apart: where one lies in the other, and what is believed.
 
 The pose is followed from the guess. Where both clouds then agree so well that it is as good as
-certain, that is the answer. Else poses are proposed by shapes that are alike (`registration.fpfh`),
-and, where both clouds were seen from known points, by a search over their images
-(`registration.view_pair`); each is aligned, and judged by what both clouds say of it
-(`registration.cloud_agreement`) and by its lead over its rivals.
+certain, that is the answer. Else poses are proposed by shapes that are alike (`registration.fpfh`);
+each is aligned, and judged by what both clouds say of it (`registration.cloud_agreement`) and by
+its lead over its rivals.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.base import Registration
@@ -32,8 +30,6 @@ from tofuse.registration.sample_consensus import are_distinct
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
-from tofuse.registration.view_pair import register_pair
-from tofuse.registration.viewpoint import as_image
 
 Float64 = NDArray[np.float64]
 
@@ -131,6 +127,7 @@ def register_clouds(
     target: Frame,
     guess: Float64 | None,
     rng: np.random.Generator,
+    seen: Registration | None = None,
     *,
     always_search: bool = False,
 ) -> Registration:
@@ -140,6 +137,8 @@ def register_clouds(
     ----------
     guess
         (4, 4) T_target_source; the identity is tried first unless given.
+    seen
+        What the images that they were seen as gave, if they were; one more proposal.
     always_search
         Whether to search even if the pose that was followed from the guess is as good as certain.
 
@@ -160,7 +159,7 @@ def register_clouds(
         if found is not None:
             reason = f"the views fit with the source {scale:g} times as large: check its unit"
             return replace(found, believed=False, reason=reason)
-    return _registered(source, target, guess, rng, always_search=always_search)
+    return _registered(source, target, guess, rng, seen, always_search=always_search)
 
 
 def _registered(
@@ -168,6 +167,7 @@ def _registered(
     target: Frame,
     guess: Float64 | None,
     rng: np.random.Generator,
+    seen: Registration | None = None,
     *,
     always_search: bool = False,
 ) -> Registration:
@@ -178,9 +178,6 @@ def _registered(
         found = _registration(views, near)
         if (found.probability or 0.0) >= CERTAIN and not len(found.unobservable):
             return found
-    seen = _searched(views, guess)
-    if seen is not None and seen.believed and not always_search:
-        return seen
     poses = [near] if seen is None else [near, views.judged(seen.T_target_source)]
     poses += _proposed(views, start)
     poses.sort(key=lambda pose: -pose.agreement.score)
@@ -281,25 +278,6 @@ def _polish(size: float) -> tuple[Icp, ...]:
         neighbours=NEIGHBOURS,
     )
     return plain, replace(plain, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
-
-
-def _searched(views: _Views, guess: Float64 | None) -> Registration | None:
-    """Register the images that both clouds came from; None where they can't be made."""
-    there, here = views.there.viewpoint, views.here.viewpoint
-    if there is None or here is None:
-        return None
-    first, second = as_image(views.source, there), as_image(views.target, here)
-    if first is None or second is None:
-        return None
-    (data, T_source_camera), (model, T_target_camera) = first, second
-    T_camera_target = se3.inverse(T_target_camera)
-    options = SurfaceOptions()
-    start = None if guess is None else T_camera_target @ guess @ T_source_camera
-    try:
-        found = register_pair(surface_map(data, options), surface_map(model, options), start)
-    except RegistrationError:
-        return None
-    return None if found is None else found.between(T_target_camera, se3.inverse(T_source_camera))
 
 
 def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Registration:

@@ -38,8 +38,9 @@ _QUARTILES = 1.349  # of a normal distribution, in standard deviations
 _WIDEST, _OUTSIDE = 0.9, 0.01
 # Pixels of an image made of a cloud, in spacings of the points, and along a side at most.
 _PIXEL, _MOST_PIXELS = 1.25, 640
-# Points of one pixel that differ by less than this share are on the same surface.
-_SAME = 0.03
+# Points of one pixel that differ by less than this share are on the same surface; slopes are
+# measured between pixels so many steps to either side.
+_SAME, _BESIDE = 0.03, 2
 # Cells of a sphere in spacings of the points, and at least, rad.
 _CELL, _FINEST = 2.0, 0.006
 _AROUND = np.ones((3, 3), np.uint8)
@@ -215,9 +216,10 @@ def _axes(points: Float64) -> Float64:
 
 
 def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, NDArray[np.intp]]:
-    """(H, W) mean depth of the nearest surface in each pixel, 0 without, and its nearest point."""
+    """(H, W) depth of the nearest surface in each pixel, 0 without, and its nearest point."""
     shape = camera.height, camera.width
-    pixel = np.round(camera.project(points))
+    at_pixel = camera.project(points)
+    pixel = np.round(at_pixel)
     inside = (pixel >= 0).all(1) & (pixel < shape[::-1]).all(1)
     which = np.flatnonzero(inside)
     at = (pixel[which, 1] * camera.width + pixel[which, 0]).astype(np.intp)
@@ -225,13 +227,49 @@ def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, NDArray[np.int
     order = np.lexsort((z, at))
     at, z, which = at[order], z[order], which[order]
     first = np.r_[True, at[1:] != at[:-1]] if len(at) else np.zeros(0, bool)
-    least = np.full(camera.width * camera.height, np.inf)
+    size = camera.width * camera.height
+    least = np.full(size, np.inf)
     least[at[first]] = z[first]
     same = z < (1 + _SAME) * least[at]
-    size = camera.width * camera.height
-    count = np.bincount(at[same], minlength=size)
-    total = np.bincount(at[same], z[same], minlength=size)
+    count = np.maximum(np.bincount(at[same], minlength=size), 1)
+    off = at_pixel[which] - pixel[which]
+    inverse, u, v = (
+        (np.bincount(at[same], value[same], minlength=size) / count).reshape(shape)
+        for value in (1 / z, off[:, 0], off[:, 1])
+    )
     nearest = np.full(size, -1, np.intp)
     nearest[at[first]] = which[first]
-    depth = (total / np.maximum(count, 1)).astype(np.float32)
-    return depth.reshape(shape), nearest.reshape(shape)
+    at_centre = _at_centres(inverse, u, v)
+    depth = np.where(at_centre > 0, 1 / np.where(at_centre > 0, at_centre, 1), 0)
+    return depth.astype(np.float32), nearest.reshape(shape)
+
+
+def _at_centres(inverse: Float64, u: Float64, v: Float64) -> Float64:
+    """Inverse depth (H, W) at the centres of pixels, of points that are off by (u, v) pixels.
+
+    Over a plane it is linear in the image. Its slopes are those between the pixels beside, where
+    these are on the same surface.
+    """
+    out = inverse.copy()
+    for axis, off in ((1, u), (0, v)):
+        before, after = (_shifted(inverse, step, axis) for step in (-_BESIDE, _BESIDE))
+        width = 2 * _BESIDE + _shifted(off, _BESIDE, axis) - _shifted(off, -_BESIDE, axis)
+        near = (1 + _SAME) ** (2 * _BESIDE)
+        same = (np.minimum(before, after) > inverse / near) & (
+            np.maximum(before, after) < inverse * near
+        )
+        out -= np.where(same, off * (after - before) / width, 0)
+    return out
+
+
+def _shifted(image: Float64, step: int, axis: int) -> Float64:
+    """The pixels so many steps further along an axis, 0 beyond the border."""
+    out = np.zeros_like(image)
+    here, there = (slice(None, -step), slice(step, None)) if step > 0 else (
+        slice(-step, None), slice(None, step),
+    )  # fmt: skip
+    index = [slice(None), slice(None)]
+    other = [slice(None), slice(None)]
+    index[axis], other[axis] = here, there
+    out[tuple(index)] = image[tuple(other)]
+    return out
