@@ -14,6 +14,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
+from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
 
 Float64 = NDArray[np.float64]
@@ -52,6 +53,13 @@ class AnyPair(Registrar):
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
             options = SurfaceOptions()
             data, model = surface_map(source, options), surface_map(target, options)
+            if not comparable(data.depth, model.depth):
+                raise RegistrationError(
+                    f"has a median depth of {data.depth:.2g} m, and frame {target.index} of "
+                    f"{model.depth:.2g} m: views of so different a scale can't be compared",
+                    where=f"frame {source.index}",
+                    remedy="check the unit of depth",
+                )
             if self.search or guess is None:
                 found = register_pair(data, model, guess)
             else:

@@ -295,10 +295,7 @@ def _searched(views: _Views, guess: Float64 | None) -> Registration | None:
     T_camera_target = se3.inverse(T_target_camera)
     options = SurfaceOptions()
     start = None if guess is None else T_camera_target @ guess @ T_source_camera
-    try:
-        found = register_pair(surface_map(data, options), surface_map(model, options), start)
-    except RegistrationError:
-        return None
+    found = register_pair(surface_map(data, options), surface_map(model, options), start)
     return None if found is None else found.between(T_target_camera, se3.inverse(T_source_camera))
 
 
@@ -332,4 +329,5 @@ def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Reg
         overlap=said.overlap,
         support=said.support,
         contradiction=said.contradiction,
+        violation=said.violation,
     )
