@@ -285,3 +285,21 @@ def test_prepared_views_of_different_scale_are_not_compared(pair):
     target = surface(pair[1])
     assert register_pair(small, target) is None
     assert follow(small, target, np.eye(4)) is None
+
+
+def test_a_search_and_an_alignment_that_agree_need_nothing_else(pair):
+    target = surface(pair[1])
+    near, far = (
+        register_pair(surface(seen(A @ se3.exp(xi), 8)), target, always_search=True)
+        for xi in ([0.05, 0, 0, 0, 0.08, 0], [0.3, 0, 0.3, 0, 0.75, 0])
+    )
+    assert near.confirmed
+    assert near.margin is not None
+    assert not far.confirmed
+    for confirmed, probability, alone in (
+        (True, 0.6, True),
+        (False, 0.6, False),
+        (True, 0.4, False),
+    ):
+        made = replace(near, believed=False, confirmed=confirmed, probability=probability)
+        assert made.stands_alone == alone

@@ -76,7 +76,7 @@ class Relocalizer:
         found = self._probable(view, keyframe)
         if found is None:
             return None
-        certain = adjacent or bool(found.believed)
+        certain = adjacent or found.stands_alone
         return Link(keyframe.view.index, view.index, found, certain, found.how)
 
     def agrees(self, view: SurfaceMap, keyframe: Keyframe, T: Float64) -> bool | None:

@@ -36,12 +36,7 @@ from tofuse.registration.confidence import CONTRADICTION
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.verification import (
-    IN_SIGHT,
-    PATIENT,
-    UsualFit,
-    self_scaled,
-)
+from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
 from tofuse.registration.view_pair import follow, register_pair
 
 Float32 = NDArray[np.float32]
@@ -690,7 +685,7 @@ def _link(first: View, second: View, found: Registration | None) -> Link | None:
     """A registration of two views as a link, if it is probable."""
     if found is None or not found.is_probable:
         return None
-    return Link(first.index, second.index, found, bool(found.believed), found.how)
+    return Link(first.index, second.index, found, found.stands_alone, found.how)
 
 
 def _moved(T: Mapping[int, Float64], T_other: Float64) -> dict[int, Float64]:

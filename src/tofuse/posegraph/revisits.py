@@ -309,7 +309,7 @@ class _RevisitLoops(Loops):
         believed = {}
         for (i, j), made in found.items():
             alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
-            if alone and not made.believed:
+            if alone and not made.stands_alone:
                 refused[i, j] += f"; by a search {made.reason}, and no other loop agrees"
                 continue
             how = made.how if alone else f"{made.how}; another loop agrees"

@@ -65,6 +65,8 @@ class Registration:
         that land on a surface.
     violation
         Share of the points that lie in the other view's free space.
+    confirmed
+        Whether the pose that a search found is also where an alignment from the guess ends.
     """
 
     T_target_source: Float64
@@ -86,6 +88,7 @@ class Registration:
     support: float | None = None
     contradiction: float | None = None
     violation: float | None = None
+    confirmed: bool = False
 
     @property
     def share(self) -> float:
@@ -96,6 +99,14 @@ class Registration:
     def is_probable(self) -> bool:
         """Whether the pose is more probable than not."""
         return self.probability is not None and self.probability >= PROBABLE
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether no other measurement needs to say the same.
+
+        It is believed, or a search and an alignment agree on a pose that is probable.
+        """
+        return bool(self.believed) or (self.is_probable and self.confirmed)
 
     @property
     def how(self) -> str:

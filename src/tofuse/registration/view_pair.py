@@ -119,12 +119,13 @@ def register_pair(
         return None
     rough = with_rough_planes(source), with_rough_planes(target)
     best = pair.settled(match, rough)
+    confirmed = near is not None and not near.degenerate and pair.same(near, best)
     if guess is not None and near is not None:
         best = pair.nearer(near, best, rough)
     rival = pair.rival(best, match)
     lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
     evidence = Evidence.of(best.agreement, lead, best.degenerate)
-    return pair.registration(best, evidence, rival)
+    return replace(pair.registration(best, evidence, rival), confirmed=confirmed)
 
 
 def follow(
@@ -220,6 +221,10 @@ class _Pair:
         across = se3.exp((gap - weak.T @ (weak @ gap)) * UNITS)
         same = not self.options.differ(np.eye(4), across)
         return near if near.degenerate and same else best
+
+    def same(self, a: _Pose, b: _Pose) -> bool:
+        """Whether two poses are one answer."""
+        return not self.options.differ(a.T_target_source, b.T_target_source)
 
     def rival(self, pose: _Pose, match: Match) -> Candidate | None:
         """The best pose of a search that is not this one."""
