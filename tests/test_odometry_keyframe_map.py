@@ -146,15 +146,24 @@ def test_searches_are_few_at_first_and_more_with_the_frames(around, monkeypatch)
     keyframes, _ = around
     asked = counted(monkeypatch)
     budgeted, lost = relocalizer(), surface(seen(at(0, 0.3, 0.7), 7))
-    for _ in range(100):
-        budgeted.links(lost, keyframes, 9)
+    for k in range(100):
+        budgeted.links(replace(lost, index=7 + k), keyframes, 9)
     at_first = len(asked)
     assert 0 < at_first <= 60
-    for _ in range(1000):
+    for k in range(1000):
         budgeted.count_frame()
-        budgeted.links(lost, keyframes, 9)
+        budgeted.links(replace(lost, index=107 + k), keyframes, 9)
     # A search costs as much as tracking some tens of frames.
     assert 10 <= len(asked) - at_first <= 50
+
+
+def test_a_pair_is_searched_once_for_each_view(around, monkeypatch) -> None:
+    keyframes, _ = around
+    asked = counted(monkeypatch)
+    budgeted, lost = relocalizer(), surface(seen(at(0, 0.3, 0.7), 7))
+    for _ in range(3):
+        budgeted.links(lost, keyframes, 9)
+    assert len(asked) == len(set(asked)) > 0
 
 
 def test_the_newest_and_the_likest_keyframe_are_searched(around, monkeypatch) -> None:
