@@ -37,8 +37,7 @@ from tofuse.pipeline.progress import Stopwatch
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.search import search
-from tofuse.registration.verification import Belief
+from tofuse.registration.search import SearchOptions, search
 from tofuse.results.types import Reconstruction
 
 
@@ -145,7 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         mapped(frames, 30)
         ends = [surface_map(frames[k], Keyframes().surface) for k in (0, -1)]
-        search(ends[0], ends[1], Belief().search)
+        search(ends[0], ends[1], SearchOptions(mode="both"))
         for count in options.frames:
             result, watch = mapped(frames, count)
             print(row(result, watch), flush=True)

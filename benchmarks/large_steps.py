@@ -36,8 +36,8 @@ from tofuse.registration.agreement import agreement
 from tofuse.registration.features import Features
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.plane_sets import PlaneSets
-from tofuse.registration.search import SearchOptions, search
-from tofuse.registration.verification import Belief
+from tofuse.registration.search import SearchOptions
+from tofuse.registration.view_pair import register_pair
 
 Float64 = NDArray[np.float64]
 
@@ -89,8 +89,7 @@ class Outcome:
     """Of one pair: does the best pose agree with the reference, and what was said of it."""
 
     right: bool
-    score: float
-    margin: float
+    probability: float
     believed: bool
     seconds: float
 
@@ -127,15 +126,14 @@ def look(
     """Search for one pair on one core."""
     with threads(1):
         start = time.process_time()
-        found = search(source, target, options)
+        found = register_pair(source, target, options=options, always_search=True)
         seconds = time.process_time() - start
     if found is None:
-        return Outcome(False, 0.0, 0.0, False, seconds)
+        return Outcome(False, 0.0, False, seconds)
     right = False
     if true is not None:
         right = is_right(found.T_target_source, true)
-    believed = not Belief().objection(found, alone=False)
-    return Outcome(right, found.score, found.margin, believed, seconds)
+    return Outcome(right, found.probability or 0.0, bool(found.believed), seconds)
 
 
 def neighbours(taken: Views, options: SearchOptions) -> list[Outcome]:
@@ -173,10 +171,10 @@ def decoys(all_taken: list[Views], options: SearchOptions, most: int) -> list[Ou
     return outcomes
 
 
-def roc_area(right: list[Outcome], wrong: list[Outcome], of: Callable[[Outcome], float]) -> float:
-    """Share of pairs of a right and a wrong answer that a figure ranks rightly."""
-    a = np.array([of(outcome) for outcome in right])[:, None]
-    b = np.array([of(outcome) for outcome in wrong])[None]
+def roc_area(right: list[Outcome], wrong: list[Outcome]) -> float:
+    """Share of pairs of a right and a wrong answer that the probability ranks rightly."""
+    a = np.array([outcome.probability for outcome in right])[:, None]
+    b = np.array([outcome.probability for outcome in wrong])[None]
     return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")
 
 
@@ -202,9 +200,9 @@ Method = Callable[[RangeFrame, RangeFrame], Float64 | None]
 def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
     """The pose that the exhaustive search finds, if it is believed."""
     options = SurfaceOptions()
-    found = search(surface_map(source, options), surface_map(target, options))
-    believed = found is not None and not Belief().objection(found, alone=False)
-    return found.T_target_source if found is not None and believed else None
+    views = surface_map(source, options), surface_map(target, options)
+    found = register_pair(*views, options=SearchOptions(), always_search=True)
+    return found.T_target_source if found is not None and found.believed else None
 
 
 def by_part(part: Features | Fpfh | PlaneSets) -> Method:
@@ -323,17 +321,7 @@ def print_search(names: list[str], data: Path, modes: list[str], most: int) -> N
         right = [o for o in outcomes if o.right]
         wrong = [o for o in outcomes if not o.right] + nothing
         print(f"\n{len(right)} right answers, {len(wrong)} wrong ones; ROC area:", end=" ")
-        print(f"score {roc_area(right, wrong, lambda o: o.score):.3f},", end=" ")
-        print(f"margin {roc_area(right, wrong, lambda o: o.margin):.3f}\n")
-        print("| Margin at least | right kept, score 0.2 | wrong kept | 0.3 | | 0.4 | |")
-        print("|---|---|---|---|---|---|---|")
-        for margin in (0.0, 0.01, 0.02, 0.03, 0.05, 0.1):
-            cells = []
-            for score in (0.2, 0.3, 0.4):
-                for group in (right, wrong):
-                    kept = sum(o.score >= score and o.margin >= margin for o in group)
-                    cells.append(f"{kept / max(len(group), 1):.0%}")
-            print(f"| {margin} | {' | '.join(cells)} |")
+        print(f"probability {roc_area(right, wrong):.3f}")
 
 
 if __name__ == "__main__":

@@ -326,6 +326,13 @@ def samples(most: int, data: Path) -> tuple[Samples, Samples]:
             source, target = (v[int(rng.integers(len(v)))] for v in (maps, other))
             _add(searched, followed, source, target, None, number, rng)
         print(f"{name}: {len(searched)} searched, {len(followed)} followed so far", flush=True)
+    # Joining and loops ask for views anywhere in one scene: its rooms and walls look alike.
+    rng = np.random.default_rng([5, 1])
+    for number, name in enumerate(FITTED):
+        maps, T = views[name]
+        for _ in range(3 * most):
+            i, j = rng.choice(len(maps), 2, replace=False)
+            _add(searched, followed, maps[j], maps[i], se3.inverse(T[i]) @ T[j], number, rng)
     return stacked(searched), stacked(followed)
 
 
@@ -420,8 +427,10 @@ def main(arguments: list[str] | None = None) -> None:
         print_table(given.scenes, given.data, given.pairs)
         return
     searched, followed = samples(given.pairs, given.data)
-    print_fit("Searched: constant, root of margin, support, contradiction, degenerate", searched)
-    print_fit("Followed from a guess: constant, support, contradiction", followed)
+    print_fit(
+        "Searched: constant, root of margin, support, root of contradiction, degenerate", searched
+    )
+    print_fit("Followed from a guess: constant, support, root of contradiction", followed)
 
 
 if __name__ == "__main__":

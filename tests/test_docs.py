@@ -347,7 +347,7 @@ def test_stated_defaults_are_those_of_the_parts() -> None:
 def test_stated_defaults_are_those_of_keyframes() -> None:
     tracker = registered_parts()["odometry"]["keyframes"]()
     numbers: dict[str, float] = {}
-    for field in ("uncertainty", "belief", "alignment", "surface"):
+    for field in ("uncertainty", "search", "alignment", "surface"):
         numbers |= numbers_of(getattr(tracker, field))
     stated = dict(stated_defaults(sections("docs/methods.md")["How `keyframes` works"]))
     checked = numbers.keys() & stated.keys()

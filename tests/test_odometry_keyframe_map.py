@@ -12,7 +12,8 @@ from tofuse.geometry import se3
 from tofuse.odometry import keyframe_map, relocalization
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.relocalization import Relocalizer
-from tofuse.registration.verification import Belief, UsualFit
+from tofuse.registration.search import SearchOptions
+from tofuse.registration.verification import UsualFit
 
 VIEW = surface(seen(at(0, 0.3, 0), 0))
 
@@ -126,58 +127,71 @@ def test_the_one_that_looks_most_alike_is_found(around) -> None:
 # The budget of searches
 
 
+def relocalizer():
+    return Relocalizer(SearchOptions(mode="both"), UsualFit())
+
+
 def counted(monkeypatch):
     """Searches that find nothing; the frames that were asked for."""
     asked = []
 
-    def search(view, target, options):
+    def registered(view, target, **_):
         asked.append((view.index, target.index))
 
-    monkeypatch.setattr(relocalization, "search", search)
+    monkeypatch.setattr(relocalization, "register_pair", registered)
     return asked
 
 
 def test_searches_are_few_at_first_and_more_with_the_frames(around, monkeypatch) -> None:
     keyframes, _ = around
     asked = counted(monkeypatch)
-    relocalizer, lost = Relocalizer(Belief()), surface(seen(at(0, 0.3, 0.7), 7))
-    for _ in range(100):
-        relocalizer.links(lost, keyframes, 9, UsualFit())
+    budgeted, lost = relocalizer(), surface(seen(at(0, 0.3, 0.7), 7))
+    for k in range(100):
+        budgeted.links(replace(lost, index=7 + k), keyframes, 9)
     at_first = len(asked)
     assert 0 < at_first <= 60
-    for _ in range(1000):
-        relocalizer.count_frame()
-        relocalizer.links(lost, keyframes, 9, UsualFit())
+    for k in range(1000):
+        budgeted.count_frame()
+        budgeted.links(replace(lost, index=107 + k), keyframes, 9)
     # A search costs as much as tracking some tens of frames.
     assert 10 <= len(asked) - at_first <= 50
+
+
+def test_a_pair_is_searched_once_for_each_view(around, monkeypatch) -> None:
+    keyframes, _ = around
+    asked = counted(monkeypatch)
+    budgeted, lost = relocalizer(), surface(seen(at(0, 0.3, 0.7), 7))
+    for _ in range(3):
+        budgeted.links(lost, keyframes, 9)
+    assert len(asked) == len(set(asked)) > 0
 
 
 def test_the_newest_and_the_likest_keyframe_are_searched(around, monkeypatch) -> None:
     keyframes, _ = around
     asked = counted(monkeypatch)
     lost = surface(seen(at(0, 0.3, 0.72), 7))
-    assert Relocalizer(Belief()).links(lost, keyframes, 2, UsualFit(), 5) == ()
+    assert relocalizer().links(lost, keyframes, 2, 5) == ()
     assert asked == [(7, 5), (7, 1)]
     # Not in its own component, and each once.
     asked.clear()
-    Relocalizer(Belief()).links(lost, keyframes, 1, UsualFit())
+    relocalizer().links(lost, keyframes, 1)
     assert [j for _, j in asked] == [1]
     asked.clear()
     last = surface(seen(at(0, 0.3, 3.52), 7))
-    Relocalizer(Belief()).links(last, keyframes, 2, UsualFit())
+    relocalizer().links(last, keyframes, 2)
     assert [j for _, j in asked] == [5]
 
 
-def test_without_belief_nothing_is_searched(around, monkeypatch) -> None:
+def test_without_options_nothing_is_searched(around, monkeypatch) -> None:
     asked = counted(monkeypatch)
-    assert Relocalizer(None).links(VIEW, around[0], 9, UsualFit()) == ()
+    assert Relocalizer(None, UsualFit()).links(VIEW, around[0], 9) == ()
     assert asked == []
 
 
 def test_a_lost_view_is_linked_where_it_is(around) -> None:
     keyframes, poses = around
     T = poses[1] @ se3.exp([0.05, 0, 0, 0, 0.1, 0])
-    links = Relocalizer(Belief()).links(surface(seen(T, 7)), keyframes, 9, UsualFit())
+    links = relocalizer().links(surface(seen(T, 7)), keyframes, 9)
     link = links[-1]
     assert link.certain
     assert (link.i, link.j) == (1, 7)
@@ -187,5 +201,5 @@ def test_a_lost_view_is_linked_where_it_is(around) -> None:
 
 def test_a_view_of_another_scene_is_linked_to_nothing_for_certain(around) -> None:
     frame = seen(at(0.1, 0, 2.0), 7, boxes=OTHER, half=(2.3, 1.2, 2.2), scene=9)
-    links = Relocalizer(Belief()).links(surface(frame), around[0], 9, UsualFit())
+    links = relocalizer().links(surface(frame), around[0], 9)
     assert not any(link.certain for link in links)

@@ -20,10 +20,9 @@ from tofuse.pipeline.progress import Silent
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.joining import Joining
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.verification import Belief
 
 DEFAULT = from_method("default")
-QUICK = Belief(search=SearchOptions("full", full_candidates=15, photo_candidates=5))
+QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
 # Coarse and quick: it is about poses.
 CONFIG = replace(
     DEFAULT,
@@ -31,7 +30,7 @@ CONFIG = replace(
     model_filters=(),
     fusion=Fusion(voxel_m=0.05),
     loops=replace(DEFAULT.loops, searches=0, appearance=Appearance(most=0)),
-    odometry=replace(DEFAULT.odometry, belief=QUICK),
+    odometry=replace(DEFAULT.odometry, search=QUICK),
     joining=Joining(QUICK, searches=2, searches_per_frame=0.0),
 )
 STRANGE = {"boxes": OTHER, "half": (2.3, 1.2, 2.2), "scene": 9}

@@ -10,10 +10,9 @@ import pytest
 from tofuse.pipeline.backend import BackEnd
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.joining import Join
-from tofuse.registration.agreement import Agreement
-from tofuse.registration.verification import Link
+from tofuse.registration.base import Link, Registration
 
-SEEN = Agreement(0.5, 0.5, 0.0, 0.0, 0.01, 100, 0.5)
+FOUND = Registration(np.eye(4), True, 5, 100, 100, 0.1, 0.01, np.eye(6))
 # Frames 0 to 8, three in each component.
 POSED = [
     SimpleNamespace(record=SimpleNamespace(index=k), step=SimpleNamespace(component=k // 3))
@@ -22,7 +21,7 @@ POSED = [
 
 
 def join(i, j, how="links", needed=True):
-    return Join(Link(i, j, np.eye(4), np.eye(6), SEEN, 0.2, True, "made"), how, needed)
+    return Join(Link(i, j, FOUND, True, "made"), how, needed)
 
 
 def loop(i, j, accepted=True):

@@ -17,11 +17,10 @@ from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.verification import Belief
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
 ALL = Spacing(angle=0, distance=0)
-QUICK = Belief(search=SearchOptions("full", full_candidates=15, photo_candidates=5))
+QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
 # Boxes (centre, half size, turned about y by rad) in a room of 5 x 2.4 x 4 m, y down.
 BOXES = [
     ((1.3, 0.9, 1.2), (0.3, 0.5, 0.25), 0.3),
@@ -90,7 +89,7 @@ def drifted(truth, degrees):
 
 def found_in(views, poses, sigma=0.0, **options):
     store = ViewStore(ALL)
-    loops = Revisits(spacing=ALL, belief=QUICK, **options).start(0, (), store)
+    loops = Revisits(spacing=ALL, search=QUICK, **options).start(0, (), store)
     frame = room(0.0, 0)
     for view, T in zip(views, poses, strict=True):
         store.push(view, T)

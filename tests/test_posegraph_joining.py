@@ -13,8 +13,8 @@ from tofuse.kernels.threads import threads
 from tofuse.posegraph import joining
 from tofuse.posegraph.joining import Joining, Stretch
 from tofuse.posegraph.views import PosedView
-from tofuse.registration.agreement import agreement
-from tofuse.registration.verification import Belief, Link, UsualFit, aligned_link, searched_link
+from tofuse.registration.base import Link, Registration
+from tofuse.registration.view_pair import follow, register_pair
 
 RATE = 10.0
 SPARSELY = Joining(searches=2, searches_per_frame=0, bridge=False)
@@ -45,9 +45,8 @@ def linked(first, second, certain=True, off=None):
 
 
 def link_of(a, b, T, certain=True):
-    said = replace(agreement(b.view, a.view, T), support=0.5)
-    margin = 0.3 if certain else None
-    return Link(a.index, b.index, T, np.diag([1e4] * 6), said, margin, certain, "made")
+    found = Registration(T, True, 5, 100, 100, 0.1, 0.01, np.diag([1e4] * 6), support=0.5)
+    return Link(a.index, b.index, found, certain, "made")
 
 
 @pytest.fixture(scope="module")
@@ -329,9 +328,13 @@ def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
     """As relocalization on the way finds them."""
     monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
     a, b, c = three
-    searched, _ = searched_link(b.views[0].view, a.views[-1].view, Belief(), UsualFit())
-    aligned = aligned_link(c.views[0].view, b.views[-1].view, np.eye(4), UsualFit())
-    (group,) = SPARSELY.join(three, [searched, aligned])
+    ends = [(a.views[-1].view, b.views[0].view), (b.views[-1].view, c.views[0].view)]
+    made = [register_pair(*reversed(ends[0])), follow(*reversed(ends[1]), np.eye(4))]
+    links = [
+        Link(target.index, source.index, found, bool(found.believed), found.how)
+        for (target, source), found in zip(ends, made, strict=True)
+    ]
+    (group,) = SPARSELY.join(three, links)
     assert_joined(group, three)
 
 

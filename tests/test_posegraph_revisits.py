@@ -14,8 +14,8 @@ from tofuse.posegraph import revisits
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing, ViewStore
-from tofuse.registration.agreement import Agreement
-from tofuse.registration.search import Candidate, Match
+from tofuse.registration.base import Registration
+from tofuse.registration.confidence import BELIEVED
 from tofuse.registration.verification import Assessment
 
 ALL = Spacing(angle=0, distance=0)
@@ -117,41 +117,41 @@ def test_what_a_person_gives_counts(turn):
     assert by_pair[0, 99].record.reason == "frame 99 has no pose"
 
 
-def match(T, lead, score=0.6):
-    agreement = Agreement(
-        overlap=0.8, support=score, violation=0.0, clash=0.0, rms_m=0.003, points=2000, score=score
-    )
-    rival = replace(agreement, score=score - lead, support=score - lead)
-    far = T @ se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
-    return Match((Candidate(T, agreement), Candidate(far, rival)), "full")
+def registered(T, probability):
+    believed = probability >= BELIEVED
+    reason = "" if believed else "another pose fits nearly as well"
+    return Registration(
+        T, True, 9, 1800, 2000, 0.1, 0.003, 1e4 * np.eye(6), margin=0.1,
+        believed=believed, probability=probability, reason=reason,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("leads", "wrong", "accepted"),
+    ("probable", "wrong", "accepted"),
     [
-        ((0.3, 0.3), (), 2),  # each leads clearly
-        ((0.05, 0.05), (), 2),  # both say the same
-        ((0.05, 0.05), (1,), 0),  # each says something else
-        ((0.05, 0.3), (0,), 1),  # only the clear one counts
-        ((0.01, 0.01), (), 0),  # hardly any lead at all
+        ((0.99, 0.99), (), 2),  # each is believed
+        ((0.7, 0.7), (), 2),  # both say the same
+        ((0.7, 0.7), (1,), 0),  # each says something else
+        ((0.7, 0.99), (0,), 1),  # only the one that is believed counts
+        ((0.3, 0.3), (), 0),  # hardly probable at all
     ],
 )
-def test_searched_loops_lead_clearly_or_agree(turn, monkeypatch, leads, wrong, accepted):
+def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong, accepted):
     frames, truth, start = turn
     options = Revisits(spacing=ALL, per_view=3)
     asked = []
 
-    def scripted(source, target, _options):
+    def scripted(source, target, **_):
         k = len(asked)
         asked.append((target.index, source.index))
-        if k >= len(leads):
+        if k >= len(probable):
             return None
         T = se3.inverse(truth[target.index]) @ truth[source.index]
         if k in wrong:
             T = T @ se3.exp(np.array([0.5, 0, 0, 0, 0, 0]))
-        return match(T, leads[k])
+        return registered(T, probable[k])
 
-    monkeypatch.setattr(revisits, "search", scripted)
+    monkeypatch.setattr(revisits, "register_pair", scripted)
     # Nothing fits from the drifted pose, so all is left to the search.
     monkeypatch.setattr(
         revisits.UsualFit, "assess", lambda *_: Assessment(False, np.inf, "does not fit")

@@ -20,7 +20,6 @@ from tofuse.registration.agreement import AgreementOptions, agreement
 from tofuse.registration.floor import FloorOptions, find_floor, find_floors
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import SearchOptions, search
-from tofuse.registration.verification import Belief
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate_recording
 
@@ -415,7 +414,7 @@ def test_views_of_different_places_have_little_in_common(pair):
     elsewhere = view(camera(0.0, 0.2, 0.9), boxes=other)
     found = search(elsewhere, pair[1], SearchOptions(mode="both"))
     assert found.score < 0.8 * agreement(*pair, TRUE).score
-    assert Belief().objection(found, alone=True)
+    assert found.margin < 0.1
 
 
 def test_the_answer_does_not_depend_on_the_number_of_threads(pair):

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 
 import tofuse
-from made_rooms import BOXES, CAMERA, OTHER, at, seen
+from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import Agreement
+from tofuse.registration.base import PROBABLE
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.confidence import BELIEVED, Evidence
-from tofuse.registration.verification import Belief
+from tofuse.registration.projective import ProjectiveOptions, Target, align
+from tofuse.registration.verification import UsualFit
+from tofuse.registration.view_pair import follow, register_pair
 
 # 40 degrees and 0.5 m apart.
 A, B = at(-0.4, 0.3, 0.1), at(-0.1, 0.7, 0.8)
@@ -207,7 +210,6 @@ def test_the_probability_follows_the_evidence():
         Evidence.of(said(0.2, 0.0), 0.3),
         Evidence.of(said(0.5, 0.2), 0.3),
         Evidence.of(said(0.5, 0.0), 0.02),
-        Evidence.of(said(0.5, 0.0), 0.3, 1),
     ):
         assert worse.probability < good.probability
     assert (
@@ -218,7 +220,86 @@ def test_the_probability_follows_the_evidence():
 
 
 def test_the_reason_names_what_speaks_against_it():
-    words = Evidence.of(said(0.1, 0.2), 0.01, 2).objection(Belief())
+    words = Evidence.of(said(0.1, 0.2), 0.01, 2).objection()
     for part in ("only 10% of the points", "another pose", "20% of the overlap", "2 directions"):
         assert part in words
-    assert Evidence.of(said(0.6, 0.0), 0.3).objection(Belief()) == ""
+    assert Evidence.of(said(0.6, 0.0), 0.3).objection() == ""
+
+
+def test_what_is_usual_for_the_camera_decides_how_views_must_fit(pair):
+    """The same view, but a box stands in front of the camera."""
+    box = ((0.0, 0.2, 1.05), (0.35, 0.4, 0.1), 0.0)
+    target, near = surface(pair[1]), A @ se3.exp([0.02, 0, 0, 0, 0.02, 0])
+    plain, blocked = (surface(seen(near, 8, boxes=b)) for b in (BOXES, (*BOXES, box)))
+    usual = UsualFit()
+    for _ in range(20):
+        aligned = align(target, [Target(plain, np.eye(4))], np.eye(4), ProjectiveOptions())
+        usual.learn(aligned, target.depth)
+    assert follow(plain, target, np.eye(4), usual=usual) is not None
+    assert follow(blocked, target, np.eye(4), usual=usual) is None
+
+
+def test_an_alignment_is_followed_if_it_holds_both_ways(pair):
+    true = se3.exp([0.08, 0, 0.05, 0, 0.1, 0])
+    target, source = surface(pair[1]), surface(seen(A @ true, 8))
+    found = follow(source, target, np.eye(4))
+    assert found.margin is None  # nothing was compared with it
+    assert error(found.T_target_source, true)[0] < 0.01
+    back = follow(target, source, np.eye(4))
+    assert error(back.T_target_source, se3.inverse(true))[0] < 0.01
+    # From far off nothing is found, rather than something wrong.
+    off = follow(source, target, se3.exp([0.5, 0.2, 0.6, 0.2, 1.2, 0]))
+    assert off is None or error(off.T_target_source, true)[0] < 0.02
+
+
+def test_a_clear_lead_outweighs_degenerate_directions():
+    """Poses along them would fit as well."""
+    for margin in (0.02, 0.05):
+        held, loose = (Evidence(0.6, 0.0, margin, k).probability for k in (0, 1))
+        assert loose < held
+    assert Evidence(0.6, 0.0, 0.2, 1).probability == Evidence(0.6, 0.0, 0.2).probability
+
+
+def test_a_square_room_without_furniture_is_not_believed():
+    """Each corner is like the next: two poses fit as well."""
+    bare = {"boxes": (), "spots": 0, "half": (1.8, 1.1, 1.8)}
+    views = [surface(seen(at(0, 0, yaw), k, **bare)) for k, yaw in enumerate((0.0, np.pi / 4))]
+    found = register_pair(views[1], views[0])
+    assert not found.believed
+    assert "another pose" in found.reason
+
+
+def test_the_largest_overlap_along_a_wall_is_no_evidence():
+    """Any place along it fits; the one where the views cover each other has the most points."""
+    views = []
+    for k, x in enumerate((0.0, 0.2)):
+        frame = seen(at(x, 1.0, 0.0, pitch=0.0), k, boxes=(), spots=0)
+        views.append(surface(replace(frame, amplitude_image=None)))
+    found = register_pair(views[1], views[0])
+    assert found.probability < PROBABLE
+    assert "degenerate" in found.reason
+
+
+def test_prepared_views_of_different_scale_are_not_compared(pair):
+    small = surface(replace(pair[0], depth=pair[0].depth * np.float32(0.1)))
+    target = surface(pair[1])
+    assert register_pair(small, target) is None
+    assert follow(small, target, np.eye(4)) is None
+
+
+def test_a_search_and_an_alignment_that_agree_need_nothing_else(pair):
+    target = surface(pair[1])
+    near, far = (
+        register_pair(surface(seen(A @ se3.exp(xi), 8)), target, always_search=True)
+        for xi in ([0.05, 0, 0, 0, 0.08, 0], [0.3, 0, 0.3, 0, 0.75, 0])
+    )
+    assert near.confirmed
+    assert near.margin is not None
+    assert not far.confirmed
+    for confirmed, probability, alone in (
+        (True, 0.6, True),
+        (False, 0.6, False),
+        (True, 0.4, False),
+    ):
+        made = replace(near, believed=False, confirmed=confirmed, probability=probability)
+        assert made.stands_alone == alone

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.motion import Moment
 from tofuse.recordings.frames import Frame
-from tofuse.registration.base import Registration
-from tofuse.registration.verification import Link
+from tofuse.registration.base import Link, Registration
 
 Float64 = NDArray[np.float64]
 

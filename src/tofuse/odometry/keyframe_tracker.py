@@ -19,10 +19,10 @@ from tofuse.odometry.relocalization import Relocalizer
 from tofuse.odometry.rivals import Rivals
 from tofuse.odometry.segmentation import NOTICED, Segmentation
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.registration.base import Registration
+from tofuse.registration.base import Link, Registration
 from tofuse.registration.projective import registration_of
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import Link, UsualFit, comparable
+from tofuse.registration.verification import UsualFit, comparable
 
 Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -34,8 +34,9 @@ class KeyframeTracker(Tracker):
     def __init__(self, options: Keyframes) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
-        self._relocalizer = Relocalizer(options.belief if options.searches else None)
         self._usual = UsualFit(options.unusual)
+        search = options.search if options.searches else None
+        self._relocalizer = Relocalizer(search, self._usual)
         self._motion = Motion()
         self._segmentation = Segmentation(self._relocalizer)
         self._rivals = Rivals(self._usual, self._motion, self._segmentation, self._relocalizer)
@@ -142,9 +143,7 @@ class KeyframeTracker(Tracker):
         self._component += 1
         last = None if self._last is None else self._last.view.index
         adjacent = last if self._in_sequence else None
-        links = self._relocalizer.links(
-            view, self._keyframes, self._component, self._usual, adjacent
-        )
+        links = self._relocalizer.links(view, self._keyframes, self._component, adjacent)
         self._connected = any(link.certain for link in links)
         self._keyframes.add(Keyframe(view, np.eye(4), self._component))
         if self._in_sequence:  # the camera still moves as it did
@@ -179,7 +178,7 @@ class KeyframeTracker(Tracker):
         # Where the last keyframe fits no longer, this one takes over; unless it is at fault itself.
         if (keyframe is self._last and not doubtful) or self._keyframes.is_far(T, keyframe):
             if not self._connected:
-                links = self._relocalizer.links(view, self._keyframes, self._component, self._usual)
+                links = self._relocalizer.links(view, self._keyframes, self._component)
                 self._connected = any(link.certain for link in links)
             self._keyframes.add(Keyframe(view, T, self._component, doubtful))
         mask = None

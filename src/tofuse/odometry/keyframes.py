@@ -9,8 +9,8 @@ from tofuse.maps.surface_map import SurfaceOptions
 from tofuse.odometry.base import Odometry, Tracker
 from tofuse.parts import part
 from tofuse.registration.projective import ProjectiveOptions
+from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import UncertaintyOptions
-from tofuse.registration.verification import Belief
 
 Guess = Literal["identity", "previous", "odometry"]
 
@@ -36,8 +36,8 @@ class Keyframes(Odometry):
         How the covariance of an alignment is estimated.
     unusual
         A statistic of an alignment is unusual so many standard deviations above its median.
-    belief
-        What is believed of an exhaustive search for a lost frame.
+    search
+        How far and how finely a lost frame is searched for.
     searches
         Whether lost frames are searched for while frames arrive.
     guess
@@ -53,7 +53,7 @@ class Keyframes(Odometry):
     alignment: ProjectiveOptions = ProjectiveOptions()  # noqa: RUF009 - immutable
     uncertainty: UncertaintyOptions = UncertaintyOptions()  # noqa: RUF009 - immutable
     unusual: float = 3.0
-    belief: Belief = Belief()  # noqa: RUF009 - immutable
+    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     searches: bool = True
     guess: Guess = "previous"
     keyframe_angle: float = 0.2

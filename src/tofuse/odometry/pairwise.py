@@ -15,12 +15,10 @@ from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.odometry.sequential import SEED_STAGE
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
-from tofuse.registration.agreement import Agreement
 from tofuse.registration.any_pair import AnyPair
-from tofuse.registration.base import Registration
+from tofuse.registration.base import PROBABLE, Link, Registration
 from tofuse.registration.confidence import CERTAIN
 from tofuse.registration.reduce import extent
-from tofuse.registration.verification import Link
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -59,7 +57,7 @@ class Pairwise(Odometry):
     registration: AnyPair = field(default_factory=AnyPair)
     references: int = 6
     minimum_points: int = 10
-    probable: float = 0.5
+    probable: float = PROBABLE
 
     def __post_init__(self) -> None:
         for name in ("references", "minimum_points"):
@@ -216,18 +214,4 @@ class _Registered:
 
     def link(self, frame: Frame) -> Link:
         made = self.registration
-        overlap, support = made.overlap or 0.0, made.support or 0.0
-        violation = overlap * (made.contradiction or 0.0)
-        said = Agreement(
-            overlap, support, violation, 0.0, made.rms_m, made.points, support - violation
-        )
-        return Link(
-            self.to.frame.index,
-            frame.index,
-            made.T_target_source,
-            made.information,
-            said,
-            made.margin,
-            True,
-            "registered as clouds",
-        )
+        return Link(self.to.frame.index, frame.index, made, self.believed, made.how)

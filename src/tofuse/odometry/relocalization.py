@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
-from tofuse.registration.search import Match, search
-from tofuse.registration.verification import Belief, Link, UsualFit, comparable, link_of
+from tofuse.registration.base import Link, Registration
+from tofuse.registration.search import SearchOptions
+from tofuse.registration.verification import UsualFit, comparable
+from tofuse.registration.view_pair import register_pair
 
 Float64 = NDArray[np.float64]
 
@@ -26,14 +26,17 @@ class Relocalizer:
 
     Parameters
     ----------
-    belief
-        What is believed of a search; None never searches.
+    search
+        How far and how finely is searched; None never searches.
+    usual
+        How views of this camera usually fit.
     """
 
-    def __init__(self, belief: Belief | None) -> None:
-        self._belief = belief
+    def __init__(self, search: SearchOptions | None, usual: UsualFit) -> None:
+        self._search, self._usual = search, usual
         self._left = float(_FREE)
-        self._last: tuple[tuple[int, int], Match | None] | None = None  # what was searched last
+        # Registrations of the last view, as several of its explanations ask for the same pair.
+        self._known: dict[tuple[int, int], Registration | None] = {}
 
     def count_frame(self) -> None:
         """Say that a frame was processed, which adds to the budget."""
@@ -44,7 +47,6 @@ class Relocalizer:
         view: SurfaceMap,
         keyframes: KeyframeMap,
         component: int,
-        usual: UsualFit,
         last: int | None = None,
     ) -> tuple[Link, ...]:
         """Register a view of a component to keyframes of others; stops at a link that is certain.
@@ -59,49 +61,43 @@ class Relocalizer:
             candidates.append(alike)
         found = []
         for keyframe in candidates:
-            link = self.link(view, keyframe, usual, adjacent=keyframe.view.index == last)
+            link = self.link(view, keyframe, adjacent=keyframe.view.index == last)
             if link is not None:
                 found.append(link)
                 if link.certain:
                     break
         return tuple(found)
 
-    def link(
-        self, view: SurfaceMap, keyframe: Keyframe, usual: UsualFit, *, adjacent: bool
-    ) -> Link | None:
-        """Register a view to a keyframe, if the budget allows."""
-        match = self._match(view, keyframe)
-        if match is None or self._belief is None:
-            return None
-        return link_of(match, view, keyframe.view, self._belief, usual, adjacent=adjacent)[0]
+    def link(self, view: SurfaceMap, keyframe: Keyframe, *, adjacent: bool) -> Link | None:
+        """Register a view to a keyframe, if the budget allows and the pose is probable.
 
-    def confirms(self, view: SurfaceMap, keyframe: Keyframe, T_keyframe_camera: Float64) -> bool:
-        """Whether a search finds the pose (4, 4) that an alignment found.
-
-        Two methods that agree need not lead by any margin, but both images must support the pose.
+        Views that are adjacent in time see the same place, so that a probable pose is certain.
         """
-        match = self._match(view, keyframe)
-        if match is None or self._belief is None:
-            return False
-        if replace(self._belief, margin=0.0).objection(match, alone=False):
-            return False
-        return not self._belief.search.differ(match.T_target_source, T_keyframe_camera)
-
-    def contradicts(self, view: SurfaceMap, keyframe: Keyframe, T_keyframe_camera: Float64) -> bool:
-        """Whether a search finds another pose than the (4, 4) of an alignment."""
-        match = self._match(view, keyframe)
-        if match is None or self._belief is None or self._belief.objection(match, alone=False):
-            return False
-        return self._belief.search.differ(match.T_target_source, T_keyframe_camera)
-
-    def _match(self, view: SurfaceMap, keyframe: Keyframe) -> Match | None:
-        """Search a view in a keyframe, if the budget allows; the same pair is searched once."""
-        pair = view.index, keyframe.view.index
-        if self._last is not None and self._last[0] == pair:
-            return self._last[1]
-        known = comparable(view.depth, keyframe.depth)
-        if self._belief is None or self._left < 1 or not known:
+        found = self._probable(view, keyframe)
+        if found is None:
             return None
-        self._left -= 1
-        self._last = pair, search(view, keyframe.view, self._belief.search)
-        return self._last[1]
+        certain = adjacent or found.stands_alone
+        return Link(keyframe.view.index, view.index, found, certain, found.how)
+
+    def agrees(self, view: SurfaceMap, keyframe: Keyframe, T: Float64) -> bool | None:
+        """Whether a registration without a guess finds T_keyframe_camera; None if it finds none."""
+        found = self._probable(view, keyframe)
+        if found is None or self._search is None:
+            return None
+        return not self._search.differ(found.T_target_source, T)
+
+    def _probable(self, view: SurfaceMap, keyframe: Keyframe) -> Registration | None:
+        """Register a view to a keyframe, if the budget allows; the same pair once."""
+        pair = view.index, keyframe.view.index
+        if pair not in self._known:
+            if self._search is None or self._left < 1 or not comparable(view.depth, keyframe.depth):
+                return None
+            self._left -= 1
+            # Even where an alignment seems certain: a box looks alike from its other side.
+            found = register_pair(
+                view, keyframe.view, usual=self._usual, options=self._search, always_search=True
+            )
+            self._known = {p: r for p, r in self._known.items() if p[0] == view.index}
+            self._known[pair] = found
+        found = self._known[pair]
+        return found if found is not None and found.is_probable else None

@@ -100,7 +100,7 @@ class Rivals:
     def _searched(self, attempts: Attempts, now: Moment) -> Attempt | None:
         """A quick motion that nothing predicted, of which a search is certain."""
         for r in attempts.references:
-            link = self._relocalizer.link(attempts.view, r.keyframe, self._usual, adjacent=False)
+            link = self._relocalizer.link(attempts.view, r.keyframe, adjacent=False)
             if link is None or not link.certain:
                 continue
             T = r.keyframe.T_component_camera @ link.T_i_j
@@ -150,7 +150,7 @@ class Rivals:
         if not attempt.aligned.converged or len(attempt.aligned.unobservable):
             return False
         k, T = attempt.keyframe, attempt.T_keyframe_camera
-        return self._agreement(attempt) > 0 and self._relocalizer.confirms(attempt.view, k, T)
+        return self._agreement(attempt) > 0 and bool(self._relocalizer.agrees(attempt.view, k, T))
 
 
 def _is_small(attempt: Attempt, attempts: Attempts) -> bool:

@@ -67,9 +67,9 @@ class Segmentation:
                 if not moving.reliable or moving.fraction <= NOTICED:
                     continue
                 again = _again(T, k, moving, attempts, predicted=predicted)
-                if self._moved or not self._relocalizer.contradicts(
-                    attempts.whole, k, again.T_keyframe_camera
-                ):
+                T_keyframe_camera = again.T_keyframe_camera
+                agrees = self._relocalizer.agrees
+                if self._moved or agrees(attempts.whole, k, T_keyframe_camera) is not False:
                     found.append(again)
             attempts.segmented[attempt] = tuple(found)
         return attempts.segmented[attempt]

@@ -361,7 +361,7 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
         link = join.link
         if join.needed or {(link.i, link.j), (link.j, link.i)} & known:
             continue
-        seen = link.agreement
+        seen = link.registration
         record = LoopRecord(
             link.i,
             link.j,
@@ -370,7 +370,7 @@ def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[Close
             overlap=seen.overlap,
             rms_m=seen.rms_m if np.isfinite(seen.rms_m) else None,
             free_space_violation=seen.violation,
-            margin=link.margin,
+            margin=seen.margin,
         )
         more.append(ClosedLoop(record, link.T_i_j, link.information))
     return [*loops, *more]

@@ -16,7 +16,7 @@ from tofuse.posegraph.joining import Stretch
 from tofuse.posegraph.outside import Sensed
 from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
-from tofuse.registration.verification import Link
+from tofuse.registration.base import Link
 from tofuse.results.types import FrameRecord
 
 Float64 = NDArray[np.float64]

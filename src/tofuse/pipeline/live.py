@@ -17,7 +17,7 @@ from tofuse.odometry.base import Step
 from tofuse.pipeline.frame_log import FrameLog
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, Loops
-from tofuse.registration.verification import Link
+from tofuse.registration.base import Link
 
 Float64 = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -31,18 +31,13 @@ from tofuse.posegraph.cut_edges import cut_edges, sides_without
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.posegraph.views import PosedView
 from tofuse.registration.agreement import Agreement, agreement
+from tofuse.registration.base import Link, Registration
+from tofuse.registration.confidence import CONTRADICTION
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.projective import ProjectiveOptions, Target, align
-from tofuse.registration.verification import (
-    IN_SIGHT,
-    PATIENT,
-    Belief,
-    Link,
-    UsualFit,
-    aligned_link,
-    searched_link,
-    self_scaled,
-)
+from tofuse.registration.search import SearchOptions
+from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
+from tofuse.registration.view_pair import follow, register_pair
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -72,8 +67,6 @@ _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
 _RIVAL = 0.5
 # View pairs that are tried between the same two components.
 _TRIES = 4
-# How many alignments from the identity are tried for each component, beside the searches.
-_ALIGNMENTS = 6
 _SHIFT = 0.35
 _NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
 
@@ -162,8 +155,8 @@ class Joining:
 
     Attributes
     ----------
-    belief
-        What is believed of an exhaustive search.
+    search
+        How far and how finely views are searched.
     searches, searches_per_frame
         How many searches are made at most: so many, plus one for each component, plus this for
         each frame.
@@ -171,7 +164,7 @@ class Joining:
         Whether short gaps may be bridged by motion alone.
     """
 
-    belief: Belief = Belief()  # noqa: RUF009 - immutable
+    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     searches: int = 12
     searches_per_frame: float = 0.02
     bridge: bool = True
@@ -194,7 +187,9 @@ class Joining:
             only = stretches[0]
             return [Group({only.component: np.eye(4)}, (), len(only.frames))]
         joiner = _Joiner(self, stretches)
-        for link in sorted(links, key=lambda link: (not link.certain, -(link.margin or 0.0))):
+        for link in sorted(
+            links, key=lambda link: (not link.certain, -(link.registration.probability or 0.0))
+        ):
             joiner.add(link)
         joiner.decide()
         joiner.look_for_more()
@@ -230,9 +225,8 @@ class _Joiner:
         self._paths: dict[tuple[int, ...], dict[int, float]] = {}
         total = sum(len(s.frames) for s in stretches)
         self._searches = options.searches + len(stretches) + int(options.searches_per_frame * total)
-        self._alignments = _ALIGNMENTS * len(stretches)
         self._usual = UsualFit()
-        self._contradiction = options.belief.contradiction
+        self._contradiction = CONTRADICTION
         steps = [_speeds(s, end=True) for s in stretches]
         known = np.concatenate(steps)
         # (2,) m and rad by the unit of time that the camera hardly exceeds.
@@ -420,14 +414,13 @@ class _Joiner:
             self._contradiction = max(self._contradiction, min(limit, _MAX_CONTRADICTION))
 
     def _registered(self, first: View, second: View) -> Link | None:
-        """Register two views that look alike: from the identity if that does, else by a search."""
-        if self._alignments > 0:
-            self._alignments -= 1
-            link = aligned_link(second.view, first.view, np.eye(4), self._usual)
-            if link is not None:
-                return link
-        self._searches -= 1
-        return searched_link(second.view, first.view, self._options.belief, self._usual)[0]
+        """Register two views that look alike; what needs no search does not count as one."""
+        found = register_pair(
+            second.view, first.view, usual=self._usual, options=self._options.search
+        )
+        if found is None or found.margin is not None:
+            self._searches -= 1
+        return _link(first, second, found)
 
     def _island_of(self, component: int) -> _Island:
         return next(island for island in self._islands if component in island.T)
@@ -486,7 +479,7 @@ class _Joiner:
         drift = _DRIFT * (self._path(a, i).get(k, np.inf) + self._path(b, j).get(m, np.inf))
         at = self._T_island(b, j)
         between = se3.inverse(T @ at) @ other @ at
-        search, depth = self._options.belief.search, self._depth_of(j)
+        search, depth = self._options.search, self._depth_of(j)
         return bool(
             np.linalg.norm(between[:3, 3]) <= search.distinct_m + drift * depth
             and se3.angle(between) <= search.distinct_rad + drift
@@ -660,9 +653,13 @@ class _Joiner:
         for first, second, T, _ in self._overlapping(a, b, T_a_b)[:4]:
             if frozenset((first.index, second.index)) in seen:
                 continue
-            link = aligned_link(second.view, first.view, T, self._usual)
-            if link is not None and not self._options.belief.search.differ(link.T_i_j, T):
-                found.append(link)
+            # Along degenerate directions an alignment stays where it began: that confirms nothing.
+            made = follow(second.view, first.view, T, usual=self._usual)
+            link = _link(first, second, made)
+            if link is None or len(link.registration.unobservable):
+                continue
+            if not self._options.search.differ(link.T_i_j, T):
+                found.append(replace(link, certain=False))
         return found
 
     def _reachable(self, a: _Island, b: _Island, T_a_b: Float64) -> bool:
@@ -682,6 +679,13 @@ class _Joiner:
                 ):
                     return False
         return True
+
+
+def _link(first: View, second: View, found: Registration | None) -> Link | None:
+    """A registration of two views as a link, if it is probable."""
+    if found is None or not found.is_probable:
+        return None
+    return Link(first.index, second.index, found, found.stands_alone, found.how)
 
 
 def _moved(T: Mapping[int, Float64], T_other: Float64) -> dict[int, Float64]:
@@ -713,7 +717,7 @@ def _key(a: _Island, b: _Island, between: Sequence[Link]) -> tuple[int, ...]:
 
 def _weight(link: Link) -> float:
     """A certain link counts for two that are not."""
-    return (2.0 if link.certain else 1.0) * (0.5 + link.agreement.support)
+    return (2.0 if link.certain else 1.0) * (0.5 + (link.registration.support or 0.0))
 
 
 def _speeds(stretch: Stretch, *, end: bool) -> Float64:
@@ -766,14 +770,11 @@ def _bridged(before: Stretch, after: Stretch) -> Link | None:
         return None
     T = moved(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
     sigma = np.maximum(sigma, 0.1 * limit)
-    nothing = Agreement(0.0, 0.0, 0.0, 0.0, np.inf, 0, 0.0)
+    made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
     return Link(
         int(before.frames[-1]),
         int(after.frames[0]),
-        T,
-        np.diag(1 / sigma**2),
-        nothing,
-        None,
-        False,
-        "bridged by the motion before and after the gap",
+        made,
+        certain=False,
+        how="bridged by the motion before and after the gap",
     )

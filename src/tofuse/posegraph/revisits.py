@@ -29,9 +29,10 @@ from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, over
 from tofuse.recordings.frames import Frame
 from tofuse.registration.likeness import look_of
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
-from tofuse.registration.search import Match, search
+from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import Belief, UsualFit, both_ways_agree
+from tofuse.registration.verification import UsualFit, both_ways_agree
+from tofuse.registration.view_pair import register_pair
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -49,8 +50,6 @@ _TOO_FAR = "looks alike, but the trajectory can't have drifted so far"
 _LEAST_OVERLAP = 0.3
 # Pairs of neighbouring views from which is learnt how views of this camera fit.
 _LEARN = 40
-# A search leaves errors of about this size, m and rad.
-_AFTER_SEARCH = 0.03
 
 
 @part("loops", "revisits")
@@ -87,8 +86,8 @@ class Revisits(LoopDetector):
     searches
         At most so many of the candidates that did not fit are searched, those of the largest
         overlap.
-    belief
-        How, and what is believed of what is found.
+    search
+        How far and how finely.
     same_m, same_rad
         How far apart two loops may put a camera that say the same.
     appearance
@@ -108,7 +107,7 @@ class Revisits(LoopDetector):
     both_ways_rad: float = 0.03
     weak: int = 2
     searches: int = 6
-    belief: Belief = Belief()  # noqa: RUF009 - immutable
+    search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     same_m: float = 0.15
     same_rad: float = 0.1
     appearance: Appearance = Appearance()  # noqa: RUF009 - immutable
@@ -290,38 +289,47 @@ class _RevisitLoops(Loops):
 
         Returns what is found and believed, and of the others why not.
         """
-        belief = self._options.belief
         found, margins = {}, {}
         refused = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
         for i, j in pairs:
-            match = search(surfaces[j], surfaces[i], belief.search)
-            objection = "there are too few surfaces to search with"
-            if match is not None:
-                margins[i, j] = match.margin
-                objection = belief.objection(match, alone=False)
-            if match is None or objection:
-                refused[i, j] += f"; by exhaustive search {objection}"
+            made = register_pair(
+                surfaces[j], surfaces[i], usual=self._usual, options=self._options.search
+            )
+            if made is None:
+                refused[i, j] += "; there are too few surfaces to search with"
+                continue
+            margins[i, j] = made.margin
+            if not made.is_probable:
+                refused[i, j] += f"; by a search {made.reason}"
                 continue
             if (i, j) in alike and not self._plausible(
-                surfaces[i], surfaces[j], match.T_target_source
+                surfaces[i], surfaces[j], made.T_target_source
             ):
                 refused[i, j] = _TOO_FAR
                 continue
-            found[i, j] = match
+            found[i, j] = made
         said = {pair: loop.T_i_j for pair, loop in closed.items() if loop.T_i_j is not None}
-        said |= {pair: match.T_target_source for pair, match in found.items()}
+        said |= {pair: made.T_target_source for pair, made in found.items()}
         believed = {}
-        for (i, j), match in found.items():
+        for (i, j), made in found.items():
             alone = not any(self._same(i, j, said[i, j], *p, T) for p, T in said.items())
-            doubt = belief.objection(match, alone=True)
-            if alone and doubt:
-                refused[i, j] += f"; by exhaustive search {doubt}, and no other loop agrees"
+            if alone and not made.stands_alone:
+                refused[i, j] += f"; by a search {made.reason}, and no other loop agrees"
                 continue
-            lead = f"found by exhaustive search, margin {match.margin:.0%}"
-            how = lead if alone else f"{lead}; another loop agrees"
+            how = made.how if alone else f"{made.how}; another loop agrees"
             if (i, j) in alike:
                 how = f"looks alike, {how}"
-            believed[i, j] = self._measured(surfaces[i], surfaces[j], match, how)
+            record = LoopRecord(
+                i,
+                j,
+                True,
+                how,
+                overlap=made.overlap,
+                rms_m=made.rms_m if np.isfinite(made.rms_m) else None,
+                free_space_violation=made.violation,
+                margin=made.margin,
+            )
+            believed[i, j] = ClosedLoop(record, made.T_target_source, made.information)
         no = {}
         for p in pairs:
             record = LoopRecord(*p, False, "") if p in alike else closed[p].record
@@ -355,29 +363,6 @@ class _RevisitLoops(Loops):
             np.linalg.norm(away[:3, 3]) < self._options.same_m
             and se3.angle(away) < self._options.same_rad
         )
-
-    def _measured(
-        self, target: SurfaceMap, source: SurfaceMap, match: Match, how: str
-    ) -> ClosedLoop:
-        options = replace(
-            self._options.alignment,
-            levels=self._options.near,
-            prior_m=_AFTER_SEARCH,
-            prior_rad=_AFTER_SEARCH,
-        )
-        there = align(source, [Target(target, np.eye(4))], match.T_target_source, options)
-        record = LoopRecord(
-            target.index,
-            source.index,
-            True,
-            how,
-            overlap=match.agreement.overlap,
-            rms_m=match.agreement.rms_m,
-            free_space_violation=match.agreement.violation,
-            margin=match.margin,
-        )
-        C = covariance(source, [Target(target, np.eye(4))], there, options)
-        return ClosedLoop(record, there.T_world_source, np.asarray(np.linalg.inv(C), np.float64))
 
     def _decided(
         self, target: SurfaceMap, source: SurfaceMap, there: Aligned, objection: str

@@ -15,6 +15,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
+from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.registration.viewpoint import as_image, viewpoint_of
 
@@ -78,15 +79,19 @@ def _registered_as_images(
     (data, T_source_camera), (model, T_target_camera) = first, second
     T_camera_source, T_camera_target = se3.inverse(T_source_camera), se3.inverse(T_target_camera)
     start = None if guess is None else T_camera_target @ guess @ T_source_camera
-    try:
-        if search or start is None:
-            found = register_pair(data, model, start)
-        else:
-            found = follow(data, model, start)
-    except RegistrationError:
+    if not comparable(data.depth, model.depth):
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
-            raise
+            raise RegistrationError(
+                f"has a median depth of {data.depth:.2g} m, and frame {target.index} of "
+                f"{model.depth:.2g} m: views of so different a scale can't be compared",
+                where=f"frame {source.index}",
+                remedy="check the unit of depth",
+            )
         return None  # as clouds, the unit of one of them may be found to be wrong
+    if search or start is None:
+        found = register_pair(data, model, start)
+    else:
+        found = follow(data, model, start)
     return None if found is None else found.between(T_target_camera, T_camera_source)
 
 

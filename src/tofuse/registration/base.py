@@ -13,6 +13,9 @@ from tofuse.recordings.frames import Frame
 
 Float64 = NDArray[np.float64]
 
+# Of a pose that is more probable than not other evidence may say that it is right.
+PROBABLE = 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -60,6 +63,10 @@ class Registration:
     contradiction
         Points that lie in the other view's free space, or reflect otherwise, as a share of those
         that land on a surface.
+    violation
+        Share of the points that lie in the other view's free space.
+    confirmed
+        Whether the pose that a search found is also where an alignment from the guess ends.
     """
 
     T_target_source: Float64
@@ -80,11 +87,33 @@ class Registration:
     overlap: float | None = None
     support: float | None = None
     contradiction: float | None = None
+    violation: float | None = None
+    confirmed: bool = False
 
     @property
     def share(self) -> float:
         """Corresponding points as a share of the source's points, 0 to 1."""
         return self.correspondences / self.points if self.points else 0.0
+
+    @property
+    def is_probable(self) -> bool:
+        """Whether the pose is more probable than not."""
+        return self.probability is not None and self.probability >= PROBABLE
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether no other measurement needs to say the same.
+
+        It is believed, or a search and an alignment agree on a pose that is probable.
+        """
+        return bool(self.believed) or (self.is_probable and self.confirmed)
+
+    @property
+    def how(self) -> str:
+        """How the pose was found, in words."""
+        if self.margin is None:
+            return "followed from a guess"
+        return f"found by a search, margin {max(self.margin, 0.0):.0%}"
 
     def between(self, T_a_target: Float64, T_source_b: Float64) -> Registration:
         """The same between other frames (4, 4): of source b in target a.
@@ -107,6 +136,39 @@ class Registration:
             unobservable=free / np.maximum(lengths, 1e-12),
             runner_up=None if other is None else T_a_target @ other @ T_source_b,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A registration of two views that nothing else connects.
+
+    Attributes
+    ----------
+    i, j
+        Frame indices of target and source.
+    registration
+        Of source and target.
+    certain
+        Whether it is believed by itself. Else it needs other links that say the same.
+    how
+        How it was found, in words.
+    """
+
+    i: int
+    j: int
+    registration: Registration
+    certain: bool
+    how: str
+
+    @property
+    def T_i_j(self) -> Float64:
+        """(4, 4)."""
+        return self.registration.T_target_source
+
+    @property
+    def information(self) -> Float64:
+        """(6, 6) of the right perturbation."""
+        return self.registration.information
 
 
 class Registrar(Protocol):

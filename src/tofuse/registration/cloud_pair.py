@@ -310,4 +310,5 @@ def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Reg
         overlap=said.overlap,
         support=said.support,
         contradiction=said.contradiction,
+        violation=said.violation,
     )

@@ -1,27 +1,23 @@
-"""Whether an alignment is right: by how views of this camera usually fit, and by its rivals.
+"""Whether an alignment fits as views of this camera usually do.
 
 How well two images fit at the right pose depends on the camera: of a smoothing phone 92 % of the
 compared pixels are inliers, of a stereo camera two thirds. So no fixed limit decides. `UsualFit`
 learns the distribution of a few statistics from the alignments that were accepted, beginning with a
-wide prior. What deviates from it by more than `Unusual.sigmas` is not refused, but doubted: it then
-has to beat its rivals. What was found without a prediction is verified by both images
-(`registration.agreement`), and by its lead over the other poses that an exhaustive search found.
+wide prior. What deviates from it by more than `UsualFit.sigmas` is not refused, but doubted: it
+then has to beat its rivals.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
-from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
-from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
-from tofuse.registration.search import Match, SearchOptions, search
-from tofuse.registration.uncertainty import UncertaintyOptions, covariance
+from tofuse.registration.agreement import AgreementOptions
+from tofuse.registration.projective import Aligned, Level
 
 Float64 = NDArray[np.float64]
 
@@ -173,220 +169,6 @@ def _in_words(k: int, found: float, usual: float) -> str:
     return f"{_NAMES[k]} {np.exp(found - usual):.1f} times as large as usual"
 
 
-@dataclass(frozen=True)
-class Belief:
-    """What is believed of a pose that an exhaustive search found.
-
-    Attributes
-    ----------
-    support, clear_support
-        Least fraction of both views' points that support the pose; the second where it leads by
-        `clear_margin`.
-    score
-        Least score: the same fraction, by how alike they reflect, less those that contradict it.
-    margin, clear_margin
-        Least lead in score over the best other pose: where other evidence agrees, and by itself.
-        Fractions of the points.
-    contradiction
-        Largest fraction of what lands on a surface that lies in the other view's free space, or
-        reflects otherwise.
-    search
-        How far and how finely is searched.
-    """
-
-    support: float = 0.25
-    clear_support: float = 0.15
-    score: float = 0.1
-    margin: float = 0.025
-    clear_margin: float = 0.1
-    contradiction: float = 0.08
-    search: SearchOptions = field(default_factory=lambda: SearchOptions(mode="both"))
-
-    def __post_init__(self) -> None:
-        for name in ("support", "clear_support", "score", "margin", "clear_margin"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 1")
-        if not 0 <= self.contradiction <= 1:
-            raise ValueError(f"contradiction is {self.contradiction}, not 0 to 1")
-
-    def objection(self, match: Match, *, alone: bool) -> str:
-        """Why the best pose of a search is not believed; empty if it is.
-
-        Parameters
-        ----------
-        alone
-            Whether nothing else speaks for the pose: it must then lead by `clear_margin`.
-        """
-        found, margin = match.agreement, match.margin
-        clear = margin >= self.clear_margin
-        if found.support < self.clear_support:
-            return f"no pose has the support of {self.clear_support:.0%} of the points"
-        if match.score < self.score:
-            return "the best pose is contradicted by albedo or free space"
-        if margin < (self.clear_margin if alone else self.margin):
-            return f"the best pose leads its runner-up by {max(margin, 0):.1%} of the points only"
-        if found.support < self.support and not clear:
-            return f"the best pose has the support of {found.support:.0%} of the points only"
-        if found.contradiction > self.contradiction:
-            return f"{found.contradiction:.0%} of the overlap contradicts the best pose"
-        return ""
-
-
-@dataclass(frozen=True, eq=False)
-class Link:
-    """A registration of two views that may be far apart.
-
-    Attributes
-    ----------
-    i, j
-        Frame indices of target and source.
-    T_i_j
-        (4, 4).
-    information
-        (6, 6) of the right perturbation.
-    agreement
-        What both images say of it.
-    margin
-        Lead over the runner-up, as a fraction of the points; None where no search was made.
-    certain
-        Whether it is believed by itself. Else it needs other links that say the same.
-    how
-        In words.
-    """
-
-    i: int
-    j: int
-    T_i_j: Float64
-    information: Float64
-    agreement: Agreement
-    margin: float | None
-    certain: bool
-    how: str
-
-
-_ALIGNMENT = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
-# A search leaves errors of about this size, m and rad.
-_AFTER_SEARCH = replace(_ALIGNMENT, prior_m=0.03, prior_rad=0.03)
-
-
-def searched_link(
-    source: SurfaceMap,
-    target: SurfaceMap,
-    belief: Belief,
-    usual: UsualFit,
-    *,
-    adjacent: bool = False,
-) -> tuple[Link | None, str]:
-    """Register two views by an exhaustive search.
-
-    A pose that leads clearly is certain. So is one that leads by less where other evidence agrees:
-    the views are adjacent in time, or an alignment from the identity ends there.
-
-    Returns
-    -------
-    The link, certain or not, and why it is not believed, if so. Without a link where the search
-    finds no pose that is worth keeping.
-    """
-    if not comparable(source.depth, target.depth):
-        return None, "the views are of different scale"
-    match = search(source, target, belief.search)
-    if match is None:
-        return None, "there are too few surfaces to search with"
-    return link_of(match, source, target, belief, usual, adjacent=adjacent)
-
-
-def link_of(
-    match: Match,
-    source: SurfaceMap,
-    target: SurfaceMap,
-    belief: Belief,
-    usual: UsualFit,
-    *,
-    adjacent: bool = False,
-) -> tuple[Link | None, str]:
-    """The link that a search of `source` in `target` gives; see `searched_link`."""
-    objection = belief.objection(match, alone=False)
-    if objection:
-        return None, objection
-    at = [Target(target, np.eye(4))]
-    aligned = align(source, at, match.T_target_source, _AFTER_SEARCH)
-    T = aligned.T_world_source
-    doubt = "" if adjacent else belief.objection(match, alone=True)
-    if doubt and len(aligned.unobservable):
-        # All poses along it fit, and the one with most overlap leads: that is no evidence.
-        return None, f"{len(aligned.unobservable)} directions are degenerate, and {doubt}"
-    if doubt:
-        near = aligned_link(source, target, np.eye(4), usual)
-        if near is not None and not belief.search.differ(near.T_i_j, T):
-            doubt = ""
-    C = covariance(source, at, aligned, _AFTER_SEARCH, UncertaintyOptions())
-    how = f"found by exhaustive search, margin {match.margin:.0%}"
-    return (
-        Link(
-            target.index,
-            source.index,
-            T,
-            np.asarray(np.linalg.inv(C), np.float64),
-            match.agreement,
-            match.margin,
-            not doubt,
-            how,
-        ),
-        doubt,
-    )
-
-
-def aligned_link(
-    source: SurfaceMap,
-    target: SurfaceMap,
-    T_guess: Float64,
-    usual: UsualFit,
-    tolerance: tuple[float, float] = (0.03, 0.03),
-) -> Link | None:
-    """Register two views from a guess, both ways; None where they don't fit as usual.
-
-    The link is not certain: nothing was compared with it.
-
-    Parameters
-    ----------
-    T_guess
-        (4, 4) T_target_source.
-    tolerance
-        How far apart both ways may end, as a fraction of the depth and in rad.
-    """
-    if not comparable(source.depth, target.depth):
-        return None
-    at = [Target(target, np.eye(4))]
-    coarse = align(source, at, T_guess, replace(_ALIGNMENT, levels=COARSE))
-    there = align(source, at, coarse.T_world_source, _ALIGNMENT, usual_scale=usual.noise_scale)
-    if not there.converged or len(there.unobservable) or not usual.assess(there).usual:
-        return None
-    T = there.T_world_source
-    back = align(
-        target, [Target(source, np.eye(4))], se3.inverse(T), _ALIGNMENT,
-        usual_scale=usual.noise_scale,
-    )  # fmt: skip
-    far_m, far_rad = tolerance
-    if not usual.assess(back).usual or not both_ways_agree(
-        T, back.T_world_source, far_m * source.depth, far_rad
-    ):
-        return None
-    found = agreement(source, target, T, self_scaled(usual))
-    if found.score <= 0:
-        return None
-    C = covariance(source, at, there, _ALIGNMENT, UncertaintyOptions())
-    return Link(
-        target.index,
-        source.index,
-        T,
-        np.asarray(np.linalg.inv(C), np.float64),
-        found,
-        None,
-        False,
-        "aligned both ways",
-    )
-
-
 def both_ways_agree(
     T_target_source: Float64, T_source_target: Float64, metres: float, radians: float
 ) -> bool:
@@ -395,9 +177,9 @@ def both_ways_agree(
     return bool(np.linalg.norm(gap[:3, 3]) <= metres and se3.angle(gap) <= radians)
 
 
-def self_scaled(usual: UsualFit) -> AgreementOptions:
+def self_scaled(usual: UsualFit, plain: AgreementOptions | None = None) -> AgreementOptions:
     """How images of this camera are compared: distances that it usually errs by are no conflict."""
-    plain = AgreementOptions()
+    plain = plain or AgreementOptions()
     return replace(
         plain,
         floor_share=max(plain.floor_share, _NO_CONFLICT * usual.rms_share),

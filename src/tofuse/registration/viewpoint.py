@@ -39,8 +39,8 @@ _WIDEST, _OUTSIDE = 0.9, 0.01
 # Pixels of an image made of a cloud, in spacings of the points, and along a side at most.
 _PIXEL, _MOST_PIXELS = 1.25, 640
 # Points of one pixel that differ by less than this share are on the same surface; slopes are
-# measured between pixels so many steps to either side.
-_SAME, _BESIDE = 0.03, 2
+# measured between pixels so many steps to either side, in so many rounds.
+_SAME, _BESIDE, _ROUNDS = 0.03, 2, 3
 # Cells of a sphere in spacings of the points, and at least, rad.
 _CELL, _FINEST = 2.0, 0.006
 _AROUND = np.ones((3, 3), np.uint8)
@@ -248,17 +248,18 @@ def _at_centres(inverse: Float64, u: Float64, v: Float64) -> Float64:
     """Inverse depth (H, W) at the centres of pixels, of points that are off by (u, v) pixels.
 
     Over a plane it is linear in the image. Its slopes are those between the pixels beside, where
-    these are on the same surface.
+    these are on the same surface; each round measures them again where the last one left them.
     """
-    out = inverse.copy()
-    for axis, off in ((1, u), (0, v)):
-        before, after = (_shifted(inverse, step, axis) for step in (-_BESIDE, _BESIDE))
-        width = 2 * _BESIDE + _shifted(off, _BESIDE, axis) - _shifted(off, -_BESIDE, axis)
-        near = (1 + _SAME) ** (2 * _BESIDE)
-        same = (np.minimum(before, after) > inverse / near) & (
-            np.maximum(before, after) < inverse * near
-        )
-        out -= np.where(same, off * (after - before) / width, 0)
+    near = (1 + _SAME) ** (2 * _BESIDE)
+    out = inverse
+    for _ in range(_ROUNDS):
+        slopes = []
+        for axis in (1, 0):
+            before, after = (_shifted(out, step, axis) for step in (-_BESIDE, _BESIDE))
+            low, high = np.minimum(before, after), np.maximum(before, after)
+            same = (low > inverse / near) & (high < inverse * near)
+            slopes.append(np.where(same, (after - before) / (2 * _BESIDE), 0))
+        out = inverse - u * slopes[0] - v * slopes[1]
     return out
 
 
