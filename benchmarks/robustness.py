@@ -281,6 +281,25 @@ def summary(rows: Sequence[Row]) -> Iterator[str]:
         )
 
 
+def by_case(rows: Sequence[Row]) -> Iterator[str]:
+    """Give a Markdown table of our own runs, a row for each case."""
+    yield "| case | runs | covered at least 95 % | wrong poses | not marked | wrong joins |"
+    yield "|---|---|---|---|---|---|"
+    own = [row for row in rows if row.method == OURS]
+    for name in dict.fromkeys(row.name for row in own):
+        scores = [row.score for row in own if row.name == name]
+        covered = sum(s.covered >= 0.95 * s.overlapping for s in scores)
+        wrong, unmarked, joins = (
+            f"{sum(counts)} in {sum(n > 0 for n in counts)} runs" if any(counts) else "0"
+            for counts in (
+                [s.wrong for s in scores],
+                [s.unmarked for s in scores],
+                [s.joins for s in scores],
+            )
+        )
+        yield f"| {name} | {len(scores)} | {covered} | {wrong} | {unmarked} | {joins} |"
+
+
 def keep(rows: Sequence[Row], path: Path) -> None:
     """Write the rows as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -332,6 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                         rows.append(row)
                         print(stress_line(row), flush=True)
         _end(rows, options.out / "robustness_stress.json")
+        print("\n".join(by_case(rows)))
 
 
 def _end(rows: Sequence[Row], path: Path) -> None:

@@ -433,6 +433,12 @@ def cases(scene: Scene, seed: int, *, quick: bool = False, containing: str = "")
             made[name] = lambda rng: make(rng, name)
 
     add("as it is", lambda rng, name: as_case(scene.name, name, base()))
+
+    def dark(rng: np.random.Generator, name: str) -> Case:
+        frames = tuple(replace(f, amplitude_image=None) for f in base().frames)
+        return as_case(scene.name, name, replace(base(), frames=frames))
+
+    add("depth without amplitude", dark)
     if camera_model(scene.camera).amplitude_kind == "raw":
         add(
             "amplitude falls off to corners",
