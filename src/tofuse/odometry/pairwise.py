@@ -12,6 +12,7 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Odometry, Step, Tracker
+from tofuse.odometry.motion import Moment, Motion
 from tofuse.odometry.sequential import SEED_STAGE
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
@@ -92,14 +93,15 @@ class _PairwiseTracker(Tracker):
         self._placed: deque[_Placed] = deque(maxlen=options.references)
         self._component = -1
         self._connected = True  # whether links join the component to an earlier one
-        self._motion: Float64 | None = None
+        self._motion = Motion()
+        self._degenerate = False  # whether the last motion was, in some direction
         self._following = replace(options.registration, search=False)
         # Whether what the motion led to was what a search found, in the last few views.
         self._steady: deque[bool] = deque(maxlen=_PROVEN + 1)
 
     def interrupt(self) -> None:
         """See `Tracker.interrupt`."""
-        self._motion = None
+        self._motion.interrupt()
         self._steady.clear()
 
     def push(
@@ -108,7 +110,7 @@ class _PairwiseTracker(Tracker):
         """See `Tracker.push`; raises nothing for frames without points."""
         least = self._options.minimum_points
         if len(frame) < least:
-            self._motion = None
+            self._motion.interrupt()
             return Step("lost", f"{len(frame)} valid points, {least} are needed", None)
         own = [p for p in reversed(self._placed) if p.component == self._component]
         near = self._followed(frame, own[0]) if own else None
@@ -132,8 +134,13 @@ class _PairwiseTracker(Tracker):
         return self._begin(frame, links, doubtful[0] if doubtful else None)
 
     def _followed(self, frame: Frame, last: _Placed) -> _Registered | None:
-        """Register to the last view from where the motion so far leads to."""
-        guess = np.eye(4) if self._motion is None else self._motion
+        """Register to the last view from where the motion so far leads to.
+
+        In a direction that is degenerate for many views, the noise of one motion would add up.
+        """
+        now = _moment(frame)
+        T = self._motion.steadily(now) if self._degenerate else self._motion.expected(now)
+        guess = np.eye(4) if T is None else se3.inverse(last.T_component_view) @ T
         return self._registered(frame, last, guess, self._following)
 
     def _searched(self, frame: Frame, to: _Placed) -> _Registered | None:
@@ -153,7 +160,8 @@ class _PairwiseTracker(Tracker):
         """Take the pose that a registration gives in the present component."""
         to, made = found.to, found.registration
         T = se3.orthonormalise(to.T_component_view @ made.T_target_source)
-        self._motion = se3.inverse(self._placed[-1].T_component_view) @ T
+        self._motion.follow(T, _moment(frame))
+        self._degenerate = len(made.unobservable) > 0
         links = () if self._connected else self._links(frame)
         self._connected |= bool(links)
         self._placed.append(_Placed(frame, T, self._component))
@@ -172,7 +180,8 @@ class _PairwiseTracker(Tracker):
         """Begin a component."""
         self._component += 1
         self._connected = self._component == 0 or bool(links)
-        self._motion = None
+        self._motion.interrupt()
+        self._motion.follow(np.eye(4), _moment(frame))
         self._placed.append(_Placed(frame, np.eye(4), self._component))
         reason = "" if refused is None else f"not connected: {refused.registration.reason}"
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
@@ -182,6 +191,10 @@ class _PairwiseTracker(Tracker):
         others = [p for p in self._placed if p.component != self._component]
         found = self._searched(frame, others[-1]) if others else None
         return (found.link(frame),) if found is not None and found.believed else ()
+
+
+def _moment(frame: Frame) -> Moment:
+    return Moment(frame.index, frame.timestamp)
 
 
 @dataclass(frozen=True, eq=False)
