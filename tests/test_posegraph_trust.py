@@ -142,3 +142,6 @@ def test_the_covariance_between_two_poses_of_a_chain_is_that_of_the_edges_betwee
     far = relative_covariance(se3.inverse(poses[2]) @ poses[6], C[2], C[6])
     assert np.linalg.eigvalsh(far - np.diag(sigmas[5] ** 2)).min() > 0
     assert not relative_covariance(np.eye(4), np.full((6, 6), np.nan), C[3]).any()
+    # An uncertain branch does not make what is beside it negative.
+    branch = relative_covariance(np.eye(4), C[6], C[1])
+    assert np.linalg.eigvalsh(branch).min() > -1e-15

@@ -64,7 +64,8 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
     """Covariance (6, 6) of the motion between two poses of a chain, as a right perturbation of j.
 
     Along a chain of measurements C_j = Ad(T_j_i) C_i Ad(T_j_i)^T + C_i_j; what was measured between
-    the two is left when the first part is taken away.
+    the two is left when the first part is taken away. Where the two are on different branches this
+    may be negative in some direction, which then counts as 0.
 
     Parameters
     ----------
@@ -75,7 +76,10 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
     """
     A = se3.adjoint(se3.inverse(T_i_j))
     C = C_j - A @ C_i @ A.T
-    return C if np.isfinite(C).all() else np.zeros((6, 6))
+    if not np.isfinite(C).all():
+        return np.zeros((6, 6))
+    variances, axes = np.linalg.eigh(C)
+    return np.asarray((axes * np.maximum(variances, 0)) @ axes.T, np.float64)
 
 
 def expected_error(graph: PoseGraph, sigmas: float = 2.0) -> tuple[float, float]:
