@@ -24,7 +24,8 @@ from tofuse.registration.reduce import extent
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-# Searches of which the motion must have foretold the end, of one more.
+# The motion is followed without a search once it has predicted the results of so many of the last
+# searches, of which one more is looked at.
 _PROVEN = 2
 # Poses that differ by this share of the extent are the same.
 _SAME = 0.03

@@ -154,7 +154,7 @@ class BackEnd:
             graph = self.graph(loops)
         sequential = led = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
-        told = told_by(self._config.outside, sensed, self.graph(()))
+        told = told_by(self._config.outside, sensed, tracked)
         graph = with_outside(graph, told)
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any() or told:
@@ -162,7 +162,7 @@ class BackEnd:
             with self._watch.timing("optimisation"):
                 optimisation = self._config.optimiser.optimise(graph)
                 if told and graph.loop.any():  # what loops are to be compared with
-                    alone = with_outside(self.graph(()), told)
+                    alone = with_outside(tracked, told)
                     led = self._config.optimiser.optimise(alone).graph.poses
             loops = _decided(loops, optimisation)
             optimisation = without_left_out(optimisation)

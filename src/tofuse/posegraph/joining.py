@@ -242,6 +242,7 @@ class _Joiner:
         """Take note of a link."""
         if {link.i, link.j} <= self._poses.keys():
             self._links.append(link)
+            self._tried.add((link.i, link.j))
             self._remember_ends(link)
 
     def _remember_ends(self, link: Link) -> None:
@@ -298,20 +299,19 @@ class _Joiner:
         component = np.array([self._component_of[v.index] for v in views])
         i, j = np.nonzero(np.triu(component[:, None] != component))
         order = np.lexsort((j, i, far[i, j]))
-        tried = self._tried | {(link.i, link.j) for link in self._links}
         between: dict[tuple[int, int], int] = {}
         for k in order.tolist():
             if self._searches < 1 or len(self._islands) < 2:
                 return
             first, second = views[i[k]], views[j[k]]
-            if (first.index, second.index) in tried or self._is_joined(first, second):
+            pair = first.index, second.index
+            if pair in self._tried or self._is_joined(first, second):
                 continue
             ends = (int(component[i[k]]), int(component[j[k]]))
             between[ends] = between.get(ends, 0) + 1
             if between[ends] > _TRIES:
                 continue
-            tried.add((first.index, second.index))
-            self._tried.add((first.index, second.index))
+            self._tried.add(pair)
             link = self._registered(first, second)
             if link is not None:
                 self.add(link)

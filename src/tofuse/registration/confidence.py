@@ -35,8 +35,8 @@ _FOLLOWED = np.array([0.55, 7.01, -6.02])
 
 # Those of `CloudEvidence.searched` and `CloudEvidence.followed`, fitted to simulated poses by
 # ``benchmarks/cloud_pairs.py fit``. On scenes and cameras that took no part the area under the ROC
-# curve is 0.96 both, and of 47 and 235 poses that were believed 1 each was wrong; of 228 on those
-# that did, 10 were: rooms of one size behind each other, and slides along bare walls.
+# curve is 0.96 for both, and of 47 and 235 believed poses one each was wrong; of 228 on those that
+# did take part, 10 were: rooms of one size behind each other, and slides along bare walls.
 _CLOUDS_SEARCHED = np.array([-1.47, 4.33, 0.75, -1.03, -3.80, 0.63])
 _CLOUDS_FOLLOWED = np.array([-2.29, 9.96, -2.94, -0.62])
 

@@ -8,6 +8,7 @@ compared like an image.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -54,10 +55,21 @@ class Viewpoint:
     spacing: float
 
 
+# A view is registered to several others, as an image and as a cloud.
+_known: WeakKeyDictionary[Frame, Viewpoint | None] = WeakKeyDictionary()
+
+
 def viewpoint_of(view: Frame) -> Viewpoint | None:
     """Return where a view was seen from, None where nothing shows that it was its origin."""
     if isinstance(view, RangeFrame):
         return Viewpoint(np.zeros(3), _angle_of_pixel(view.camera))
+    if view not in _known:
+        _known[view] = _found(view)
+    return _known[view]
+
+
+def _found(view: CloudFrame) -> Viewpoint | None:
+    """The viewpoint of a cloud, from how its points are spread."""
     origin = np.asarray(view.origin, np.float64)
     points = view.points[:: max(1, len(view) // _LOOKED_AT)].astype(np.float64) - origin
     ranges = np.linalg.norm(points, axis=1)
@@ -253,24 +265,15 @@ def _at_centres(inverse: Float64, u: Float64, v: Float64) -> Float64:
     near = (1 + _SAME) ** (2 * _BESIDE)
     out = inverse
     for _ in range(_ROUNDS):
+        padded = np.pad(out, _BESIDE)
+        inside, back, on = slice(_BESIDE, -_BESIDE), slice(-2 * _BESIDE), slice(2 * _BESIDE, None)
         slopes = []
-        for axis in (1, 0):
-            before, after = (_shifted(out, step, axis) for step in (-_BESIDE, _BESIDE))
+        for before, after in (
+            (padded[inside, back], padded[inside, on]),
+            (padded[back, inside], padded[on, inside]),
+        ):
             low, high = np.minimum(before, after), np.maximum(before, after)
             same = (low > inverse / near) & (high < inverse * near)
             slopes.append(np.where(same, (after - before) / (2 * _BESIDE), 0))
         out = inverse - u * slopes[0] - v * slopes[1]
-    return out
-
-
-def _shifted(image: Float64, step: int, axis: int) -> Float64:
-    """The pixels so many steps further along an axis, 0 beyond the border."""
-    out = np.zeros_like(image)
-    here, there = (slice(None, -step), slice(step, None)) if step > 0 else (
-        slice(-step, None), slice(None, step),
-    )  # fmt: skip
-    index = [slice(None), slice(None)]
-    other = [slice(None), slice(None)]
-    index[axis], other[axis] = here, there
-    out[tuple(index)] = image[tuple(other)]
     return out
