@@ -3,9 +3,28 @@
 import numpy as np
 import pytest
 
-from tofuse.odometry.prediction import growth, runs
+from tofuse.geometry import se3
+from tofuse.odometry.prediction import Prediction, runs
 
 NONE, SOME = np.zeros((0, 6)), np.eye(6)[:1]
+
+
+def path(motions):
+    """Poses (N, 4, 4) of motions (N-1, 6)."""
+    poses = [np.eye(4)]
+    for T in se3.exp(motions):
+        poses.append(poses[-1] @ T)
+    return np.array(poses)
+
+
+def random_walk(rng, n):
+    """Motions (N, 6) whose change is random, small enough for rotations to add up."""
+    return np.cumsum(rng.standard_normal((n, 6)) * ([0.01] * 3 + [1e-3] * 3), axis=0)
+
+
+def around_a_mean(rng, n):
+    """Motions (N, 6) that are independent of each other."""
+    return rng.standard_normal((n, 6)) * ([0.01] * 3 + [1e-3] * 3)
 
 
 def test_runs_of_degenerate_frames() -> None:
@@ -19,13 +38,54 @@ def test_errors_grow_as_those_of_a_velocity_that_wanders(n) -> None:
     """Frame by frame, or over all frames at once: as in many draws of a random walk."""
     step = np.random.default_rng(1).standard_normal((20_000, n))
     expected = np.cumsum(np.cumsum(step, axis=1), axis=1)[:, -1].std()
-    single = np.sqrt(sum(growth(k, 1) ** 2 for k in range(1, n + 1)))
+    usual = Prediction((1.0, 1.0))
+    single = np.sqrt(sum(usual.error(k, 1)[0] ** 2 for k in range(1, n + 1)))
     assert single == pytest.approx(expected, rel=0.03)
-    assert growth(n, n) == pytest.approx(single)
+    assert usual.error(n, n)[0] == pytest.approx(single)
     # Beside a later frame of the run, the velocity is off from the first one on.
-    assert growth(n, 2) == pytest.approx(np.hypot(n - 1, n))
+    assert usual.error(n, 2)[0] == pytest.approx(np.hypot(n - 1, n))
 
 
 def test_one_prediction_is_off_by_its_own_error() -> None:
-    assert growth(1, 1) == 1
-    assert growth(0, 0) == 0
+    assert Prediction((0.3, 0.2)).error(1, 1) == (0.3, 0.2)
+    assert Prediction((0.3, 0.2)).error(0, 0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("walk", "low", "high"), [(random_walk, 1.5, 2), (around_a_mean, 0.7, 1.3)]
+)
+def test_growth_is_measured_where_the_motion_is_constrained(walk, low, high) -> None:
+    """A velocity that does a random walk is lost faster than one that is wrong, but stays so."""
+    poses = path(walk(np.random.default_rng(5), 300))
+    found = Prediction.of(poses, [NONE] * len(poses))
+    assert low <= found.power[0] <= high
+    assert low <= found.power[1] <= high
+
+
+def test_predicted_error_is_that_of_the_recording() -> None:
+    poses = path(around_a_mean(np.random.default_rng(6), 400))
+    found = Prediction.of(poses, [NONE] * len(poses))
+    steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in zip(poses, poses[1:], strict=False)])
+    off = [
+        poses[k + 12][:3, 3] - (poses[k] @ se3.exp(12 * steps[k - 1]))[:3, 3] for k in range(1, 380)
+    ]
+    assert found.error(12, 12)[0] == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.15)
+
+
+def test_degenerate_directions_do_not_count() -> None:
+    """A direction that goes on by its prediction agrees with it, and says nothing."""
+    motions = around_a_mean(np.random.default_rng(7), 300)
+    motions[:, 1] = 0.02
+    poses = path(motions * [1, 1, 1, 0, 0, 0])
+    weak = np.eye(6)[1:2]
+    found = Prediction.of(poses, [weak] * len(poses))
+    ignored = Prediction.of(poses, [NONE] * len(poses))
+    assert found.sigma[0] == pytest.approx(ignored.sigma[0] * np.sqrt(3 / 2), rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
+def test_few_poses_are_known_by_a_share_of_the_motion(n) -> None:
+    found = Prediction.of(path(np.full((n, 6), 0.1))[:n], [NONE] * n)
+    assert np.isfinite(found.sigma).all()
+    assert min(found.sigma) > 0
+    assert found.power == (2.0, 2.0)

@@ -1,8 +1,9 @@
-"""How well a motion predicts the next one: what directions that nothing held are known by."""
+"""How well a motion predicts the next one: what degenerate directions are known by."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,46 +13,109 @@ from tofuse.registration.projective import UNITS
 
 Float64 = NDArray[np.float64]
 
-# Dimensions of held motion from which a rms is told; below, motions are known by a share.
-_LEAST_HELD = 30.0
+# Constrained dimensions from which an rms is measured; below, motions are known by a share.
+_LEAST_CONSTRAINED = 30.0
 _SHARE = 0.5
 # In units of 1 cm and 1 degree: no prediction is taken to be better.
 _LEAST = 0.1
+# Directions of several frames are different ones above this share of the strongest.
+_DISTINCT = 0.3
+# Frames over which the growth of the error is measured, and the powers between which it is sought:
+# of independent steps, and of a velocity that does a random walk. A smooth motion is lost faster
+# over some frames, but its velocity stays bounded.
+_AHEAD = 8
+_POWERS = np.linspace(0.0, 2.0, 41)
+# Where the recording does not show it.
+_USUAL_POWER = 2.0
 
 
-def prediction_sigma(poses: Float64, unobservable: Sequence[Float64]) -> tuple[float, float]:
-    """Rms by which a motion differed from the one before, m and rad, where it was measured.
+@dataclass(frozen=True)
+class Prediction:
+    """How well the motion before predicts the next ones of a recording.
 
-    Parameters
+    Where a degenerate direction is not measured for n frames, the camera is where its velocity took
+    it. The variance of that grows as the sum of k^power over the frames k = 1 to n: as that of
+    independent steps for a power of 0, as that of a velocity error that stays for about 1, and as
+    that of a velocity that does a random walk for 2.
+
+    Attributes
     ----------
-    poses
-        (N, 4, 4) T_world_camera of frames in a row.
-    unobservable
-        Of each frame, (k, 6) unit directions that its data did not hold.
-
-    Returns
-    -------
-    sigma of translation (m) and of rotation (rad), of each component. Where hardly any direction
-    was ever held, it is half of the typical motion.
+    sigma
+        Rms error of one prediction, of each component: m and rad.
+    power
+        Of the growth, of translation and of rotation.
     """
-    if len(poses) < 3:
-        return 0.1, 0.1
-    motions = se3.inverse(poses[:-1]) @ poses[1:]
-    surprise = se3.log(se3.inverse(motions[:-1]) @ motions[1:]) / UNITS
-    squares, held = np.zeros(2), np.zeros(2)
-    for d, weak in zip(surprise, unobservable[2:], strict=True):
+
+    sigma: tuple[float, float]
+    power: tuple[float, float] = (_USUAL_POWER, _USUAL_POWER)
+
+    @classmethod
+    def of(cls, poses: Float64, unobservable: Sequence[Float64]) -> Prediction:
+        """Measure it where the motion was constrained.
+
+        Where hardly any direction was, sigma is half of the typical motion.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4) T_world_camera of frames in a row.
+        unobservable
+            Of each frame, (k, 6) degenerate directions, m and rad.
+        """
+        if len(poses) < 3:
+            return cls((0.1, 0.1))
+        motions = se3.inverse(poses[:-1]) @ poses[1:]
+        typical = np.sqrt((se3.log(motions) / UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
+        one, known = _errors(poses, motions, unobservable, 1)
+        sigma = np.maximum(np.where(known, one, _SHARE * typical), _LEAST)
+        power = (_USUAL_POWER, _USUAL_POWER)
+        if len(poses) > _AHEAD + 1:
+            later, known_later = _errors(poses, motions, unobservable, _AHEAD)
+            ratio = np.divide(later, one, out=np.ones(2), where=one > 0)
+            k = np.arange(1, _AHEAD + 1)[:, None]
+            found = np.interp(ratio**2, (k**_POWERS).sum(0), _POWERS)
+            found = np.where(known & known_later & (one > 0), found, _USUAL_POWER)
+            power = (float(found[0]), float(found[1]))
+        return cls((float(sigma[0] * UNITS[0]), float(sigma[1] * UNITS[3])), power)
+
+    def error(self, run: int, frames: int) -> tuple[float, float]:
+        """Sigma of each component of a motion in a degenerate direction, m and rad.
+
+        Parameters
+        ----------
+        run
+            For how many frames in a row, the last of these included, a direction was degenerate.
+        frames
+            Over how many frames the motion is.
+        """
+        first = max(run - frames, 0)
+        k = np.arange(first + 1, max(run, first + frames) + 1, dtype=float)
+        (a, b), (p, q) = self.sigma, self.power
+        return float(a * np.sqrt((k**p).sum())), float(b * np.sqrt((k**q).sum()))
+
+
+def _errors(
+    poses: Float64, motions: Float64, unobservable: Sequence[Float64], ahead: int
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Rms error of going on by a motion for some frames, of translation and rotation; (2,) each.
+
+    In `UNITS`, over constrained directions, and whether there were enough of them.
+    """
+    last = len(poses) - ahead
+    going_on = np.linalg.matrix_power(motions[: last - 1], ahead)
+    errors = se3.log(se3.inverse(poses[1:last] @ going_on) @ poses[1 + ahead :]) / UNITS
+    squares, dimensions = np.zeros(2), np.zeros(2)
+    for i, error in enumerate(errors, 1):
         P = np.eye(6)
+        weak = np.concatenate([np.zeros((0, 6)), *unobservable[i : i + ahead + 1]])
         if len(weak):
-            scaled = weak / UNITS
-            q, _ = np.linalg.qr(scaled.T)
-            P -= q @ q.T
-        seen = P @ d
+            u, s, _ = np.linalg.svd((weak / UNITS).T, full_matrices=False)
+            u = u[:, s > _DISTINCT * s[0]]
+            P -= u @ u.T
+        seen = P @ error
         squares += [seen[:3] @ seen[:3], seen[3:] @ seen[3:]]
-        held += [np.trace(P[:3, :3]), np.trace(P[3:, 3:])]
-    typical = np.sqrt((se3.log(motions) / UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
-    rms = np.where(held >= _LEAST_HELD, np.sqrt(squares / np.maximum(held, 1)), _SHARE * typical)
-    rms = np.maximum(rms, _LEAST)
-    return float(rms[0] * UNITS[0]), float(rms[1] * UNITS[3])
+        dimensions += [np.trace(P[:3, :3]), np.trace(P[3:, 3:])]
+    return np.sqrt(squares / np.maximum(dimensions, 1)), dimensions >= _LEAST_CONSTRAINED
 
 
 def runs(unobservable: Sequence[Float64]) -> NDArray[np.intp]:
@@ -62,29 +126,10 @@ def runs(unobservable: Sequence[Float64]) -> NDArray[np.intp]:
     return np.asarray(count - last_constrained, np.intp)
 
 
-def growth(run: int, frames: int) -> float:
-    """How many times the error of one prediction the motion over some frames is off by.
-
-    The velocity is what is extrapolated. Where nothing measures it, it does a random walk, and
-    after n frames the position is off by the root of the sum of squares 1 to n: as much as if the
-    k-th of n independent motions were off by k times the error of one prediction.
-
-    Parameters
-    ----------
-    run
-        For how many frames in a row, the last of these included, a direction was degenerate.
-    frames
-        Over how many frames the motion is.
-    """
-    first = max(run - frames, 0)
-    k = np.arange(first + 1, max(run, first + frames) + 1, dtype=float)
-    return float(np.sqrt((k * k).sum()))
-
-
 def with_prediction(
     information: Float64, unobservable: Float64, sigma: tuple[float, float]
 ) -> Float64:
-    """Information (6, 6) of a registration and of the prediction where the data held nothing.
+    """Information (6, 6) of a registration and of the prediction where the data is degenerate.
 
     Parameters
     ----------

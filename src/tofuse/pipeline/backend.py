@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.evaluation.sightings import Sightings, sightings
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
-from tofuse.odometry.prediction import growth, prediction_sigma, runs, with_prediction
+from tofuse.odometry.prediction import Prediction, runs, with_prediction
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
@@ -270,7 +270,7 @@ class BackEnd:
         replaced = {index for edge in again for index in (edge.i, edge.j)}
         place = {index: k for k, index in enumerate(ids)}
         unobservable = [e.record.unobservable for e in self._posed]
-        sigma, run = prediction_sigma(tracked, unobservable), runs(unobservable)
+        prediction, run = Prediction.of(tracked, unobservable), runs(unobservable)
         times = {e.record.index: e.record.timestamp for e in self._posed}
         interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
         sequence = []
@@ -285,8 +285,8 @@ class BackEnd:
             frames = abs(place[index] - place[step.reference])
             elapsed = abs(times[index] - times[step.reference])
             longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
-            times_one = growth(int(run[place[index]]), frames) * longer**2
-            predicted = (sigma[0] * times_one, sigma[1] * times_one)
+            sigma = prediction.error(int(run[place[index]]), frames)
+            predicted = (sigma[0] * longer**2, sigma[1] * longer**2)
             information = with_prediction(r.information, r.unobservable, predicted)
             sequence.append(Measured(step.reference, index, r.T_target_source, information))
         needed = [
