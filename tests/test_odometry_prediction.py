@@ -1,5 +1,7 @@
 """How far off an extrapolated motion is."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -65,7 +67,7 @@ def test_growth_is_measured_where_the_motion_is_constrained(walk, low, high) -> 
 def test_predicted_error_is_that_of_the_recording() -> None:
     poses = path(around_a_mean(np.random.default_rng(6), 400))
     found = Prediction.of(poses, [NONE] * len(poses))
-    steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in zip(poses, poses[1:], strict=False)])
+    steps = np.array([se3.log(se3.inverse(a) @ b) for a, b in itertools.pairwise(poses)])
     off = [
         poses[k + 12][:3, 3] - (poses[k] @ se3.exp(12 * steps[k - 1]))[:3, 3] for k in range(1, 380)
     ]
