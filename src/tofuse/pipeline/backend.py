@@ -270,7 +270,8 @@ class BackEnd:
         replaced = {index for edge in again for index in (edge.i, edge.j)}
         place = {index: k for k, index in enumerate(ids)}
         unobservable = [e.record.unobservable for e in self._posed]
-        prediction, run = Prediction.of(tracked, unobservable), runs(unobservable)
+        run = runs(unobservable)
+        prediction = Prediction.of(tracked, unobservable) if run.any() else None
         times = {e.record.index: e.record.timestamp for e in self._posed}
         interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
         sequence = []
@@ -285,9 +286,11 @@ class BackEnd:
             frames = abs(place[index] - place[step.reference])
             elapsed = abs(times[index] - times[step.reference])
             longer = max(elapsed / (frames * interval), 1.0) if frames and interval > 0 else 1.0
-            sigma = prediction.error(int(run[place[index]]), frames)
-            predicted = (sigma[0] * longer**2, sigma[1] * longer**2)
-            information = with_prediction(r.information, r.unobservable, predicted)
+            information = r.information
+            if prediction is not None:
+                sigma = prediction.error(int(run[place[index]]), frames)
+                predicted = (sigma[0] * longer**2, sigma[1] * longer**2)
+                information = with_prediction(information, r.unobservable, predicted)
             sequence.append(Measured(step.reference, index, r.T_target_source, information))
         needed = [
             Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
