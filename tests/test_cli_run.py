@@ -120,6 +120,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "config",
         "seconds",
         "verdict",
+        "accuracy",
         "reasons",
         "frames",
         "loops",
@@ -333,7 +334,16 @@ def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--end", 1)
     data = run_json(tmp_path / "out")
     assert [r["code"] for r in data["reasons"]] == ["single_frame"]
-    assert data["verdict"] == "good"
+    # Nothing was registered, so nothing is known of the accuracy.
+    assert data["verdict"] == "degraded"
+    assert data["accuracy"] == {
+        "position_m": None,
+        "rotation_rad": None,
+        "relative": None,
+        "assessed": False,
+        "worst": None,
+        "unbounded": [],
+    }
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES
     assert len(read_ply(tmp_path / "out/cloud.ply")) > 500
     mesh = read_ply(tmp_path / "out/mesh.ply")
@@ -434,7 +444,7 @@ def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
     assert done.err.startswith("note: ")
     assert "colour_of_case" in done.err
     # Each reason, and what can be done about it.
-    assert len(done.out.splitlines()) <= 3 + 2 * len(run_json(tmp_path / "out")["reasons"])
+    assert len(done.out.splitlines()) <= 4 + 2 * len(run_json(tmp_path / "out")["reasons"])
     assert "\x1b" not in done.out
 
 

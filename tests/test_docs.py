@@ -229,10 +229,12 @@ def test_every_field_of_run_json_is_documented(room_recording: Path) -> None:
     result = tofuse.reconstruct(tofuse.open(room_recording))
     data = run_json(result)
     section = sections("docs/commands.md")["run.json"]
-    top, frames, components, loops = re.split(
+    top, accuracy, frames, components, loops = re.split(
         r"^Fields of a \w+(?:, .*)?:$", section, flags=re.MULTILINE
     )
     assert {c for row in rows(top) for c in codes(row[0])} == set(data)
+    assert {c for row in rows(accuracy) for c in codes(row[0])} == set(data["accuracy"])
+    assert set(data["accuracy"]["worst"]) <= codes(accuracy)
     assert {row[0].strip("`") for row in rows(frames)} == set(data["frames"][0])
     fields = {f.name for f in dataclasses.fields(Component)} - {"result"}
     assert {row[0].strip("`") for row in rows(components)} == fields

@@ -13,10 +13,10 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import surface_map
+from tofuse.posegraph.accuracy import Shown, accuracy_of
 from tofuse.posegraph.build import build_graph
 from tofuse.posegraph.refine import RefineOptions, chosen, refine
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
-from tofuse.posegraph.trust import expected_error
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 
 OPTIONS = RefineOptions()
@@ -258,6 +258,6 @@ def test_pairs_of_a_view_do_not_add_up_to_more_than_it_knows():
         part = Joint(refine=replace(OPTIONS, neighbours=neighbours))
         found = refiner(part, views, drifted(truth))
         graph = build_graph(range(12), found.poses, found.edges)
-        known[neighbours] = len(found.edges), expected_error(graph)[0]
+        known[neighbours] = len(found.edges), accuracy_of(graph, Shown(), 1.0).position_m
     assert known[10][0] > 2 * known[2][0]
     assert known[10][1] > 0.7 * known[2][1]

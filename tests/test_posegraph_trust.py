@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.geometry import se3
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.trust import (
     LEFT_OUT,
-    expected_error,
     loop_errors,
     pose_covariances,
     relative_covariance,
@@ -67,16 +65,6 @@ def test_covariances_are_those_of_many_draws(solved) -> None:
         assert ratio.mean() == pytest.approx(1, abs=0.2)
 
 
-def test_the_expected_error_is_that_of_evaluation(solved) -> None:
-    time = np.arange(N, dtype=float)
-    found = [evaluate_trajectory(time, g.poses, time, TRUE).ate_rms_m for g in solved]
-    mean, bound = expected_error(walk())
-    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(mean, rel=0.1)
-    # Two standard deviations of the squared error.
-    assert 0.9 < np.mean(np.array(found) < bound) < 1
-    assert expected_error(walk(loops=()))[0] > 1.5 * mean
-
-
 def test_loops_miss_as_a_chi_square_variable(drawn) -> None:
     d = np.stack([loop_errors(g, g.poses) for g in drawn])
     assert d.shape == (len(drawn), 2)
@@ -111,7 +99,6 @@ def test_parts_that_nothing_joins_are_not_known() -> None:
     C = pose_covariances(graph)
     assert np.isfinite(C[:3]).all()
     assert np.isnan(C[3:]).all()
-    assert expected_error(graph) == (np.inf, np.inf)
     one = build_graph([7], TRUE[:1], [])
     np.testing.assert_array_equal(pose_covariances(one), np.zeros((1, 6, 6)))
 

@@ -251,6 +251,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "config",
         "seconds",
         "verdict",
+        "accuracy",
         "reasons",
         "frames",
         "components",

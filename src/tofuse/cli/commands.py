@@ -59,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         loops=arguments.loops,
         object=arguments.object,
         unwrap=arguments.unwrap,
+        tolerance=arguments.tolerance,
         texture=arguments.texture,
         overwrite=arguments.overwrite,
     )
@@ -187,7 +188,8 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Say in a few lines what came out."""
-    from tofuse.results.output import component_name, reasons_json
+    from tofuse.results.card import SEPARATOR, card
+    from tofuse.results.output import accuracy_json, component_name, plain, reasons_json
     from tofuse.results.ranges import in_words
     from tofuse.results.verdict import ADVICE, REASONS, ranked
 
@@ -200,6 +202,7 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
                 "event": "result",
                 "out": str(out),
                 "verdict": d.verdict,
+                "accuracy": plain(accuracy_json(d.accuracy)),
                 "reasons": reasons_json(d.reasons),
                 "frames": {**counts, "skipped": skipped},
                 "loops": sum(p.accepted for p in d.loops),
@@ -215,6 +218,7 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
         console.print(f"  [{_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
         if reason.code in ADVICE:
             console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
+    console.print(SEPARATOR.join(card(result)), markup=False)
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []

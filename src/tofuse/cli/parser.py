@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
@@ -181,6 +182,12 @@ def _processing(p: argparse.ArgumentParser) -> None:
         "--unwrap",
         action="store_true",
         help="bring back what lies beyond the range after which the camera's phase repeats",
+    )
+    g.add_argument(
+        "--tolerance",
+        type=_length,
+        metavar="LENGTH",
+        help='accuracy of a "good" result, as 30mm (0.5 %% of the model, at least 10mm)',
     )
     _seed(g)
     g.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
@@ -463,6 +470,21 @@ def _seconds(text: str) -> float:
         value = math.nan
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
+    return value
+
+
+_UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+
+
+def _length(text: str) -> float:
+    """A length above 0 in m, given as 30mm, 3cm, 0.03m or 0.03."""
+    match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(mm|cm|m)?\s*", text)
+    try:
+        value = float(match[1]) * _UNITS_M[match[2] or "m"] if match else math.nan
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
     return value
 
 

@@ -93,6 +93,12 @@ class Sightings:
         support = sum(p.support for p in pairs)
         return float(np.sqrt(sum(p.squares for p in pairs) / support)) if support else np.nan
 
+    def excess_m(self) -> float:
+        """Rms by which views further apart disagree beyond consecutive ones, m; 0 if unknown."""
+        near = self.rms_m([p for p in self.pairs if p.j == p.i + 1])
+        far = self.rms_m([p for p in self.pairs if p.j > p.i + 1])
+        return float(np.sqrt(max(far**2 - near**2, 0.0))) if np.isfinite(near + far) else 0.0
+
 
 def sightings(frames: Sequence[RangeFrame], poses: ArrayLike) -> Sightings:
     """Compare all pairs of frames under their poses (N, 4, 4) T_world_camera.

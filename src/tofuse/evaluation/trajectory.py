@@ -203,6 +203,15 @@ def align(estimate: ArrayLike, reference: ArrayLike) -> Float64:
     return T
 
 
+def displacement(before: Float64, after: Float64) -> tuple[float, float]:
+    """Rms by which poses (N, 4, 4) differ: positions, m, and rotations, rad, each aligned."""
+    distance = np.linalg.norm((align(after, before) @ after - before)[:, :3, 3], axis=1)
+    R_before, R_after = before[:, :3, :3], after[:, :3, :3]
+    turn = mean_rotation(R_before @ np.swapaxes(R_after, 1, 2))
+    angle = se3.angle(np.swapaxes(R_before, 1, 2) @ turn @ R_after)
+    return _rms(distance), _rms(angle)
+
+
 def relative_error(estimate: Float64, reference: Float64, frames: int) -> RelativeError:
     """Compare the motions over `frames` poses of two trajectories (N, 4, 4), matched in order."""
     if len(estimate) <= frames:

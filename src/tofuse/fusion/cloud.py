@@ -50,6 +50,11 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def diagonal_m(self) -> float:
+        """Of the box around it, m; 0 without points."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
+
 
 def choose_voxel(frame: CloudFrame) -> float:
     """Return a voxel edge in m that fits a cloud: 2 mm to 10 cm."""

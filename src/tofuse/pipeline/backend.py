@@ -10,14 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.evaluation.sightings import Sightings, sightings
+from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.odometry.prediction import Prediction, runs, with_prediction
 from tofuse.pipeline.checkpoint import Stages
+from tofuse.pipeline.checks import Evidence, judge
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.frame_log import FrameLog
-from tofuse.pipeline.judge import Evidence, judge
 from tofuse.pipeline.progress import Progress, Stopwatch
+from tofuse.posegraph.accuracy import (
+    Accuracy,
+    Shown,
+    accuracy_of,
+    covariances_of,
+    without_degenerate,
+)
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.cut_edges import cut_edges
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
@@ -208,17 +216,22 @@ class BackEnd:
         optimisation, graph, model = closed.optimisation, refined.graph, fused.model
         log, kept = self._log, self._kept
         self._progress.stage("checking")
-        records = self._records(closed.covariances)
         loops = tuple(c.record for c in closed.loops)
         with self._watch.timing("checking"):
+            sightings = self._sightings(graph)
+            accuracy, covariances = self._accuracy(closed, refined, model, sightings)
+            records = self._records(covariances)
             evidence = Evidence(
                 records,
                 tuple(e.step.registration if e.step is not None else None for e in log.entries),
                 loops,
                 closed.judged.sequential,
                 closed.judged.optimisation,
-                self._sightings(graph),
-                closed.judged.covariances if kept.knows_errors else None,
+                sightings,
+                accuracy,
+                model.cloud.diagonal_m,
+                self._config.tolerance_m,
+                kept.knows_errors,
                 refined.refinement,
                 frozenset((g.i, g.j) for g in self._given),
                 tuple(d for index, d in kept.depths.items() if d > 0 and index in self._poses),
@@ -253,6 +266,7 @@ class BackEnd:
                 refined.refinement,
                 optimisation.parts,
                 closed.told.records,
+                accuracy=accuracy,
             ),
             config=self._config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(log.entries)},
@@ -303,6 +317,25 @@ class BackEnd:
             if c.T_i_j is not None and c.information is not None
         ]
         return build_graph(ids, poses, [*sequence, *needed, *again], closing)
+
+    def _accuracy(
+        self, closed: Closed, refined: Refined, model: Model, sightings: Sightings | None
+    ) -> tuple[Accuracy, Float64]:
+        """How far off the final poses may be, and their covariances (P, 6, 6).
+
+        Not assessed where registrations don't know their errors.
+        """
+        if not self._kept.knows_errors:
+            return Accuracy(), closed.covariances
+        unobservable = {
+            e.record.index: e.record.unobservable for e in self._posed if len(e.record.unobservable)
+        }
+        bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
+        graph = without_degenerate(refined.graph, unobservable, bridges)
+        moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+        excess = 0.0 if sightings is None else sightings.excess_m()
+        shown = Shown(*moved, excess)
+        return accuracy_of(graph, shown, model.cloud.diagonal_m), covariances_of(graph, shown)
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
         """The records with the covariances (P, 6, 6) of the frames that have a pose here."""

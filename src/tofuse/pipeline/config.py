@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from tofuse import parts
 from tofuse.errors import InputError
 from tofuse.filters.base import Filter
@@ -54,6 +56,9 @@ class Config:
         Sensors beside the camera whose measurements count.
     joining
         Connects components that were tracked apart.
+    tolerance_m
+        A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
+        of the model's diagonal, at least 1 cm.
     """
 
     method: str
@@ -67,6 +72,11 @@ class Config:
     model_filters: tuple[Filter, ...] = ()
     outside: tuple[Outside, ...] = ()
     joining: Joining = Joining()  # noqa: RUF009 - immutable
+    tolerance_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.tolerance_m is not None and not 0 < self.tolerance_m < np.inf:
+            raise ValueError(f"tolerance_m is {self.tolerance_m}, not above 0")
 
     @property
     def window(self) -> int:

@@ -73,6 +73,7 @@ class Options:
     loops: Path | None = None
     object: bool = False
     unwrap: bool = False
+    tolerance: float | None = None
     texture: bool = False
     overwrite: bool = False
 
@@ -231,6 +232,8 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
     if options.texture and not config.fusion.texture:
         config = changed(config, {"fusion": {"texture": _TEXTURE}}, where="--texture")
+    if options.tolerance is not None:
+        config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
     front: list[dict[str, Any]] = []
     if options.min_depth is not None or options.max_depth is not None:
         low = options.min_depth or 0.0

@@ -16,8 +16,6 @@ Float64 = NDArray[np.float64]
 
 # A loop that counts with less of its information is left out.
 LEFT_OUT = 0.05
-# Of the trajectory, to tell its error.
-_POSES = 60
 
 
 def without_left_out(optimisation: Optimisation) -> Optimisation:
@@ -39,20 +37,26 @@ def without_left_out(optimisation: Optimisation) -> Optimisation:
     )
 
 
-def pose_covariances(graph: PoseGraph) -> Float64:
-    """(N, 6, 6) covariances of the poses relative to the first one, as right perturbations.
+def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
+    """(N, 6, 6) covariances of the poses relative to one of them, as right perturbations.
 
-    NaN where nothing joins a pose to the first, or the graph does not hold it.
+    NaN where nothing joins a pose to that, or the measurements do not constrain it.
+
+    Parameters
+    ----------
+    origin
+        Position of the pose that is taken to be known.
     """
     out = np.full((len(graph.ids), 6, 6), np.nan)
     if not len(out):
         return out
-    factor = _problem(graph, first_of_parts(len(out), graph.edges)).factor(
-        graph.poses, np.ones(len(graph.edges))
-    )
+    part = parts_of(len(out), graph.edges)
+    joined = part == part[origin]
+    fixed = first_of_parts(len(out), graph.edges) & ~joined
+    fixed[origin] = True
+    factor = _problem(graph, fixed).factor(graph.poses, np.ones(len(graph.edges)))
     if factor is None:
         return out
-    joined = parts_of(len(out), graph.edges) == 0
     try:
         out[joined] = factor.covariances()[: len(out)][joined]
     except RuntimeError:
@@ -82,38 +86,16 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
     return np.asarray((axes * np.maximum(variances, 0)) @ axes.T, np.float64)
 
 
-def expected_error(graph: PoseGraph, sigmas: float = 2.0) -> tuple[float, float]:
-    """Rms position error of the trajectory, aligned with the truth, that the graph leaves room for.
+def joint_covariance(graph: PoseGraph, some: NDArray[np.intp]) -> Float64 | None:
+    """(6v, 6v) covariance of some poses together, relative to the first one of the graph.
 
-    The positions' joint covariance, less what a rigid motion of them all takes up, has a trace
-    that is the mean of the squared error; its spread follows from the squares.
-
-    Returns
-    -------
-    m: the root of the mean, and of what so many standard deviations above it give. Both are inf
-    where the graph does not hold all poses.
+    None where the measurements do not constrain all poses of the graph.
     """
-    n = len(graph.ids)
-    problem = _problem(graph, first_of_parts(n, graph.edges))
+    problem = _problem(graph, first_of_parts(len(graph.ids), graph.edges))
     factor = problem.factor(graph.poses, np.ones(len(graph.edges)))
     if factor is None or problem.fixed.sum() > 1:
-        return np.inf, np.inf
-    some = np.unique(np.linspace(0, n - 1, min(n, _POSES)).round().astype(int))
-    C = factor.joint_covariance(some).reshape(len(some), 6, len(some), 6)[:, :3, :, :3]
-    R, p = graph.poses[some, :3, :3], graph.poses[some, :3, 3]
-    C = np.einsum("iab,ibjc,jdc->iajd", R, C, R, optimize=True).reshape(3 * len(some), -1)
-    # Motions of all positions together: along each axis, and about each.
-    rigid = np.concatenate([np.tile(np.eye(3), (len(some), 1, 1)), -se3.hat(p - p.mean(0))], 2)
-    axes, size, _ = np.linalg.svd(rigid.reshape(-1, 6), full_matrices=False)
-    axes = axes[:, size > 1e-9 * size.max()]
-    left = C - axes @ (axes.T @ C)
-    left -= (left @ axes) @ axes.T
-    mean = float(np.trace(left))
-    spread = float(np.sqrt(2 * (left * left).sum()))
-    if not np.isfinite(mean):
-        return np.inf, np.inf
-    rms, bound = np.sqrt(np.maximum([mean, mean + sigmas * spread], 0) / len(some))
-    return float(rms), float(bound)
+        return None
+    return factor.joint_covariance(some)
 
 
 def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:

@@ -27,6 +27,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.fusion.upright import upright
 from tofuse.kernels.threads import side_threads
+from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
@@ -391,6 +392,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "config": result.config,
             "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
             "verdict": d.verdict,
+            "accuracy": accuracy_json(d.accuracy),
             "reasons": reasons_json(d.reasons),
             "frames": [
                 {
@@ -447,6 +449,22 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
     )
+
+
+def accuracy_json(a: Accuracy) -> dict[str, Any]:
+    """Return the accuracy as in `run.json`, but for numbers that are inf."""
+    worst = None
+    if a.worst is not None:
+        w = a.worst
+        worst = {"frame": w.frame, "position_m": w.position_m, "rotation_rad": w.rotation_rad}
+    return {
+        "position_m": a.position_m,
+        "rotation_rad": a.rotation_rad,
+        "relative": a.relative,
+        "assessed": a.assessed,
+        "worst": worst,
+        "unbounded": list(a.unbounded),
+    }
 
 
 def reasons_json(reasons: Sequence[Reason]) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.odometry.base import Status
+from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
@@ -91,6 +92,8 @@ class Diagnostics:
         What became of sensors beside the camera.
     samples
         Small images of some frames; none of clouds.
+    accuracy
+        95 % bounds of the poses' errors.
     """
 
     verdict: Verdict
@@ -106,6 +109,7 @@ class Diagnostics:
     parts: tuple[GraphPart, ...] = ()
     outside: tuple[OutsideRecord, ...] = ()
     samples: tuple[FrameSample, ...] = ()
+    accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ import pytest
 
 from tofuse.evaluation.sightings import Sighting, Sightings
 from tofuse.geometry import se3
-from tofuse.pipeline.judge import Evidence, judge, stretches
+from tofuse.pipeline.checks import Evidence, judge, stretches
+from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import GraphPart, LoopRecord, Optimisation
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Gap, Suspicion
-from tofuse.posegraph.trust import pose_covariances
 from tofuse.registration.base import Registration
 from tofuse.results.types import Component, FrameRecord, Reason
 from tofuse.results.verdict import ADVICE, REASONS, ranked, verdict_of
@@ -95,7 +95,9 @@ def evidence(
         poses,
         Optimisation(graph, (1.0, 0.5), settled, parts=parts),
         seen() if images is None else images,
-        None if sigma is None else pose_covariances(graph),
+        Accuracy() if sigma is None else accuracy_of(graph, Shown(), 1.0),
+        diagonal_m=1.0,
+        knows_errors=sigma is not None,
         given=frozenset(given),
         **more,
     )
@@ -109,15 +111,6 @@ def test_good_evidence_gives_no_reason() -> None:
     assert judge(evidence()) == ("good", ())
     predicted = evidence(("tracked",) * 4 + ("predicted",) + ("tracked",) * 4)
     assert judge(predicted) == ("good", ())
-
-
-def few_loose() -> Evidence:
-    """One of sixty poses is hardly known, and no other rests on it."""
-    e = evidence(("tracked",) * 60, gaps=(), sigma=(1e-5, 1e-5))
-    assert e.covariances is not None
-    covariances = e.covariances.copy()
-    covariances[30] = 0.09 * np.eye(6)
-    return replace(e, covariances=covariances)
 
 
 def apart(*ranges) -> Component:
@@ -178,7 +171,6 @@ CASES = {
     "not_converged": evidence(converged=[True] * 4 + [False] + [True] * 4),
     "unchecked_drift": evidence(gaps=()),
     "uncertain_poses": evidence(gaps=(), sigma=(0.02, 0.001)),
-    "uncertain_frames": few_loose(),
     "calibration_alarm": evidence(gaps=((0, 8, [0.05, 0, 0, 0, 0, 0]),), sigma=(0.001, 0.001)),
     "not_improved": evidence(parts=(GraphPart(0, 9, 9, 1.0, 1.0, True),)),
     "not_refined": evidence(refinement=Refinement(np.zeros((9, 4, 4)), views=9, pairs=20)),
@@ -328,7 +320,15 @@ def test_images_that_do_not_overlap_say_nothing() -> None:
 
 def test_noise_that_neighbours_share_is_no_difference() -> None:
     assert codes(evidence(images=seen(0.8, 0.02, 0.8, 0.02))) == []
-    assert codes(evidence(images=seen(far_rms=0.02))) == ["images_differ"]
+
+
+def test_views_that_are_further_apart_count_in_the_accuracy() -> None:
+    """They are no reason by themselves, as the bound has them."""
+    images = seen(far_rms=0.02)
+    assert codes(evidence(images=images)) == []
+    assert images.excess_m() == pytest.approx(np.sqrt(0.02**2 - 0.004**2))
+    assert seen(far_rms=0.001).excess_m() == 0
+    assert Sightings(tuple(range(9)), ()).excess_m() == 0
 
 
 def test_views_that_the_others_contradict_are_named() -> None:
@@ -340,53 +340,34 @@ def test_views_that_the_others_contradict_are_named() -> None:
     assert reason.text.startswith("Frame 12 is inconsistent with most overlapping frames.")
 
 
-def test_drift_counts_by_what_the_registrations_know() -> None:
-    # Eight steps of 1 mm and 0.5 mrad on a way of 0.4 m: well under 14 mm.
-    assert codes(evidence(gaps=(), sigma=(0.001, 0.0005))) == []
-    (loose,) = judge(evidence(gaps=(), sigma=(0.02, 0.001)))[1]
-    assert loose.frames == (2, 8)
-    # The end is off by the square root of eight of them, and a loop halves that.
-    (whole,) = judge(evidence(gaps=(), sigma=(0.008, 0.0001)))[1]
-    assert whole.code == "uncertain_poses"
-    assert "up to 18 mm rms (2σ)" in whole.text
-    assert 'the threshold for "good" is 14 mm' in whole.text
-    assert codes(evidence(sigma=(0.008, 0.0001))) == []
-
-
-def test_few_loose_frames_spoil_no_path() -> None:
-    e = few_loose()
-    assert codes(e) == ["uncertain_frames"]
-    assert judge(e)[1][0].frames == (30, 30)
-    covariances = e.covariances.copy()
-    covariances[30:33] = 0.09 * np.eye(6)
-    assert codes(replace(e, covariances=covariances)) == ["uncertain_poses"]
-
-
-def test_turns_that_are_not_held_are_told() -> None:
-    (reason,) = judge(evidence(gaps=(), sigma=(1e-5, np.radians(0.8))))[1]
-    assert reason.code == "uncertain_poses"
-    assert "2.3°" in reason.text
-    assert "No loop closure constrains them" in reason.text
-    (reason,) = judge(evidence(gaps=(), sigma=(1e-5, 2.0)))[1]
-    assert reason.code == "uncertain_poses"
-    assert "not constrained at all" in reason.text
-    assert "°" not in reason.text
-
-
-def test_a_part_that_nothing_joins_is_told() -> None:
-    e = evidence(gaps=(), sigma=(0.001, 0.0005))
-    graph = e.optimisation.graph
-    keep = np.arange(8) != 4
-    columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
-    torn = replace(graph, **columns)
-    e = replace(
-        e,
-        optimisation=replace(e.optimisation, graph=torn),
-        covariances=pose_covariances(torn),
-    )
+def test_a_path_is_good_within_the_tolerance() -> None:
+    """It is 0.5 % of the model's diagonal and at least 1 cm, unless it is given."""
+    e = evidence(gaps=(), sigma=(0.008, 0.0001))
+    bound = e.accuracy.position_m
+    assert 0.01 < bound < 0.03
     (reason,) = judge(e)[1]
-    assert (reason.code, reason.frames) == ("uncertain_poses", (5, 8))
-    assert "not connected" in reason.text
+    assert (reason.code, reason.frames) == ("uncertain_poses", (0, 8))
+    assert f"off by {bound * 1e3:.0f} mm rms (95 % bound); the tolerance is 10 mm." in reason.text
+    assert "Frame " in reason.text
+    assert codes(replace(e, diagonal_m=201 * bound)) == []
+    assert codes(replace(e, diagonal_m=199 * bound)) == ["uncertain_poses"]
+    assert codes(replace(e, tolerance_m=1.01 * bound)) == []
+    assert codes(replace(e, tolerance_m=0.99 * bound, diagonal_m=100)) == ["uncertain_poses"]
+    # A loop takes a part of the error away.
+    assert evidence(sigma=(0.008, 0.0001)).accuracy.position_m < 0.8 * bound
+
+
+def test_poses_that_no_measurement_bounds_are_named() -> None:
+    e = evidence(gaps=(), sigma=(0.001, 0.0005))
+    loose = replace(e.accuracy, position_m=np.inf, unbounded=(3, 4, 7))
+    verdict, (reason,) = judge(replace(e, accuracy=loose))
+    assert verdict == "degraded"
+    assert (reason.code, reason.ranges) == ("unobserved_motion", ((3, 4), (7, 7)))
+    assert reason.text.startswith("Poses of frames 3-4, 7 are not constrained in some direction")
+
+
+def test_what_was_not_assessed_is_no_reason() -> None:
+    assert codes(replace(evidence(sigma=(0.001, 0.0005)), accuracy=Accuracy())) == []
 
 
 def test_a_gap_within_the_known_errors_is_no_alarm() -> None:
@@ -407,7 +388,8 @@ def test_the_gravest_reason_decides() -> None:
         return verdict_of([Reason(name, ((0, 1),), "") for name in names])
 
     assert of() == "good"
-    assert of("unreadable_frames", "single_frame") == "good"
+    assert of("unreadable_frames", "moving_objects") == "good"
+    assert of("single_frame") == "degraded"
     assert of("unreadable_frames", "loop_gap") == "degraded"
     assert of("loop_gap", "few_poses", "single_frame") == "failed"
     assert {force for force, _ in REASONS.values()} == {"failed", "degraded", "note"}
@@ -416,7 +398,7 @@ def test_the_gravest_reason_decides() -> None:
 def test_reasons_are_merged_and_sorted() -> None:
     reasons = ranked(
         [
-            Reason("single_frame", ((0, 99),), "note."),
+            Reason("stood_still", ((0, 99),), "note."),
             Reason("loop_gap", ((3, 5),), "small."),
             Reason("jumped", ((9, 9), (11, 12)), "b."),
             Reason("jumped", ((1, 8),), "a."),
@@ -424,7 +406,7 @@ def test_reasons_are_merged_and_sorted() -> None:
             Reason("few_poses", ((4, 4),), "grave."),
         ]
     )
-    assert [r.code for r in reasons] == ["few_poses", "jumped", "loop_gap", "single_frame"]
+    assert [r.code for r in reasons] == ["few_poses", "jumped", "loop_gap", "stood_still"]
     assert reasons[1] == Reason("jumped", ((1, 9), (11, 12)), "b. a.")
     assert reasons[1].frames == (1, 12)
     assert set(ADVICE) <= set(REASONS)
@@ -479,8 +461,8 @@ def test_single_frames_that_nothing_connects_are_a_failure() -> None:
         verdict, reasons = judge(e)
         assert verdict == "failed"
         assert [r.code for r in reasons] == ["few_poses", "disconnected"]
-    # One view alone is fine.
-    assert judge(evidence(("tracked",)))[0] == "good"
+    # Of one view alone, nothing is known to be wrong, and nothing to be right.
+    assert judge(evidence(("tracked",)))[0] == "degraded"
 
 
 def test_a_component_that_begins_elsewhere_is_no_jump() -> None:

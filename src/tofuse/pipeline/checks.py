@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from tofuse.evaluation.sightings import Sightings
 from tofuse.geometry import se3
 from tofuse.odometry.motion import Moment, jumps
+from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.graph import LoopRecord, Optimisation
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import in_words as camera_in_words
-from tofuse.posegraph.trust import expected_error, loop_errors
+from tofuse.posegraph.trust import loop_errors
 from tofuse.registration.base import Registration
 from tofuse.results.ranges import Range, in_words, is_one, runs, size, union
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
@@ -36,14 +37,8 @@ NEAREST_M, FARTHEST_M = 0.3, 12.0
 UNORDERED, UNORDERED_SHARE = 3, 0.2
 # A camera that moved by no more than this stood still.
 STILL_M, STILL_RAD = 0.01, np.radians(0.5)
-# A result is good if its path is right to 1 cm and 1 % of its length: what the verdict promises.
-GOOD_M, GOOD_SHARE = 0.01, 0.01
-# Single poses are told that may be off by twice that, as the way from the first adds to them.
-UNCERTAIN_TIMES, UNCERTAIN_RAD = 2.0, np.radians(2)
-# So small a share of the frames says nothing of the path.
-SELDOM = 0.02
-# Path lengths are measured over so many poses: jitter from frame to frame is no way.
-PATH_POSES = 60
+# Unless a tolerance is given, it is this share of the model's diagonal, and at least so many m.
+TOLERANCE_SHARE, TOLERANCE_M = 0.005, 0.01
 # Loops miss where odometry leads by a chi-square variable with six degrees of freedom, if both
 # know their errors: one in a thousand misses by more.
 MISSED = 22.46
@@ -52,8 +47,8 @@ GAP_SHARE, GAP_FLOOR_M, GAP_FLOOR_RAD = 0.02, 0.03, np.radians(2)
 # Disconnected parts that are named, the largest ones; and loops.
 LISTED = 6
 # Of what overlapping images say of the poses, this share has to support them, or they are wrong;
-# below that share of what neighbours reach, or above that much more rms, they differ.
-CONTRADICTED_SHARE, AGREEMENT_RATIO, RMS_RATIO = 0.5, 0.9, 1.5
+# below that share of what neighbours reach, they differ.
+CONTRADICTED_SHARE, AGREEMENT_RATIO = 0.5, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +68,14 @@ class Evidence:
         The graph after it.
     sightings
         What overlapping images say of the final poses; None where there are too few.
-    covariances
-        (N, 6, 6) of those poses, see `trust.pose_covariances`; None where registrations don't know
-        their errors, as ICP's don't.
+    accuracy
+        Of the final poses.
+    diagonal_m
+        Of the model.
+    tolerance_m
+        What the poses may be off by; None for the usual share of the model's size.
+    knows_errors
+        Whether registrations state errors that can be relied on, which ICP's don't.
     refinement
         What became of the refinement over all views.
     given
@@ -106,7 +106,10 @@ class Evidence:
     sequential: Float64
     optimisation: Optimisation
     sightings: Sightings | None
-    covariances: Float64 | None = None
+    accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
+    diagonal_m: float = 0.0
+    tolerance_m: float | None = None
+    knows_errors: bool = False
     refinement: Refinement | None = None
     given: frozenset[tuple[int, int]] = frozenset()
     depths: tuple[float, ...] = ()
@@ -129,6 +132,13 @@ class Evidence:
         """From the first to the last frame of the main model."""
         ids = self.optimisation.graph.ids
         return ((int(ids[0]), int(ids[-1])),)
+
+    @property
+    def tolerance(self) -> float:
+        """What the poses may be off by, m."""
+        if self.tolerance_m is not None:
+            return self.tolerance_m
+        return max(TOLERANCE_M, TOLERANCE_SHARE * self.diagonal_m)
 
     @property
     def in_main(self) -> list[bool]:
@@ -155,7 +165,7 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
             *_depths(evidence),
             *_registrations(evidence),
             *_loops(evidence),
-            *(_drift(evidence) if evidence.covariances is None else _uncertainty(evidence)),
+            *(_uncertainty(evidence) if evidence.knows_errors else _drift(evidence)),
             *_optimiser(evidence),
             *_outside(evidence),
             *_images(evidence),
@@ -305,8 +315,8 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
             "correspondence."
         )
         yield Reason("weak_registration", weak, text)
-    if e.covariances is not None:
-        return  # what was unobservable, or did not converge, is in them
+    if e.knows_errors:
+        return  # what was unobservable, or did not converge, is in the bounds
     free = {index for index, r in pairs if len(r.unobservable)}
     if len(free) > UNHELD_SHARE * len(pairs):
         text = (
@@ -392,63 +402,24 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     """With known errors of the registrations, those of the path follow."""
     yield from _missed(e)
     yield from _suspected(e)
-    graph = e.optimisation.graph
-    assert e.covariances is not None
-    if len(graph.ids) < 2:
+    a = e.accuracy
+    if not a.assessed:
         return
-    promised = GOOD_M + GOOD_SHARE * _way(graph.poses)
-    sigma, turn = _worst(e.covariances[:, :3, :3]), _worst(e.covariances[:, 3:, 3:])
-    doubtful = ~((sigma <= UNCERTAIN_TIMES * promised) & (turn <= UNCERTAIN_RAD))
-    found = runs(graph.ids.tolist(), doubtful.tolist())
-    seldom = bool(doubtful.sum() <= SELDOM * len(doubtful))
-    if found:
-        text = _doubt(e, sigma, turn, doubtful)
-        yield Reason("uncertain_frames" if seldom else "uncertain_poses", found, text)
-    if not seldom:
-        return
-    _, bound = expected_error(graph)
-    if bound > promised:
+    free = e.runs_of(a.unbounded)
+    if free:
         text = (
-            f"Estimated trajectory error: up to {_length(bound)} rms (2σ); the threshold for "
-            f'"good" is {_length(promised)} (10 mm + 1 % of the path length).'
+            f"{_poses_of(free)} not constrained in some direction (degenerate geometry): the "
+            "motion is extrapolated there, and its error is not bounded."
         )
+        yield Reason("unobserved_motion", free, text)
+    elif a.position_m > e.tolerance:
+        text = (
+            f"The poses may be off by {_length(a.position_m)} rms (95 % bound); the tolerance is "
+            f"{_length(e.tolerance)}."
+        )
+        if a.worst is not None:
+            text += f" Frame {a.worst.frame} is the least certain: {_length(a.worst.position_m)}."
         yield Reason("uncertain_poses", e.posed, text)
-
-
-def _doubt(e: Evidence, sigma: Float64, turn: Float64, doubtful: NDArray[np.bool_]) -> str:
-    """Say how uncertain the doubtful poses of the graph are: m and rad, NaN where not connected."""
-    graph = e.optimisation.graph
-    ids = graph.ids.tolist()
-    apart = doubtful & ~np.isfinite(sigma)
-    free = np.zeros(len(ids), bool)
-    for first, last in runs(ids, (doubtful & ~apart).tolist()):
-        here = (graph.ids >= first) & (graph.ids <= last)
-        free |= here & (turn[here] >= np.pi).any()  # no two rotations are further apart
-    loose = doubtful & ~apart & ~free
-    out = []
-    where = runs(ids, loose.tolist())
-    if where:
-        worst = f"up to {_length(float(sigma[loose].max()))} and {_angle(float(turn[loose].max()))}"
-        out.append(f"{_poses_of(where)} uncertain: {worst} (1σ, worst direction).")
-        ends = np.sort(graph.ids[graph.edges[graph.loop]], axis=1)
-        if not any(((ends[:, 0] < k) & (k <= ends[:, 1])).any() for k in graph.ids[loose]):
-            out.append("No loop closure constrains them.")
-    where = runs(ids, free.tolist())
-    if where:
-        out.append(f"{_poses_of(where)} not constrained at all in some direction.")
-    where = runs(ids, apart.tolist())
-    if where:
-        verb = "is" if is_one(where) else "are"
-        out.append(f"{_sentence(where)} {verb} not connected to the first by any measurement.")
-    return " ".join(out)
-
-
-def _worst(covariances: Float64) -> Float64:
-    """(N,) standard deviations in the worst directions of (N, 3, 3); NaN where not known."""
-    known = np.isfinite(covariances).all((1, 2))
-    out = np.full(len(covariances), np.nan)
-    out[known] = np.sqrt(np.linalg.eigvalsh(covariances[known])[:, -1])
-    return out
 
 
 def _missed(e: Evidence) -> Iterator[Reason]:
@@ -488,13 +459,6 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
         "check the calibration."
     )
     yield Reason("calibration_alarm", ((gap.i, gap.j),), text)
-
-
-def _way(poses: Float64) -> float:
-    """Length of the path in m."""
-    n = len(poses)
-    some = np.unique(np.linspace(0, n - 1, min(n, PATH_POSES)).round().astype(int))
-    return float(np.linalg.norm(np.diff(poses[some, :3, 3], axis=0), axis=1).sum())
 
 
 def _gap(e: Evidence) -> Iterator[Reason]:
@@ -545,7 +509,8 @@ def _images(e: Evidence) -> Iterator[Reason]:
     # Images next to each other see the same errors of the sensor, but hardly any drift.
     near = [p for p in s.pairs if p.j == p.i + 1]
     share, rms = s.share(near), s.rms_m(near)
-    if s.share() < AGREEMENT_RATIO * share or s.rms_m() > RMS_RATIO * rms:
+    # By how much they are apart is in the bounds; how many are not there at all is not.
+    if s.share() < AGREEMENT_RATIO * share:
         nearby = f"{_percent(share)} ({rms * 1e3:.1f} mm rms)"
         texts.append(f"{found}, but {nearby} in consecutive images.")
     if texts:

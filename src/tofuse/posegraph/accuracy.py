@@ -1,0 +1,280 @@
+"""How far off the poses may be: 95 % bounds, from what the recording itself shows.
+
+The joint covariance of the poses says what noise, and the errors that the patches of a view share,
+leave room for. Two things come on top of it. By how much the refinement moved the trajectory is by
+how much the errors of single registrations, which are correlated, had bent it: what is left is in
+proportion. And views far apart in time that see the same surface disagree by more than consecutive
+ones do, if poses are wrong. `docs/uncertainty.md` shows how the factors were found, on recordings
+of other cameras and scenes than those on which they were tested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from tofuse.geometry import se3
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.trust import joint_covariance, pose_covariances
+from tofuse.registration.projective import UNITS
+
+Float64 = NDArray[np.float64]
+
+_LEVEL = 0.95
+# Poses, evenly spaced, that the rms is taken over, and the least certain ones beside them.
+_EVEN, _WORST = 50, 10
+# What a direction that nothing measures is given, as good as unbounded: m and rad.
+_OPEN = np.array([30.0] * 3 + [10.0] * 3)
+# No error is known to be larger than this: m and rad.
+_UNBOUNDED = np.array([3.0, 1.0])
+# What shows is the part of the errors in which views differ. Errors of the sensor that all views of
+# a place share show in nothing: in total they are so many times larger.
+_HIDDEN = 1.3
+# Directions of two frames are different ones above this share of the strongest.
+_DISTINCT = 0.3
+_NONE = np.zeros((0, 6))
+
+
+@dataclass(frozen=True)
+class WorstFrame:
+    """The frame whose pose is least certain, and its 95 % bounds: m and rad, inf if unbounded."""
+
+    frame: int
+    position_m: float
+    rotation_rad: float
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How far off the poses may be.
+
+    Attributes
+    ----------
+    position_m, rotation_rad
+        95 % bounds of the rms error over the frames, after the best rigid alignment. They are inf
+        where some direction is not bounded by any measurement.
+    relative
+        `position_m` as a share of the model's diagonal.
+    assessed
+        False where nothing was registered, or where registrations don't state their errors; then
+        the bounds are inf.
+    worst
+        The least certain frame; None where nothing was assessed.
+    unbounded
+        Indices of the frames whose pose is not bounded in some direction.
+    """
+
+    position_m: float = np.inf
+    rotation_rad: float = np.inf
+    relative: float = np.inf
+    assessed: bool = False
+    worst: WorstFrame | None = None
+    unbounded: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the recording shows of errors that the covariance does not know.
+
+    Attributes
+    ----------
+    moved_m, moved_rad
+        Rms by which the refinement moved the poses, after alignment.
+    excess_m
+        Rms by which views far apart in time disagree, beyond consecutive ones.
+    """
+
+    moved_m: float = 0.0
+    moved_rad: float = 0.0
+    excess_m: float = 0.0
+
+    @property
+    def position_m(self) -> float:
+        """Rms of positions that they come to."""
+        return float(np.hypot(self.moved_m, self.excess_m))
+
+
+def without_degenerate(
+    graph: PoseGraph,
+    unobservable: Mapping[int, Float64],
+    unmeasured: Collection[tuple[int, int]] = (),
+) -> PoseGraph:
+    """The graph without what it knows of directions that a frame does not constrain.
+
+    Whatever a pair of views measures, it measures on the surfaces that both see. So no pair says
+    anything of the directions in which one of its frames is degenerate; what seems to be said is
+    noise. These are left nearly free.
+
+    Parameters
+    ----------
+    unobservable
+        (k, 6) degenerate directions of frames, by their index: right perturbations, m and rad.
+    unmeasured
+        Pairs of frames between which only the motion was extrapolated.
+    """
+    information = graph.information.copy()
+    open_variance = np.diag((_OPEN / UNITS) ** 2)
+    for k, ((a, b), T_a_b) in enumerate(zip(graph.edges, graph.measurements, strict=True)):
+        i, j = int(graph.ids[a]), int(graph.ids[b])
+        if (i, j) in unmeasured or (j, i) in unmeasured:
+            information[k] = np.diag(_OPEN**-2.0)
+            continue
+        # A motion of a's frame moves b the other way, as seen from b.
+        there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_a_b)).T
+        weak = np.concatenate([there, unobservable.get(j, _NONE)]) / UNITS
+        if not len(weak):
+            continue
+        u, s, _ = np.linalg.svd(weak.T, full_matrices=False)
+        u = u[:, s > _DISTINCT * s[0]]
+        H = information[k] * np.outer(UNITS, UNITS)
+        scaled = H - H @ u @ np.linalg.pinv(u.T @ H @ u, hermitian=True) @ u.T @ H
+        free = u @ np.linalg.inv(u.T @ open_variance @ u) @ u.T
+        information[k] = (scaled + free) / np.outer(UNITS, UNITS)
+    return replace(graph, information=information)
+
+
+def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
+    """How far off the poses of a graph may be.
+
+    Parameters
+    ----------
+    graph
+        After refinement; its information is that of measurements alone, see `without_degenerate`.
+    diagonal_m
+        Of the model.
+    """
+    n = len(graph.ids)
+    if n < 2:
+        return Accuracy()
+    covariances, unbounded = _single(graph)
+    free = tuple(graph.ids[unbounded].tolist())
+    even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))
+    size = np.nan_to_num(np.trace(covariances[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
+    loosest = np.argsort(-size, kind="stable")[:_WORST]
+    looked_at = np.union1d(even, loosest)
+    C = joint_covariance(graph, looked_at)
+    if C is None:
+        first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
+        return Accuracy(assessed=True, worst=first, unbounded=free)
+    rms = np.isin(looked_at, even)
+    of_all, of_each = [], []
+    both = (shown.position_m, shown.moved_rad)
+    for part, extra in zip(_aligned(C, graph.poses[looked_at], rms), both, strict=True):
+        overall, each = _bounds(part, rms)
+        of_all.append(_HIDDEN * float(np.hypot(overall, extra)))
+        of_each.append(_HIDDEN * np.hypot(each, extra))
+    worst = int(np.argmax(np.maximum(of_each[0] / _UNBOUNDED[0], of_each[1] / _UNBOUNDED[1])))
+    position, rotation = _finite(of_all[0], of_all[1])
+    single = _finite(float(of_each[0][worst]), float(of_each[1][worst]))
+    return Accuracy(
+        position,
+        rotation,
+        position / diagonal_m if diagonal_m > 0 else np.inf,
+        True,
+        WorstFrame(int(graph.ids[looked_at[worst]]), *single),
+        free,
+    )
+
+
+def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
+    """(N, 6, 6) covariances of single poses relative to the first, as right perturbations.
+
+    NaN where nothing joins a pose to the first. A direction that is not bounded has a sigma of tens
+    of metres.
+    """
+    more = np.repeat([shown.position_m**2 / 3, shown.moved_rad**2 / 3], 3)
+    C = pose_covariances(graph)
+    C[1:] += np.diag(more)
+    return _HIDDEN**2 * C
+
+
+def _single(graph: PoseGraph) -> tuple[Float64, NDArray[np.bool_]]:
+    """Covariances (N, 6, 6) of the poses, and which of them are not bounded, (N,).
+
+    Relative to the first one; to another if that is one of the few that are not bounded.
+    """
+    covariances = pose_covariances(graph)
+    unbounded = _is_unbounded(covariances)
+    if 2 * unbounded.sum() > len(unbounded):
+        many = np.flatnonzero(unbounded)
+        other = pose_covariances(graph, int(many[len(many) // 2]))
+        if _is_unbounded(other).sum() < unbounded.sum():
+            return other, _is_unbounded(other)
+    return covariances, unbounded
+
+
+def _is_unbounded(covariances: Float64) -> NDArray[np.bool_]:
+    """(N,) poses of which some direction is known no better than from the motion."""
+    known = np.isfinite(covariances).all((1, 2))
+    out = np.asarray(~known, np.bool_)
+    C = covariances[known]
+    for part, limit in ((C[:, :3, :3], _UNBOUNDED[0]), (C[:, 3:, 3:], _UNBOUNDED[1])):
+        out[known] |= np.linalg.eigvalsh(part)[:, -1] > limit**2
+    return out
+
+
+def _finite(position_m: float, rotation_rad: float) -> tuple[float, float]:
+    """Bounds, inf where they say nothing: a pose that may be turned any way may be anywhere."""
+    return (
+        position_m if position_m < _UNBOUNDED[0] else np.inf,
+        rotation_rad if rotation_rad < _UNBOUNDED[1] else np.inf,
+    )
+
+
+def _aligned(C: Float64, poses: Float64, rms: NDArray[np.bool_]) -> tuple[Float64, Float64]:
+    """Covariances (3m, 3m) of positions and rotations in the world, less a rigid motion of all.
+
+    Parameters
+    ----------
+    C
+        (6m, 6m) of right perturbations.
+    poses
+        (m, 4, 4).
+    rms
+        (m,) poses that the alignment looks at.
+    """
+    m = len(poses)
+    C = C.reshape(m, 6, m, 6)
+    R, p = poses[:, :3, :3], poses[:, :3, 3]
+    positions, rotations = (
+        np.einsum("iab,ibjc,jdc->iajd", R, C[:, part, :, part], R, optimize=True).reshape(3 * m, -1)
+        for part in (np.s_[:3], np.s_[3:])
+    )
+    turn = np.tile(np.eye(3), (m, 1, 1))
+    motion = np.concatenate([turn, -se3.hat(p - p[rms].mean(0))], 2)
+    return _without(positions, motion, rms), _without(rotations, turn, rms)
+
+
+def _without(C: Float64, motion: Float64, rms: NDArray[np.bool_]) -> Float64:
+    """Covariance (3m, 3m) after the best fit of motions (m, 3, k) of the chosen ones is removed."""
+    k = motion.shape[2]
+    flat = motion.reshape(-1, k)
+    chosen = np.where(np.repeat(rms, 3)[:, None], flat, 0.0)
+    left = np.eye(len(flat)) - flat @ np.linalg.pinv(chosen, rcond=1e-9)
+    return np.asarray(left @ C @ left.T, np.float64)
+
+
+def _bounds(C: Float64, rms: NDArray[np.bool_]) -> tuple[float, Float64]:
+    """95 % bounds of the rms over the chosen ones, and of each one's length (m,)."""
+    m = len(rms)
+    chosen = np.repeat(rms, 3)
+    overall = _quantile(C[np.ix_(chosen, chosen)]) / rms.sum()
+    blocks = C.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m), :]
+    return float(np.sqrt(overall)), np.sqrt([_quantile(block) for block in blocks])
+
+
+def _quantile(C: Float64) -> float:
+    """95 % quantile of the squared length of a normal vector with this covariance.
+
+    A sum of squares is distributed nearly as a gamma variable of the same mean and variance
+    (Satterthwaite 1946).
+    """
+    mean, variance = float(np.trace(C)), 2 * float((C * C).sum())
+    if mean <= 0 or variance <= 0:
+        return 0.0
+    degrees = 2 * mean**2 / variance
+    return float(chi2.ppf(_LEVEL, degrees) * mean / degrees)

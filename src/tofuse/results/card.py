@@ -1,0 +1,61 @@
+"""The accuracy card: how accurate the result is, in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.posegraph.accuracy import Accuracy
+from tofuse.results.ranges import in_words, runs
+from tofuse.results.types import Reconstruction
+from tofuse.results.verdict import ADVICE, ranked
+
+SEPARATOR = " · "
+
+
+def card(result: Reconstruction) -> list[str]:
+    """Return the parts of the line: accuracy, what it rests on, the weakest frame, what to do."""
+    d = result.diagnostics
+    parts = [bound(d.accuracy, result.cloud.diagonal_m)]
+    readable = sum(f.status != "skipped" for f in d.frames)
+    closed = sum(p.accepted for p in d.loops)
+    loops = f", {closed} loop{'' if closed == 1 else 's'}"
+    parts.append(f"{int(result.has_pose.sum())} of {readable} frames{loops}")
+    if weakest := weakest_frame(d.accuracy):
+        parts.append(f"weakest: {weakest}")
+    if d.verdict != "good":
+        advice = [ADVICE[r.code] for r in ranked(d.reasons) if r.code in ADVICE]
+        if advice:
+            parts.append(f"to improve: {advice[0][0].lower()}{advice[0][1:].rstrip('.')}")
+    return parts
+
+
+def bound(a: Accuracy, diagonal_m: float) -> str:
+    """Say how accurate the poses are: "±24 mm (95 %) over 6.2 m, 0.4 %"."""
+    if not a.assessed:
+        return "accuracy not assessed"
+    if not np.isfinite(a.position_m):
+        return f"accuracy not bounded over {diagonal_m:.3g} m"
+    return f"±{length(a.position_m)} (95 %) over {diagonal_m:.3g} m, {100 * a.relative:.2g} %"
+
+
+def weakest_frame(a: Accuracy) -> str:
+    """Say which frames are known least, and how well; empty where nothing was assessed."""
+    if a.unbounded:
+        indices = list(a.unbounded)
+        where = in_words(runs(range(indices[0], indices[-1] + 1), _marked(indices)))
+        return f"{where}, not bounded"
+    if a.worst is None:
+        return ""
+    return f"frame {a.worst.frame}, {length(a.worst.position_m)}"
+
+
+def _marked(indices: list[int]) -> list[bool]:
+    chosen = set(indices)
+    return [k in chosen for k in range(indices[0], indices[-1] + 1)]
+
+
+def length(metres: float) -> str:
+    """Say a length: "2.3 mm", "24 mm", "1.20 m"."""
+    if metres >= 1:
+        return f"{metres:.2f} m"
+    return f"{metres * 1e3:.0f} mm" if metres >= 0.01 else f"{metres * 1e3:.1f} mm"

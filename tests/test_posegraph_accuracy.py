@@ -1,0 +1,137 @@
+"""Bounds hold as often as they say, and what nothing measures is not bounded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.trajectory import displacement
+from tofuse.geometry import se3
+from tofuse.posegraph import accuracy
+from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of, covariances_of
+from tofuse.posegraph.accuracy import without_degenerate as bounded
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+
+N = 14
+SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
+STEP = se3.exp(np.array([0.2, 0, 0.1, 0, 2 * np.pi / N, 0]))
+TRUE = np.stack([np.linalg.matrix_power(STEP, k) for k in range(N)])
+X, TURN = np.eye(6)[:1], np.eye(6)[4:5]
+
+
+def walk(rng: np.random.Generator | None = None, *, loops=((0, N - 1), (2, 9))) -> PoseGraph:
+    def measured(i: int, j: int) -> Measured:
+        noise = np.zeros(6) if rng is None else SIGMA * rng.standard_normal(6)
+        return Measured(i, j, se3.inverse(TRUE[i]) @ TRUE[j] @ se3.exp(noise), np.diag(SIGMA**-2.0))
+
+    steps = [measured(k, k + 1) for k in range(N - 1)]
+    return build_graph(range(N), TRUE, steps, [measured(i, j) for i, j in loops])
+
+
+@pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
+def test_errors_are_within_the_bounds_as_often_as_they_say(loops, monkeypatch) -> None:
+    """With noise alone, which the covariance knows in full."""
+    monkeypatch.setattr(accuracy, "_HIDDEN", 1.0)
+    rng = np.random.default_rng(11)
+    solve = LevenbergMarquardt(robust="none").optimise
+    found = np.array(
+        [displacement(TRUE, solve(walk(rng, loops=loops)).graph.poses) for _ in range(300)]
+    )
+    bound = accuracy_of(walk(loops=loops), Shown(), 2.0)
+    for column, limit in zip(found.T, (bound.position_m, bound.rotation_rad), strict=True):
+        assert 0.91 < np.mean(column < limit) < 0.985
+        assert limit < 2.5 * np.median(column)
+    assert bound.assessed
+    assert bound.relative == bound.position_m / 2
+    assert bound.worst is not None
+    assert bound.worst.position_m > bound.position_m
+    assert bound.unbounded == ()
+
+
+def test_without_loops_the_ends_are_known_least() -> None:
+    a = accuracy_of(walk(loops=()), Shown(), 1.0)
+    assert a.worst is not None
+    assert a.worst.frame in (0, N - 1)
+    assert a.position_m > 1.5 * accuracy_of(walk(), Shown(), 1.0).position_m
+
+
+def test_what_the_recording_shows_is_added() -> None:
+    plain = accuracy_of(walk(), Shown(), 1.0)
+    more = accuracy_of(walk(), Shown(0.03, 0.02, 0.04), 1.0)
+    assert more.position_m > 0.05
+    assert more.position_m == pytest.approx(
+        np.hypot(plain.position_m, accuracy._HIDDEN * 0.05), rel=1e-6
+    )
+    assert more.rotation_rad > plain.rotation_rad
+    C = covariances_of(walk(), Shown(0.03, 0.02, 0.04))
+    np.testing.assert_array_equal(C[0], 0)
+    assert np.trace(C[5, :3, :3]) > 0.05**2
+
+
+@pytest.mark.parametrize("direction", [X, TURN])
+def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
+    """However much information noise has made of it; frames on both sides stay bounded."""
+    graph = walk()
+    slide = dict.fromkeys((4, 5, 6), direction)
+    a = accuracy_of(bounded(graph, slide), Shown(), 1.0)
+    assert a.unbounded == (4, 5, 6)
+    assert a.worst is not None
+    assert a.worst.frame in (4, 5, 6)
+    worst = a.worst.position_m if direction is X else a.worst.rotation_rad
+    assert np.isinf(worst)
+    assert np.isinf(a.position_m if direction is X else a.rotation_rad)
+    # Edges of other frames are as they were.
+    others = [k for k, (i, j) in enumerate(graph.edges) if not {i, j} & {4, 5, 6}]
+    np.testing.assert_array_equal(
+        bounded(graph, slide).information[others], graph.information[others]
+    )
+
+
+def test_other_directions_of_a_degenerate_frame_are_still_measured() -> None:
+    graph = bounded(walk(), {5: X})
+    C = covariances_of(graph, Shown())[5]
+    sigma = np.sqrt(np.linalg.eigvalsh(C[:3, :3]))
+    assert sigma[1] < 0.05
+    assert sigma[2] > 1
+
+
+def test_a_degenerate_start_leaves_the_rest_bounded() -> None:
+    """What is relative to the first frame would all be unbounded."""
+    a = accuracy_of(bounded(walk(loops=((2, N - 1),)), {0: X, 1: X}), Shown(), 1.0)
+    assert a.unbounded == (0, 1)
+
+
+def test_extrapolated_motion_bounds_nothing() -> None:
+    graph = walk(loops=())
+    a = accuracy_of(bounded(graph, {}, [(9, 8)]), Shown(), 1.0)
+    assert set(a.unbounded) in ({*range(9)}, {*range(9, N)})
+    assert np.isinf(a.position_m)
+
+
+def test_parts_that_nothing_connects_are_not_bounded() -> None:
+    graph = walk(loops=())
+    keep = np.arange(N - 1) != 8
+    columns = {k: getattr(graph, k)[keep] for k in ("edges", "measurements", "information", "loop")}
+    a = accuracy_of(replace(graph, **columns), Shown(), 1.0)
+    assert a.assessed
+    assert np.isinf(a.position_m)
+    assert len(a.unbounded) in (5, 9)
+
+
+def test_one_pose_is_not_assessed() -> None:
+    one = build_graph([7], TRUE[:1], [])
+    assert accuracy_of(one, Shown(), 1.0) == Accuracy()
+
+
+def test_displacement_ignores_a_motion_of_all() -> None:
+    moved = se3.exp(np.array([1.0, 2, 3, 0.3, -0.2, 0.5])) @ TRUE
+    np.testing.assert_allclose(displacement(TRUE, moved), 0, atol=1e-9)
+    other = moved.copy()
+    other[3, :3, 3] += [0.0, 0.1, 0.0]
+    distance, angle = displacement(TRUE, other)
+    assert 0.02 < distance < 0.1 / np.sqrt(N) + 1e-9
+    assert angle == pytest.approx(0, abs=1e-9)
