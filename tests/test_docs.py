@@ -230,7 +230,7 @@ def test_every_field_of_run_json_is_documented(room_recording: Path) -> None:
     data = run_json(result)
     section = sections("docs/commands.md")["run.json"]
     top, accuracy, frames, components, loops = re.split(
-        r"^Fields of a \w+(?:, .*)?:$", section, flags=re.MULTILINE
+        r"^Fields of an? \w+(?:, .*)?:$", section, flags=re.MULTILINE
     )
     assert {c for row in rows(top) for c in codes(row[0])} == set(data)
     assert {c for row in rows(accuracy) for c in codes(row[0])} == set(data["accuracy"])
