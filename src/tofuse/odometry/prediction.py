@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,10 @@ class Prediction:
             found = np.where(known & known_later & (one > 0), found, _USUAL_POWER)
             power = (float(found[0]), float(found[1]))
         return cls((float(sigma[0] * UNITS[0]), float(sigma[1] * UNITS[3])), power)
+
+    def at_worst(self) -> Prediction:
+        """The same, with errors that grow as fast as those of a random walk."""
+        return replace(self, power=(_USUAL_POWER, _USUAL_POWER))
 
     def error(self, run: int, frames: int) -> tuple[float, float]:
         """Sigma of each component of a motion in a degenerate direction, m and rad.

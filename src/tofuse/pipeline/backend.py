@@ -156,7 +156,9 @@ class BackEnd:
         self._progress.stage("closing loops")
         with self._watch.timing("loops"):
             tracked = self.graph(())
-            unsure = dict(zip(tracked.ids.tolist(), pose_covariances(tracked), strict=True))
+            # Where the camera may be: the motion there need not be like that of other stretches.
+            covariances = pose_covariances(self.graph((), cautious=True))
+            unsure = dict(zip(tracked.ids.tolist(), covariances, strict=True))
             found = self._kept.loops.finish(self._poses, unsure)
             loops = with_joins(found, self._joins)
             graph = self.graph(loops)
@@ -275,8 +277,17 @@ class BackEnd:
             components=components,
         )
 
-    def graph(self, loops: Sequence[ClosedLoop], refined: Refinement | None = None) -> PoseGraph:
-        """The graph as it was tracked and joined, or with what the refinement measured instead."""
+    def graph(
+        self,
+        loops: Sequence[ClosedLoop],
+        refined: Refinement | None = None,
+        *,
+        cautious: bool = False,
+    ) -> PoseGraph:
+        """The graph as it was tracked and joined, or with what the refinement measured instead.
+
+        If `cautious`, motion in degenerate directions is taken to be lost as fast as it ever is.
+        """
         ids = [e.record.index for e in self._posed]
         tracked = np.array([self._poses[index] for index in ids])
         poses = tracked if refined is None else refined.poses
@@ -286,6 +297,8 @@ class BackEnd:
         unobservable = [e.record.unobservable for e in self._posed]
         run = runs(unobservable)
         prediction = Prediction.of(tracked, unobservable) if run.any() else None
+        if prediction is not None and cautious:
+            prediction = prediction.at_worst()
         times = {e.record.index: e.record.timestamp for e in self._posed}
         interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
         sequence = []
