@@ -357,6 +357,14 @@ def test_a_path_is_good_within_the_tolerance() -> None:
     assert evidence(sigma=(0.008, 0.0001)).accuracy.position_m < 0.8 * bound
 
 
+def test_rotations_have_a_tolerance_of_their_own() -> None:
+    e = evidence(gaps=(), sigma=(1e-5, np.radians(0.8)))
+    (reason,) = judge(replace(e, tolerance_m=10.0))[1]
+    assert reason.code == "uncertain_poses"
+    assert "the tolerance is 2.0°" in reason.text
+    assert codes(evidence(gaps=(), sigma=(1e-5, np.radians(0.1)))) == []
+
+
 def test_poses_that_no_measurement_bounds_are_named() -> None:
     e = evidence(gaps=(), sigma=(0.001, 0.0005))
     loose = replace(e.accuracy, position_m=np.inf, unbounded=(3, 4, 7))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from tofuse.inspection.inspect import inspect_recording as inspect
     from tofuse.live.player import Player
     from tofuse.pipeline.config import Config
+    from tofuse.pipeline.judging import Judgement, judge
     from tofuse.pipeline.mapper import Mapper
     from tofuse.pipeline.reconstruct import reconstruct
     from tofuse.recordings.frames import CloudFrame, RangeFrame
@@ -33,6 +34,7 @@ _HOMES = {
     "CloudFrame": "tofuse.recordings.frames",
     "Config": "tofuse.pipeline.config",
     "InputError": "tofuse.errors",
+    "Judgement": "tofuse.pipeline.judging",
     "Mapper": "tofuse.pipeline.mapper",
     "OutputError": "tofuse.errors",
     "Player": "tofuse.live.player",
@@ -43,6 +45,7 @@ _HOMES = {
     "RegistrationError": "tofuse.errors",
     "TofuseError": "tofuse.errors",
     "inspect": "tofuse.inspection.inspect",
+    "judge": "tofuse.pipeline.judging",
     "open": "tofuse.recordings.open",
     "reconstruct": "tofuse.pipeline.reconstruct",
     "register": "tofuse.registration.register",
@@ -52,6 +55,7 @@ __all__ = [
     "CloudFrame",
     "Config",
     "InputError",
+    "Judgement",
     "Mapper",
     "OutputError",
     "Player",
@@ -63,6 +67,7 @@ __all__ = [
     "TofuseError",
     "__version__",
     "inspect",
+    "judge",
     "open",
     "reconstruct",
     "register",

@@ -6,7 +6,7 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tofuse.cli.progress import emit, progress_for
-from tofuse.results.types import Reconstruction
+from tofuse.results.types import Reason, Reconstruction
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -166,6 +166,50 @@ def register(arguments: argparse.Namespace) -> int:
     return exit_status(result)
 
 
+def judge(arguments: argparse.Namespace) -> int:
+    """``tofuse judge``."""
+    from tofuse.errors import InputError
+    from tofuse.pipeline.judging import JudgeOptions, judge_files, sentence
+    from tofuse.results.output import plain
+
+    if arguments.overwrite and arguments.out is None:
+        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
+    options = JudgeOptions(
+        out=arguments.out,
+        overwrite=arguments.overwrite,
+        tolerance=arguments.tolerance,
+        format=arguments.format,
+        camera=arguments.camera,
+        topic=arguments.topic,
+        start=arguments.start,
+        end=arguments.end,
+        every=arguments.every,
+        threads=arguments.threads,
+    )
+    # With --json only the one object is printed.
+    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+        found = judge_files([arguments.recording], arguments.trajectory, options, progress)
+    status = 3 if found.verdict == "failed" else 0
+    if arguments.json:
+        emit({**plain(found.to_dict()), "out": None if options.out is None else str(options.out)})
+        return status
+    console = _Output(highlight=False, soft_wrap=True)
+    console.print(f"[bold {_COLORS[found.verdict]}]{found.verdict}[/]")
+    _print_reasons(console, found.reasons)
+    console.print(sentence(found, arguments.trajectory.name), markup=False)
+    pairs = (("given", found.consistency), ("refined", found.refined_consistency))
+    said = [
+        f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_share:.1%} inliers"
+        for name, c in pairs
+        if c is not None
+    ]
+    if said:
+        console.print(f"map consistency: {'; '.join(said)}", markup=False)
+    if options.out is not None:
+        console.print(f"see {options.out / 'report.html'}", markup=False)
+    return status
+
+
 def demo(arguments: argparse.Namespace) -> int:
     """``tofuse demo``."""
     from tofuse.kernels.threads import threads
@@ -191,7 +235,6 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     from tofuse.results.card import SEPARATOR, card
     from tofuse.results.output import accuracy_json, component_name, plain, reasons_json
     from tofuse.results.ranges import in_words
-    from tofuse.results.verdict import ADVICE, REASONS, ranked
 
     d = result.diagnostics
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
@@ -213,11 +256,7 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
         return
     console = _Output(highlight=False, soft_wrap=True)
     console.print(f"[bold {_COLORS[d.verdict]}]{d.verdict}[/]")
-    for reason in ranked(d.reasons):
-        level = REASONS[reason.code][0]
-        console.print(f"  [{_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
-        if reason.code in ADVICE:
-            console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
+    _print_reasons(console, d.reasons)
     console.print(SEPARATOR.join(card(result)), markup=False)
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
@@ -231,6 +270,16 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
         if component.result is not None and not component.connected:
             path = out / component_name(number) / "report.html"
             console.print(f"and {path}, for {in_words(component.frames)}", markup=False)
+
+
+def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
+    from tofuse.results.verdict import ADVICE, REASONS, ranked
+
+    for reason in ranked(reasons):
+        level = REASONS[reason.code][0]
+        console.print(f"  [{_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
+        if reason.code in ADVICE:
+            console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
 
 
 def simulate(arguments: argparse.Namespace) -> int:

@@ -84,6 +84,7 @@ def make_parser() -> Parser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _run(commands)
     _register(commands)
+    _judge(commands)
     _demo(commands)
     _simulate(commands)
     _inspect(commands)
@@ -212,6 +213,32 @@ def _register(commands: Any) -> None:
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
     g = p.add_argument_group("what to read")
     _source(g)
+
+
+def _judge(commands: Any) -> None:
+    p = _command(
+        commands,
+        "judge",
+        "say how accurate poses from anywhere are, without a reference",
+        epilog="exit status: 0, judged; 3, the depth images contradict the poses; 2, bad input",
+    )
+    p.add_argument("recording", metavar="RECORDING", help="images of a depth camera")
+    p.add_argument(
+        "trajectory", type=Path, metavar="TRAJECTORY", help="a TUM trajectory, or a result"
+    )
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the refined result (none)")
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
+    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument(
+        "--tolerance",
+        type=_length,
+        metavar="LENGTH",
+        help="accuracy of good poses, as 30mm (0.5 %% of the model, at least 10mm)",
+    )
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    g = p.add_argument_group("what to read")
+    _source(g)
+    _selection(g)
 
 
 def _demo(commands: Any) -> None:

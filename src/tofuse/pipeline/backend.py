@@ -13,6 +13,7 @@ from tofuse.evaluation.sightings import Sightings, sightings
 from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
+from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.prediction import Prediction, runs, with_prediction
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.checks import Evidence, judge
@@ -132,6 +133,7 @@ class BackEnd:
         self._config, self._log, self._poses, self._joins = config, log, poses, joins
         self._given, self._kept, self._progress, self._watch = given, kept, progress, watch
         self._posed = [e for e in log.posed if e.record.index in poses]
+        self._tracks = not isinstance(config.odometry, GivenPoses)
 
     def run(self, stages: Stages, components: tuple[Component, ...]) -> Reconstruction:
         """Make the reconstruction; `stages` keeps what there is after each step."""
@@ -227,7 +229,7 @@ class BackEnd:
                 records,
                 tuple(e.step.registration if e.step is not None else None for e in log.entries),
                 loops,
-                closed.judged.sequential,
+                closed.judged.sequential if self._tracks else graph.poses,
                 closed.judged.optimisation,
                 sightings,
                 accuracy,
@@ -345,7 +347,9 @@ class BackEnd:
         }
         bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
         graph = without_degenerate(refined.graph, unobservable, bridges)
-        moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+        moved = 0.0, 0.0
+        if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
+            moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
         excess = 0.0 if sightings is None else sightings.excess_m()
         shown = Shown(*moved, excess)
         return accuracy_of(graph, shown, model.cloud.diagonal_m), covariances_of(graph, shown)

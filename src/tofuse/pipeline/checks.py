@@ -39,6 +39,8 @@ UNORDERED, UNORDERED_SHARE = 3, 0.2
 STILL_M, STILL_RAD = 0.01, np.radians(0.5)
 # Unless a tolerance is given, it is this share of the model's diagonal, and at least so many m.
 TOLERANCE_SHARE, TOLERANCE_M = 0.005, 0.01
+# Rotations are never good beyond this.
+TOLERANCE_RAD = np.radians(2)
 # Loops miss where odometry leads by a chi-square variable with six degrees of freedom, if both
 # know their errors: one in a thousand misses by more.
 MISSED = 22.46
@@ -136,9 +138,7 @@ class Evidence:
     @property
     def tolerance(self) -> float:
         """What the poses may be off by, m."""
-        if self.tolerance_m is not None:
-            return self.tolerance_m
-        return max(TOLERANCE_M, TOLERANCE_SHARE * self.diagonal_m)
+        return tolerance_of(self.tolerance_m, self.diagonal_m)
 
     @property
     def in_main(self) -> list[bool]:
@@ -153,6 +153,11 @@ class Evidence:
         """Ranges of the records with these indices."""
         chosen = set(frames)
         return self.runs([record.index in chosen for record in self.records])
+
+
+def tolerance_of(given_m: float | None, diagonal_m: float) -> float:
+    """What poses may be off by, m: as given, or in proportion to the model's diagonal."""
+    return max(TOLERANCE_M, TOLERANCE_SHARE * diagonal_m) if given_m is None else given_m
 
 
 def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
@@ -402,24 +407,29 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     """With known errors of the registrations, those of the path follow."""
     yield from _missed(e)
     yield from _suspected(e)
-    a = e.accuracy
+    yield from bounds(e.accuracy, e.tolerance, [r.index for r in e.records])
+
+
+def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[Reason]:
+    """Give reasons where an accuracy of frames with these indices is not within a tolerance."""
     if not a.assessed:
         return
-    free = e.runs_of(a.unbounded)
+    chosen = set(a.unbounded)
+    free = runs(frames, [k in chosen for k in frames])
     if free:
         text = (
             f"{_poses_of(free)} not constrained in some direction (degenerate geometry): the "
             "motion is extrapolated there, and its error is not bounded."
         )
         yield Reason("unobserved_motion", free, text)
-    elif a.position_m > e.tolerance:
-        text = (
-            f"The poses may be off by {_length(a.position_m)} rms (95 % bound); the tolerance is "
-            f"{_length(e.tolerance)}."
-        )
+    elif a.position_m > tolerance_m or a.rotation_rad > TOLERANCE_RAD:
+        off, limit = _length(a.position_m), _length(tolerance_m)
+        if a.position_m <= tolerance_m:
+            off, limit = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
+        text = f"The poses may be off by {off} rms (95 % bound); the tolerance is {limit}."
         if a.worst is not None:
             text += f" Frame {a.worst.frame} is the least certain: {_length(a.worst.position_m)}."
-        yield Reason("uncertain_poses", e.posed, text)
+        yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
 
 
 def _missed(e: Evidence) -> Iterator[Reason]:
@@ -492,29 +502,34 @@ def _gap(e: Evidence) -> Iterator[Reason]:
 
 
 def _images(e: Evidence) -> Iterator[Reason]:
-    s = e.sightings
-    if s is None or not np.isfinite(s.share()):
+    if e.sightings is not None:
+        yield from images(e.sightings, e.posed)
+
+
+def images(s: Sightings, everything: tuple[Range, ...]) -> Iterator[Reason]:
+    """Give reasons where overlapping images contradict the poses of a stretch of frames."""
+    if not np.isfinite(s.share()):
         return
     found = f"{_percent(s.share())} of overlapping measurements are consistent with the poses"
     if np.isfinite(s.rms_m()):
         found += f" ({s.rms_m() * 1e3:.1f} mm rms)"
     if s.share() < CONTRADICTED_SHARE:
-        yield Reason("images_disagree", e.posed, f"Only {found}.")
+        yield Reason("images_disagree", everything, f"Only {found}.")
         return
     texts = []
     alone = runs(s.frames, [share < CONTRADICTED_SHARE for share in s.share_of_views()])
     if alone:
         verb = "is" if is_one(alone) else "are"
         texts.append(f"{_sentence(alone)} {verb} inconsistent with most overlapping frames.")
-    # Images next to each other see the same errors of the sensor, but hardly any drift.
+    # Images next to each other see the same errors of the sensor, but hardly any drift. By how much
+    # they are apart is in the bounds; how many are not there at all is not.
     near = [p for p in s.pairs if p.j == p.i + 1]
-    share, rms = s.share(near), s.rms_m(near)
-    # By how much they are apart is in the bounds; how many are not there at all is not.
+    share = s.share(near)
     if s.share() < AGREEMENT_RATIO * share:
-        nearby = f"{_percent(share)} ({rms * 1e3:.1f} mm rms)"
+        nearby = f"{_percent(share)} ({s.rms_m(near) * 1e3:.1f} mm rms)"
         texts.append(f"{found}, but {nearby} in consecutive images.")
     if texts:
-        yield Reason("images_differ", alone or e.posed, " ".join(texts))
+        yield Reason("images_differ", alone or everything, " ".join(texts))
 
 
 def stretches(records: Sequence[FrameRecord], status: str) -> tuple[Range, ...]:

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.filters.base import Filter
 from tofuse.filters.correction import Correction
 from tofuse.kernels.threads import threads as use_threads
+from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.parts import name_of
 from tofuse.pipeline.config import Config, check_views, kind_of
@@ -57,7 +58,7 @@ def learnt(
             if item.on_trial:
                 config = _tried(config, item, recording, progress or Silent())
         odometry = config.odometry
-        if isinstance(odometry, Keyframes) and odometry.surface.falloff is None:
+        if isinstance(odometry, Keyframes | GivenPoses) and odometry.surface.falloff is None:
             falloff = 0.0
             if _has_amplitude(recording):
                 falloff = estimate_falloff(recording, _prepared(config), odometry.surface)

@@ -22,6 +22,8 @@ class ReportExtras:
     ----------
     title
         For example the name of the input.
+    headline
+        Said above everything else; may be empty.
     filter_steps
         ("raw", frame), then (name, frame) after each filter in order, for one sample frame.
     reference
@@ -36,6 +38,7 @@ class ReportExtras:
     """
 
     title: str
+    headline: str = ""
     filter_steps: tuple[tuple[str, Frame], ...] = ()
     reference: Float64 | None = None
     truth_points: Float32 | None = None

@@ -20,6 +20,7 @@ from tofuse.report import (
 )
 from tofuse.report.extras import ReportExtras
 from tofuse.report.subject import Subject, Values
+from tofuse.results.card import card
 from tofuse.results.types import Reconstruction
 
 
@@ -93,6 +94,8 @@ def _verdict(s: Subject) -> Values:
     facts.append(("loops closed", f"{closed:,}"))
     return {
         "title": s.extras.title,
+        "headline": s.extras.headline,
+        "card": card(result),
         "subtitle": _subtitle(result),
         "verdict": result.diagnostics.verdict,
         "verdict_head": head + ":",

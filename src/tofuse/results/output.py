@@ -52,6 +52,7 @@ FILES = (
     "report.html",
     "view.npz",
     "run.json",
+    "judge.json",
     "cloud.pcd",
     "cloud.las",
     "cloud.e57",

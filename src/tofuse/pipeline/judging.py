@@ -1,0 +1,416 @@
+"""Judging poses from elsewhere: do they agree with the depth, and how much better could they be?
+
+The poses take the place of tracking; from there on everything is as in a run: loops are closed, and
+all views are refined together. How far the given poses are from the refined ones, and how far those
+may be off themselves, is how far the given ones may be off. Where images contradict even the
+refined poses, the recording is tracked anew, and what the images support better counts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.evaluation.consistency import Consistency, map_consistency
+from tofuse.evaluation.sightings import Sightings, sightings
+from tofuse.evaluation.trajectory import align
+from tofuse.evaluation.trajectory import displacement as displacement_of
+from tofuse.files.trajectory import associated_poses, read_tum
+from tofuse.geometry import se3
+from tofuse.odometry.given import GivenPoses
+from tofuse.odometry.motion import Moment, jumps
+from tofuse.pipeline.checks import bounds, images, tolerance_of
+from tofuse.pipeline.config import Config, check_views, from_method
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.reconstruct import reconstruct, view_kind
+from tofuse.posegraph.accuracy import Accuracy, WorstFrame
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording, Source, evenly
+from tofuse.results.card import bound
+from tofuse.results.output import OutputFolder, accuracy_json, plain, reasons_json, write_result
+from tofuse.results.ranges import in_words, runs
+from tofuse.results.types import Reason, Reconstruction, Verdict
+from tofuse.results.verdict import ranked, verdict_of
+
+Float64 = NDArray[np.float64]
+
+# Frames whose images are compared under the poses.
+_CHECKED = 60
+# Where less of what overlapping images say supports the poses, another trajectory is looked for.
+_SUPPORTED = 0.95
+# Where fewer views overlap than this share of those that do under the refined poses, most of the
+# poses are wrong.
+_MOST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What the depth says of poses from elsewhere.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera of the frames as given, NaN where none is.
+    accuracy
+        Of these poses.
+    verdict, reasons
+        As of a run.
+    consistency, refined_consistency
+        Map consistency of the given poses and of the refined ones; None if no two views overlap.
+    displacement_m
+        (N,) distance of each given pose from the refined one after alignment, m; NaN where unknown.
+    refined
+        The result of a refinement that started from the poses; or of a run of its own, where the
+        images support that better.
+    started
+        Whether `refined` started from the poses.
+    """
+
+    poses: Float64
+    accuracy: Accuracy
+    verdict: Verdict
+    reasons: tuple[Reason, ...]
+    consistency: Consistency | None
+    refined_consistency: Consistency | None
+    displacement_m: Float64
+    refined: Reconstruction
+    started: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `judge.json` holds, but for numbers that are inf."""
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "accuracy": accuracy_json(self.accuracy),
+            "reasons": reasons_json(self.reasons),
+            "frames": int(np.isfinite(self.poses[:, 0, 0]).sum()),
+            "map_consistency": None if self.consistency is None else self.consistency.to_dict(),
+            "displacement_m": self.displacement_m,
+            "refined": {
+                "from_these_poses": self.started,
+                "verdict": self.refined.diagnostics.verdict,
+                "accuracy": accuracy_json(self.refined.diagnostics.accuracy),
+                "map_consistency": None
+                if self.refined_consistency is None
+                else self.refined_consistency.to_dict(),
+            },
+        }
+
+
+def judge(
+    recording: Recording,
+    trajectory: str | Path | Float64,
+    *,
+    tolerance_m: float | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Judgement:
+    """Say how accurate poses from anywhere are, without a reference.
+
+    Parameters
+    ----------
+    recording
+        What `tofuse.open` gives; images of a camera.
+    trajectory
+        A TUM file, the folder of a result, or (N, 4, 4) T_world_camera of the frames, NaN where
+        there is none. Poses of a file belong to the frames that are nearest in time, within 20 ms.
+    tolerance_m
+        As of `Config`.
+
+    Raises
+    ------
+    InputError
+        If fewer than two frames have a pose, or the recording holds clouds.
+    """
+    progress = progress or Silent()
+    poses = poses_for(recording, trajectory)
+    config = replace(from_method("default", view_kind(recording)), tolerance_m=tolerance_m)
+    check_views(replace(config, odometry=GivenPoses()), view_kind(recording))
+    # What else moves with the camera says nothing of these poses.
+    config = replace(config, outside=())
+
+    def made(led: Recording, by: Config) -> tuple[Reconstruction, Seen]:
+        result = reconstruct(led, by, threads=threads, progress=progress)
+        return result, Seen.of(recording, result.trajectory)
+
+    progress.stage("comparing images")
+    seen = Seen.of(recording, poses)
+    refined, after = made(with_odometry(recording, poses), replace(config, odometry=GivenPoses()))
+    started = True
+    if not after.is_supported:
+        other, seen_other = made(recording, config)
+        if seen_other.support > after.support:
+            refined, after, started = other, seen_other, False
+    displacement = _displacement(poses, refined.trajectory)
+    accuracy = _accuracy(displacement, poses, refined)
+    reasons = ranked([*_reasons(poses, accuracy, seen, after, refined, tolerance_m)])
+    return Judgement(
+        poses,
+        accuracy,
+        verdict_of(reasons),
+        reasons,
+        _consistency(recording, poses),
+        _consistency(recording, refined.trajectory),
+        displacement,
+        refined,
+        started,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What overlapping images say of poses."""
+
+    sightings: Sightings
+
+    @classmethod
+    def of(cls, recording: Recording, poses: Float64) -> Seen:
+        """Compare some of the frames of a recording under their poses (N, 4, 4)."""
+        frames, chosen = [], []
+        for k in evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist():
+            try:
+                frame = recording[k]
+            except UnreadableFrameError:
+                continue
+            if isinstance(frame, RangeFrame):
+                frames.append(frame)
+                chosen.append(k)
+        return cls(sightings(frames, poses[chosen]))
+
+    @property
+    def overlapping(self) -> float:
+        """Share of the views that overlap with another one."""
+        shares = self.sightings.share_of_views()
+        return float(np.isfinite(shares).mean()) if len(shares) else 0.0
+
+    @property
+    def support(self) -> float:
+        """Share of the overlapping measurements that support the poses, times `overlapping`."""
+        return float(np.nan_to_num(self.sightings.share())) * self.overlapping
+
+    @property
+    def is_supported(self) -> bool:
+        """Whether all views overlap with others, and hardly anything contradicts the poses."""
+        return self.support >= _SUPPORTED
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """The options of ``tofuse judge``; see its ``--help``."""
+
+    out: Path | None = None
+    overwrite: bool = False
+    tolerance: float | None = None
+    format: str | None = None
+    camera: Path | None = None
+    topic: str | None = None
+    start: int = 0
+    end: int | None = None
+    every: int = 1
+    threads: int | None = None
+
+
+def judge_files(
+    inputs: Sequence[str | Path],
+    trajectory: Path,
+    options: JudgeOptions | None = None,
+    progress: Progress | None = None,
+) -> Judgement:
+    """Judge the poses in a file, and write the refined result if a folder is given for it.
+
+    Raises
+    ------
+    InputError
+        If the recording or the poses can't be used.
+    OutputError
+        If the result can't be written; nothing that was there before has changed then.
+    """
+    options, progress = options or JudgeOptions(), progress or Silent()
+    recording = open_recording(
+        *inputs, format=options.format, camera=options.camera, topic=options.topic
+    ).select(options.start, options.end, options.every)
+    folder = None
+    if options.out is not None:
+        folder = OutputFolder(options.out, overwrite=options.overwrite)
+    try:
+        found = judge(
+            recording,
+            trajectory,
+            tolerance_m=options.tolerance,
+            threads=options.threads,
+            progress=progress,
+        )
+        if folder is not None:
+            progress.stage("writing")
+            with threadpool_limits(1):
+                _write(found, trajectory, recording, folder)
+    finally:
+        if folder is not None:
+            folder.discard()
+    return found
+
+
+def _write(found: Judgement, trajectory: Path, recording: Recording, folder: OutputFolder) -> None:
+    """Write the refined result, with the judgement beside it and at the top of its report."""
+    from tofuse.report.extras import ReportExtras
+    from tofuse.report.html import write_report
+    from tofuse.report.pictures import draw
+    from tofuse.viewer.kept import NAME, write_kept
+
+    def report(result: Reconstruction, here: Path) -> None:
+        pictures = draw(result.diagnostics.samples)
+        headline = sentence(found, trajectory.name) if result is found.refined else ""
+        title = f"{trajectory.name} on {Path(recording.path).name}"
+        extras = ReportExtras(title=title, headline=headline, pictures=pictures)
+        write_report(result, here / "report.html", extras)
+        write_kept(result, pictures, here / NAME)
+        if result is found.refined:
+            text = json.dumps(plain(found.to_dict()), indent=1, allow_nan=False)
+            (here / "judge.json").write_text(text + "\n", encoding="utf-8")
+
+    write_result(found.refined, folder, report)
+
+
+def sentence(found: Judgement, name: str) -> str:
+    """Say what the judgement comes to: "poses.txt: ±31 mm ...; refined: ±9 mm ..."."""
+    diagonal = found.refined.cloud.diagonal_m
+    given = bound(found.accuracy, diagonal)
+    better = bound(found.refined.diagnostics.accuracy, diagonal)
+    how = "refined" if found.started else "tracked anew"
+    return f"{name}: {given}; {how}: {better}."
+
+
+def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64:
+    """(N, 4, 4) poses of the frames of a recording, NaN where a trajectory has none; see `judge`.
+
+    Raises
+    ------
+    InputError
+        If fewer than two frames have a pose, or an array is of another length.
+    """
+    where = "trajectory"
+    if isinstance(trajectory, str | Path):
+        path = Path(trajectory)
+        where = str(path)
+        times, given = read_tum(path / "trajectory.txt" if path.is_dir() else path)
+        poses = associated_poses(recording.timestamps, times, given)
+    else:
+        poses = np.array(trajectory, float)
+        if poses.shape != (len(recording), 4, 4):
+            raise InputError(
+                f"has shape {poses.shape}, for {len(recording)} frames",
+                where=where,
+                remedy="give one (4, 4) pose for each frame, NaN where there is none",
+            )
+        for T in poses[np.isfinite(poses).all((1, 2))]:
+            se3.check_pose(T, where=where)
+    known = int(np.isfinite(poses).all((1, 2)).sum())
+    if known < 2:
+        raise InputError(
+            f"has a pose for {known} of the {len(recording)} frames",
+            where=where,
+            remedy="give timestamps in seconds on the clock of the recording",
+        )
+    return poses
+
+
+@dataclass
+class _Led:
+    """A source with other odometry."""
+
+    source: Source
+    odometry: Float64 | None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+
+def with_odometry(recording: Recording, poses: Float64) -> Recording:
+    """The recording with poses (N, 4, 4) as its odometry."""
+    of_source = np.full((len(recording.source.timestamps), 4, 4), np.nan)
+    of_source[recording.indices] = poses
+    source: Any = _Led(recording.source, of_source)
+    return replace(recording, source=source)
+
+
+def _displacement(poses: Float64, refined: Float64) -> Float64:
+    both = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
+    out = np.full(len(poses), np.nan)
+    if both.any():
+        moved = align(poses[both], refined[both]) @ poses[both] - refined[both]
+        out[both] = np.linalg.norm(moved[:, :3, 3], axis=1)
+    return out
+
+
+def _accuracy(displacement: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
+    """Of the given poses: how far from the refined ones, and how far those may be off."""
+    known = refined.diagnostics.accuracy
+    both = np.flatnonzero(np.isfinite(displacement))
+    if not known.assessed or not len(both):
+        return known
+    _, turned = displacement_of(refined.trajectory[both], poses[both])
+    # In the worst case both are in one direction.
+    position = float(np.sqrt((displacement[both] ** 2).mean())) + known.position_m
+    rotation = turned + known.rotation_rad
+    worst = int(both[np.argmax(displacement[both])])
+    at_worst = WorstFrame(
+        int(refined.diagnostics.frames[worst].index),
+        float(displacement[worst]) + known.position_m,
+        rotation,
+    )
+    if known.unbounded and known.worst is not None:
+        at_worst = known.worst
+    diagonal = refined.cloud.diagonal_m
+    relative = position / diagonal if diagonal > 0 else np.inf
+    return Accuracy(position, rotation, relative, True, at_worst, known.unbounded)
+
+
+def _reasons(
+    poses: Float64,
+    accuracy: Accuracy,
+    seen: Seen,
+    after: Seen,
+    refined: Reconstruction,
+    tolerance_m: float | None,
+) -> Iterator[Reason]:
+    frames = refined.diagnostics.frames
+    indices = [f.index for f in frames]
+    everything = ((indices[0], indices[-1]),)
+    if seen.overlapping < _MOST * after.overlapping:
+        text = (
+            f"Only {seen.overlapping:.0%} of the images overlap with another under these poses; "
+            f"under the refined ones {after.overlapping:.0%} do."
+        )
+        yield Reason("images_disagree", everything, text)
+    yield from images(seen.sightings, everything)
+    yield from bounds(accuracy, tolerance_of(tolerance_m, refined.cloud.diagonal_m), indices)
+    # The camera itself may have moved abruptly; then the refined poses jump as well.
+    moments = [Moment(f.index, f.timestamp) for f in frames]
+    own = {k for k, _ in jumps(_or_none(refined.trajectory), moments)}
+    jumped = {k: words for k, words in jumps(_or_none(poses), moments) if k not in own}
+    if jumped:
+        first = next(iter(jumped))
+        where = runs(indices, [k in jumped for k in range(len(indices))])
+        text = (
+            f"The poses of {in_words(where)} jump, and the refined ones don't; that of frame "
+            f"{indices[first]} is {jumped[first]}."
+        )
+        yield Reason("jumped", where, text)
+
+
+def _or_none(poses: Float64) -> list[Float64 | None]:
+    return [T if np.isfinite(T).all() else None for T in poses]
+
+
+def _consistency(recording: Recording, poses: Float64) -> Consistency | None:
+    found = map_consistency(recording, poses)
+    return found if found.pairs else None

@@ -1,0 +1,178 @@
+"""Poses from elsewhere: how far off they are is found without a reference."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.evaluation.trajectory import displacement
+from tofuse.files.trajectory import write_tum
+from tofuse.geometry import se3
+from tofuse.odometry.given import GivenPoses
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.judging import poses_for, with_odometry
+from tofuse.posegraph.refinement import NoRefinement
+from tofuse.results.output import FILES
+
+
+@pytest.fixture(scope="module")
+def recording(room_recording):
+    return tofuse.open(room_recording)
+
+
+@pytest.fixture(scope="module")
+def truth(recording):
+    return recording.reference
+
+
+def bent(truth):
+    """The second half is 8 cm and 3 degrees beside the first."""
+    out = truth.copy()
+    out[4:] = se3.exp(np.array([0.06, 0.04, -0.03, 0.02, -0.05, 0])) @ out[4:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def of_truth(recording, truth):
+    return tofuse.judge(recording, truth)
+
+
+@pytest.fixture(scope="module")
+def of_bent(recording, truth):
+    return tofuse.judge(recording, bent(truth))
+
+
+def test_right_poses_are_good(of_truth) -> None:
+    assert of_truth.verdict == "good"
+    assert of_truth.reasons == ()
+    assert of_truth.started
+    assert of_truth.displacement_m.max() < 0.012
+    assert of_truth.accuracy.position_m < 0.02
+    assert of_truth.consistency is not None
+    assert of_truth.consistency.inlier_share > 0.9
+
+
+def test_wrong_poses_are_as_far_off_as_is_said(of_bent, truth) -> None:
+    wrong, _ = displacement(truth, bent(truth))
+    assert wrong > 0.02
+    stated = of_bent.accuracy.position_m
+    assert wrong < stated < 1.6 * wrong
+    assert of_bent.verdict == "degraded"
+    assert [r.code for r in of_bent.reasons] == ["uncertain_poses", "jumped"]
+    assert of_bent.reasons[1].frames == (4, 4)
+    refined = of_bent.refined
+    assert displacement(truth, refined.trajectory)[0] < 0.01
+    assert refined.diagnostics.accuracy.position_m < 0.01
+    assert refined.diagnostics.verdict == "good"
+    assert of_bent.refined_consistency.rms_m < of_bent.consistency.rms_m
+
+
+def test_a_tolerance_decides(recording, truth) -> None:
+    near = truth.copy()
+    near[:, :3, 3] += 0.004 * np.random.default_rng(3).standard_normal((8, 3))
+    assert tofuse.judge(recording, near, tolerance_m=0.05).verdict == "good"
+    (reason,) = tofuse.judge(recording, near, tolerance_m=0.004).reasons
+    assert reason.code == "uncertain_poses"
+
+
+def test_poses_of_another_place_are_contradicted_and_tracked_anew(recording, truth) -> None:
+    turns = np.array([se3.exp(np.array([0, 0, 0, 0, 2.5 * k, 0])) for k in range(8)])
+    found = tofuse.judge(recording, turns @ truth)
+    assert not found.started
+    assert found.verdict == "degraded"
+    assert "uncertain_poses" in [r.code for r in found.reasons]
+    assert found.accuracy.rotation_rad > 1
+    assert displacement(truth, found.refined.trajectory)[0] < 0.01
+    away = np.array([se3.exp(np.array([0, 0, 0, 0, 1.1 * k, 0])) for k in range(8)])
+    found = tofuse.judge(recording, away @ np.linalg.inv(truth))
+    assert found.verdict == "failed"
+    assert "images_disagree" in [r.code for r in found.reasons]
+
+
+def test_frames_without_a_pose_stay_without(recording, truth) -> None:
+    some = truth.copy()
+    some[[2, 5]] = np.nan
+    found = tofuse.judge(recording, some)
+    assert found.verdict == "good"
+    assert np.flatnonzero(np.isnan(found.displacement_m)).tolist() == [2, 5]
+    assert found.to_dict()["frames"] == 6
+
+
+def test_given_poses_are_kept_where_nothing_refines(recording, truth) -> None:
+    moved = bent(truth)
+    config = replace(from_method("default"), odometry=GivenPoses(), refinement=NoRefinement())
+    result = tofuse.reconstruct(with_odometry(recording, moved), config)
+    expected = se3.inverse(moved[0]) @ moved
+    np.testing.assert_allclose(result.diagnostics.sequential, expected, atol=1e-9)
+    assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 8
+
+
+def test_what_can_not_be_judged_is_refused(recording, truth, tmp_path) -> None:
+    with pytest.raises(InputError, match="for 8 frames"):
+        tofuse.judge(recording, truth[:5])
+    one = np.full_like(truth, np.nan)
+    one[3] = np.eye(4)
+    with pytest.raises(InputError, match="has a pose for 1 of the 8 frames"):
+        tofuse.judge(recording, one)
+    with pytest.raises(InputError, match="has no rotation"):
+        tofuse.judge(recording, truth * np.array([2.0, 1, 1, 1]))
+    write_tum(tmp_path / "late.txt", recording.timestamps + 1000, truth)
+    with pytest.raises(InputError, match=r"late.txt: has a pose for 0 .* on the clock"):
+        poses_for(recording, tmp_path / "late.txt")
+    for k in range(3):
+        points = np.random.default_rng(k).uniform(-1, 1, (500, 3)).astype(np.float32)
+        tofuse_ply(tmp_path / f"scans/{k}.ply", points)
+    with pytest.raises(InputError, match=r"takes .*range"):
+        tofuse.judge(tofuse.open(tmp_path / "scans"), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def tofuse_ply(path, points) -> None:
+    from tofuse.files.ply import write_ply
+
+    path.parent.mkdir(exist_ok=True)
+    write_ply(path, points)
+
+
+def test_command(room_recording, truth, tmp_path, capsys) -> None:
+    recording = tofuse.open(room_recording)
+    poses = tmp_path / "poses.txt"
+    write_tum(poses, recording.timestamps, bent(truth))
+    words = ["judge", str(room_recording), str(poses), "--out", str(tmp_path / "out")]
+    assert main([*words, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["verdict"] == "degraded"
+    assert data["out"] == str(tmp_path / "out")
+    kept = json.loads((tmp_path / "out/judge.json").read_text())
+    assert {**kept, "out": data["out"]} == data
+    assert kept["refined"]["verdict"] == "good"
+    assert kept["refined"]["from_these_poses"]
+    assert kept["refined"]["accuracy"]["position_m"] < 0.4 * kept["accuracy"]["position_m"]
+    written = {p.name for p in (tmp_path / "out").iterdir()}
+    assert written <= set(FILES)
+    assert {"trajectory.txt", "report.html", "run.json", "judge.json"} <= written
+    assert "poses.txt: ±" in (tmp_path / "out/report.html").read_text()
+    # A result of it is replaced only if asked to, and is a trajectory itself.
+    assert main(words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["judge", str(room_recording), str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("good\nout: ±")
+    assert "map consistency: given" in out
+
+
+def test_command_refuses(room_recording, tmp_path, capsys) -> None:
+    assert main(["judge", str(room_recording), str(tmp_path / "none.txt")]) == 2
+    assert "none.txt" in capsys.readouterr().err
+    assert main(["judge", str(room_recording), str(room_recording), "--overwrite"]) == 2
+    assert "pass --out" in capsys.readouterr().err
+    shutil.copytree(room_recording, tmp_path / "mine")
+    poses = str(room_recording / "groundtruth.txt")
+    assert main(["judge", str(room_recording), poses, "--out", str(tmp_path / "mine")]) == 2
+    assert "holds no earlier result" in capsys.readouterr().err
