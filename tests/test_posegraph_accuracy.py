@@ -9,12 +9,21 @@ import pytest
 
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph import accuracy
-from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of, covariances_of
-from tofuse.posegraph.accuracy import without_degenerate as bounded
+from tofuse.posegraph.accuracy import (
+    Accuracy,
+    Shown,
+    accuracy_of,
+    covariances_of,
+    degenerate_directions,
+    without_degenerate,
+)
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.recordings.frames import RangeFrame
 
 N = 14
 SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
@@ -30,6 +39,12 @@ def walk(rng: np.random.Generator | None = None, *, loops=((0, N - 1), (2, 9))) 
 
     steps = [measured(k, k + 1) for k in range(N - 1)]
     return build_graph(range(N), TRUE, steps, [measured(i, j) for i, j in loops])
+
+
+def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:
+    """The graph of frames that are degenerate in all their pairs."""
+    directions = degenerate_directions(graph, unobservable, (), {})
+    return without_degenerate(graph, directions, unmeasured)
 
 
 @pytest.mark.parametrize("loops", [(), ((0, N - 1), (2, 9))])
@@ -89,6 +104,49 @@ def test_a_direction_that_nothing_measures_is_not_bounded(direction) -> None:
     np.testing.assert_array_equal(
         bounded(graph, slide).information[others], graph.information[others]
     )
+
+
+def test_a_registration_of_the_tracker_is_degenerate_as_its_own_frame_is() -> None:
+    """That its keyframe was degenerate beside an earlier one says nothing of it."""
+    graph = walk()
+    own = {
+        (i, j) for (i, j), loop in zip(graph.edges.tolist(), graph.loop, strict=True) if not loop
+    }
+    found = degenerate_directions(graph, {5: X}, own, {})
+    assert [tuple(graph.edges[k]) for k, d in enumerate(found) if len(d)] == [(4, 5)]
+    either = degenerate_directions(graph, {5: X}, (), {})
+    assert [tuple(graph.edges[k]) for k, d in enumerate(either) if len(d)] == [(4, 5), (5, 6)]
+
+
+@pytest.mark.parametrize(("view", "count"), [("wall", 3), ("corner", 0)])
+def test_what_a_pair_sees_decides(view, count) -> None:
+    """A frame that was degenerate beside its keyframe need not be beside other views."""
+    surface = flat_wall() if view == "wall" else surface_of_corner()
+    steps = [Measured(0, 1, np.eye(4), np.eye(6) * 1e6)]
+    graph = build_graph([0, 1], np.tile(np.eye(4), (2, 1, 1)), steps)
+    (found,) = degenerate_directions(graph, {1: X}, (), {0: surface, 1: surface})
+    assert len(found) == count
+
+
+def flat_wall():
+    z = np.full((60, 80), 2.0, np.float32)
+    return surface_map(as_frame(z, 0), SurfaceOptions())
+
+
+def surface_of_corner():
+    rays = CAMERA.rays()
+    x, y = np.moveaxis(rays, -1, 0)
+    planes = [(0.6, 0.0, 0.8), (-0.6, 0.0, 0.8), (0.0, -0.8, 0.6)]
+    z = np.min([1.5 / (a * x + b * y + c) for a, b, c in planes], axis=0)
+    return surface_map(as_frame(z.astype(np.float32), 0), SurfaceOptions())
+
+
+CAMERA = Pinhole(80, 60, 80.0, 80.0, 39.5, 29.5)
+
+
+def as_frame(z, index) -> RangeFrame:
+    noise = np.random.default_rng(index).normal(0, 0.001, z.shape)
+    return RangeFrame(index, float(index), CAMERA, (z + noise).astype(np.float32), "z")
 
 
 def test_other_directions_of_a_degenerate_frame_are_still_measured() -> None:

@@ -13,6 +13,7 @@ from tofuse.evaluation.sightings import Sightings, sightings
 from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.prediction import Prediction, runs, with_prediction
 from tofuse.pipeline.checkpoint import Stages
@@ -25,6 +26,7 @@ from tofuse.posegraph.accuracy import (
     Shown,
     accuracy_of,
     covariances_of,
+    degenerate_directions,
     without_degenerate,
 )
 from tofuse.posegraph.build import Measured, build_graph
@@ -35,6 +37,7 @@ from tofuse.posegraph.loops import ClosedLoop, GivenLoop, Loops
 from tofuse.posegraph.outside import Told, told_by, with_outside
 from tofuse.posegraph.refinement import Refinement, Refiner
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
+from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 from tofuse.results.verdict import ranked
@@ -95,6 +98,8 @@ class Kept:
         Range after which the camera's phase repeats, if it is known.
     knows_errors
         Whether registrations state errors that can be relied on; ICP's are too small.
+    views
+        Prepared views, spaced by motion.
     """
 
     loops: Loops
@@ -104,6 +109,7 @@ class Kept:
     depths: dict[int, float]
     ambiguity_m: float | None
     knows_errors: bool
+    views: ViewStore[SurfaceMap]
 
 
 class BackEnd:
@@ -346,7 +352,14 @@ class BackEnd:
             e.record.index: e.record.unobservable for e in self._posed if len(e.record.unobservable)
         }
         bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
-        graph = without_degenerate(refined.graph, unobservable, bridges)
+        own = {
+            (e.step.reference, e.record.index)
+            for e in self._posed
+            if e.step is not None and e.step.reference is not None
+        }
+        views = {v.index: v.view for v in self._kept.views.of(self._poses)}
+        directions = degenerate_directions(refined.graph, unobservable, own, views)
+        graph = without_degenerate(refined.graph, directions, bridges)
         moved = 0.0, 0.0
         if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)

@@ -98,6 +98,7 @@ class Observations:
             self._depths,
             self._ambiguity_m,
             self._knows_errors,
+            self.views,
         )
 
 

@@ -10,7 +10,7 @@ of other cameras and scenes than those on which they were tested.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.trust import joint_covariance, pose_covariances
-from tofuse.registration.projective import UNITS
+from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 
 Float64 = NDArray[np.float64]
 
@@ -37,6 +38,8 @@ _HIDDEN = 1.3
 # Directions of two frames are different ones above this share of the strongest.
 _DISTINCT = 0.3
 _NONE = np.zeros((0, 6))
+# Near the final pose.
+_ALIGNMENT = ProjectiveOptions()
 
 
 @dataclass(frozen=True)
@@ -98,37 +101,69 @@ class Shown:
         return float(np.hypot(self.moved_m, self.excess_m))
 
 
-def without_degenerate(
+def degenerate_directions(
     graph: PoseGraph,
     unobservable: Mapping[int, Float64],
-    unmeasured: Collection[tuple[int, int]] = (),
-) -> PoseGraph:
-    """The graph without what it knows of directions that a frame does not constrain.
+    own: Collection[tuple[int, int]],
+    views: Mapping[int, SurfaceMap],
+) -> list[Float64]:
+    """For every edge the directions that it does not measure: (k, 6), right perturbations of j.
 
-    Whatever a pair of views measures, it measures on the surfaces that both see. So no pair says
-    anything of the directions in which one of its frames is degenerate; what seems to be said is
-    noise. These are left nearly free.
+    Of a registration of the tracker they are known. Of a pair of the refinement, what its views see
+    of each other is looked at, if one of them was degenerate in tracking.
 
     Parameters
     ----------
     unobservable
         (k, 6) degenerate directions of frames, by their index: right perturbations, m and rad.
+    own
+        Pairs (i, j) that are the registrations of j in tracking.
+    views
+        Prepared views by frame index.
+    """
+    out = []
+    for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
+        i, j = int(graph.ids[a]), int(graph.ids[b])
+        directions = unobservable.get(j, _NONE)
+        if (i, j) not in own and (i in unobservable or j in unobservable):
+            if i in views and j in views:
+                found = align(views[j], [Target(views[i], np.eye(4))], T_i_j, _ALIGNMENT)
+                directions = found.unobservable * UNITS
+            else:
+                # A motion of i moves j the other way, as seen from j.
+                there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
+                directions = np.concatenate([there, directions])
+        out.append(directions)
+    return out
+
+
+def without_degenerate(
+    graph: PoseGraph,
+    directions: Sequence[Float64],
+    unmeasured: Collection[tuple[int, int]] = (),
+) -> PoseGraph:
+    """The graph without what its edges claim to know of directions that they do not measure.
+
+    What seems to be said there is noise (`uncertainty`), or the prediction. They are left nearly
+    free.
+
+    Parameters
+    ----------
+    directions
+        Of every edge, see `degenerate_directions`.
     unmeasured
         Pairs of frames between which only the motion was extrapolated.
     """
     information = graph.information.copy()
     open_variance = np.diag((_OPEN / UNITS) ** 2)
-    for k, ((a, b), T_a_b) in enumerate(zip(graph.edges, graph.measurements, strict=True)):
+    for k, ((a, b), weak) in enumerate(zip(graph.edges, directions, strict=True)):
         i, j = int(graph.ids[a]), int(graph.ids[b])
         if (i, j) in unmeasured or (j, i) in unmeasured:
             information[k] = np.diag(_OPEN**-2.0)
             continue
-        # A motion of a's frame moves b the other way, as seen from b.
-        there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_a_b)).T
-        weak = np.concatenate([there, unobservable.get(j, _NONE)]) / UNITS
         if not len(weak):
             continue
-        u, s, _ = np.linalg.svd(weak.T, full_matrices=False)
+        u, s, _ = np.linalg.svd((weak / UNITS).T, full_matrices=False)
         u = u[:, s > _DISTINCT * s[0]]
         H = information[k] * np.outer(UNITS, UNITS)
         scaled = H - H @ u @ np.linalg.pinv(u.T @ H @ u, hermitian=True) @ u.T @ H
