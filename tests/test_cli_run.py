@@ -728,6 +728,25 @@ def test_evaluate_a_run(plain_run, room_recording, capsys) -> None:
         assert part in table
 
 
+def test_evaluate_against_what_a_recording_comes_with(plain_run, room_recording, tmp_path, capsys):
+    """In any format, not only the native one."""
+    out = tmp_path / "tum"
+    assert main(["convert", str(room_recording), "--out", str(out), "--to", "tum"]) == 0
+    words = ["evaluate", str(plain_run), "--json"]
+    assert main(["evaluate", str(plain_run), str(room_recording), "--json"]) == 0
+    expected = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert main(["evaluate", str(plain_run), str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["ate_rms_m"] == pytest.approx(expected["ate_rms_m"], abs=1e-5)
+    bare = tmp_path / "bare"
+    shutil.copytree(room_recording, bare)
+    (bare / "groundtruth.txt").unlink()
+    assert main([*words, str(bare)]) == 2
+    assert "comes with no reference poses" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "none.txt")]) == 2
+    assert "none.txt: doesn't exist" in capsys.readouterr().err
+
+
 def test_optimize_a_graph(plain_run, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
     assert main(["optimize", str(plain_run / "pose_graph.g2o"), "--out", str(out)]) == 0

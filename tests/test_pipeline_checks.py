@@ -490,7 +490,8 @@ def test_moving_objects_and_doubtful_frames_are_told() -> None:
     assert judge(CASES["moving_objects"])[0] == "good"
     (doubtful,) = judge(CASES["doubtful_poses"])[1]
     assert doubtful.ranges == ((2, 3), (6, 6))
-    assert doubtful.text.startswith("Frames 2-3, 6 fit worse than this camera's views")
+    assert doubtful.text.startswith("Frames 2-3, 6 fitted their keyframes worse than")
+    assert judge(CASES["doubtful_poses"])[0] == "good"
 
 
 def test_loops_given_by_hand_are_listed_once() -> None:

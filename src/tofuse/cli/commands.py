@@ -483,15 +483,13 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from tofuse.evaluation.consistency import map_consistency, poses_of_frames
     from tofuse.evaluation.trajectory import evaluate_trajectory
     from tofuse.files.trajectory import read_tum
-    from tofuse.recordings.open import open_recording
+    from tofuse.recordings.open import open_recording, read_reference
 
     estimate_file, reference_file = arguments.estimate, arguments.reference
     if estimate_file.is_dir():
         estimate_file = estimate_file / "trajectory.txt"
-    if reference_file.is_dir():
-        reference_file = reference_file / "groundtruth.txt"
     times, poses = read_tum(estimate_file)
-    reference_times, reference = read_tum(reference_file)
+    reference_times, reference = read_reference(reference_file)
     recording = None if arguments.recording is None else open_recording(arguments.recording)
     frame_times = None if recording is None else recording.timestamps
     try:

@@ -403,7 +403,7 @@ def _evaluate(commands: Any) -> None:
         "reference",
         type=Path,
         metavar="REFERENCE",
-        help="a TUM trajectory, or a folder with a groundtruth.txt",
+        help="a TUM trajectory, or a recording that comes with reference poses",
     )
     p.add_argument(
         "--recording", type=Path, metavar="REC", help="also measure how well its images agree"

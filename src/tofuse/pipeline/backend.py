@@ -364,7 +364,10 @@ class BackEnd:
         if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
         excess = 0.0 if sightings is None else sightings.excess_m()
-        shown = Shown(*moved, excess)
+        suspicion, gap = refined.refinement.suspicion, (0.0, 0.0)
+        if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
+            gap = suspicion.gap.before
+        shown = Shown(*moved, excess, *gap)
         return accuracy_of(graph, shown, model.cloud.diagonal_m), covariances_of(graph, shown)
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:

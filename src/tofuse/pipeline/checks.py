@@ -387,9 +387,10 @@ def _scene(e: Evidence) -> Iterator[Reason]:
     doubtful = e.runs_of(e.doubtful)
     if doubtful:
         rest = (
-            "fits worse than this camera's views usually do; its pose is uncertain."
+            "fitted its keyframe worse than this camera's views usually do; look at it first."
             if is_one(doubtful)
-            else "fit worse than this camera's views usually do; their poses are uncertain."
+            else "fitted their keyframes worse than this camera's views usually do; look at them "
+            "first."
         )
         yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {rest}")
 

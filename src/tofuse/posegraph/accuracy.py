@@ -89,16 +89,25 @@ class Shown:
         Rms by which the refinement moved the poses, after alignment.
     excess_m
         Rms by which views far apart in time disagree, beyond consecutive ones.
+    gap_m, gap_rad
+        By how much odometry misses a loop that a better calibration would close; 0 without alarm.
     """
 
     moved_m: float = 0.0
     moved_rad: float = 0.0
     excess_m: float = 0.0
+    gap_m: float = 0.0
+    gap_rad: float = 0.0
 
     @property
     def position_m(self) -> float:
         """Rms of positions that they come to."""
-        return float(np.hypot(self.moved_m, self.excess_m))
+        return float(np.linalg.norm([self.moved_m, self.excess_m, self.gap_m]))
+
+    @property
+    def rotation_rad(self) -> float:
+        """Rms of rotations that they come to."""
+        return float(np.hypot(self.moved_rad, self.gap_rad))
 
 
 def degenerate_directions(
@@ -197,7 +206,7 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
         return Accuracy(assessed=True, worst=first, unbounded=free)
     rms = np.isin(looked_at, even)
     of_all, of_each = [], []
-    both = (shown.position_m, shown.moved_rad)
+    both = (shown.position_m, shown.rotation_rad)
     for part, extra in zip(_aligned(C, graph.poses[looked_at], rms), both, strict=True):
         overall, each = _bounds(part, rms)
         of_all.append(_HIDDEN * float(np.hypot(overall, extra)))
@@ -221,7 +230,7 @@ def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
     NaN where nothing joins a pose to the first. A direction that is not bounded has a sigma of tens
     of metres.
     """
-    more = np.repeat([shown.position_m**2 / 3, shown.moved_rad**2 / 3], 3)
+    more = np.repeat([shown.position_m**2 / 3, shown.rotation_rad**2 / 3], 3)
     C = pose_covariances(graph)
     C[1:] += np.diag(more)
     return _HIDDEN**2 * C

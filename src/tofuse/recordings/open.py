@@ -6,12 +6,18 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.reading import input_error, is_folder, list_folder
+from tofuse.files.trajectory import read_tum
 from tofuse.parts import discover, known, name_of
 from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource, LimitedSource
+
+Float64 = NDArray[np.float64]
 
 # Recordings that only their maker's program can read: what they hold, and what to do.
 CLOSED = {
@@ -229,3 +235,38 @@ def _short_names(paths: list[Path]) -> list[str]:
     """Return the last part of each path, or all of it where that isn't unique."""
     names = [p.name for p in paths]
     return names if len(set(names)) == len(names) else [str(p) for p in paths]
+
+
+def read_reference(path: str | Path) -> tuple[Float64, Float64]:
+    """Read the reference poses in a file, or those that a recording of any format comes with.
+
+    Returns
+    -------
+    (N,) timestamps in s and (N, 4, 4) T_world_camera.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or the recording comes with no reference.
+    """
+    path = Path(path)
+    beside = path / "groundtruth.txt"
+    if not path.is_dir() or beside.is_file():  # then the images don't matter
+        try:
+            return read_tum(beside if path.is_dir() else path)
+        except InputError as no_trajectory:
+            try:
+                recording = open_recording(path)
+            except InputError:
+                raise no_trajectory from None
+    else:
+        recording = open_recording(path)
+    poses = recording.reference
+    if poses is None or not np.isfinite(poses).all((1, 2)).any():
+        raise InputError(
+            "comes with no reference poses",
+            where=path,
+            remedy="give a TUM trajectory (timestamp tx ty tz qx qy qz qw)",
+        )
+    known = np.isfinite(poses).all((1, 2))
+    return recording.timestamps[known], poses[known]

@@ -18,7 +18,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "single_link": ("degraded", "Parts are connected by a single registration."),
     "images_differ": ("degraded", "Overlapping frames agree less than consecutive ones do."),
     "jumped": ("degraded", "A frame's pose jumps away from the predicted motion."),
-    "doubtful_poses": ("degraded", "Frames fit worse than this camera's views usually do."),
+    "doubtful_poses": ("note", "Frames fit worse than this camera's views usually do."),
     "faulty_recording": ("degraded", "The recording has a fault (see inspection)."),
     "unobserved_motion": (
         "degraded",
