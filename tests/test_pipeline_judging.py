@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -17,8 +18,11 @@ from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.odometry.given import GivenPoses
 from tofuse.pipeline.config import from_method
-from tofuse.pipeline.judging import poses_for, with_odometry
+from tofuse.pipeline.judging import device_sentence, poses_for, with_odometry
+from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.refinement import NoRefinement
+from tofuse.recordings.phones import POSES_BY
+from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import FILES
 
 
@@ -176,3 +180,24 @@ def test_command_refuses(room_recording, tmp_path, capsys) -> None:
     poses = str(room_recording / "groundtruth.txt")
     assert main(["judge", str(room_recording), poses, "--out", str(tmp_path / "mine")]) == 2
     assert "holds no earlier result" in capsys.readouterr().err
+
+
+def test_poses_that_a_phone_found_are_judged_unasked(recording, truth) -> None:
+    """What it says of them holds for the poses that the phone would have got wrong."""
+    result = tofuse.reconstruct(recording)
+    assert device_sentence(recording, result) == ""  # poses of a simulation are nobody's
+    phone = phone_of(recording, bent(truth))
+    said = device_sentence(phone, result)
+    match = re.fullmatch(r"ARKit's poses: ±(\d+) mm \(95 %\); these: ±([\d.]+) mm\.", said)
+    assert match is not None
+    wrong, _ = displacement(truth, bent(truth))
+    assert wrong < float(match[1]) / 1e3 < 1.6 * wrong
+    assert float(match[2]) < 12
+    loose = replace(result.diagnostics, accuracy=Accuracy(assessed=True))
+    said = device_sentence(phone, replace(result, diagnostics=loose))
+    assert said.startswith("ARKit's poses differ from these by ")
+
+
+def phone_of(recording, poses):
+    source = ArraySource(list(recording), poses, metadata={POSES_BY: "ARKit"})
+    return Recording.of(source, "phone", "frames")

@@ -18,6 +18,7 @@ from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
+from tofuse.pipeline.judging import device_sentence
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.paint import paint
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
@@ -136,6 +137,8 @@ def run(
         if size and texture is None:
             progress.note("no texture: there is no surface, or neither colour nor amplitude")
         result = with_findings(result, findings, turning=options.object)
+        if device := device_sentence(recording, result):
+            progress.note(device)
         seconds = {**watch.seconds, **result.diagnostics.seconds}
         result = replace(result, diagnostics=replace(result.diagnostics, seconds=seconds))
         progress.stage("writing")
@@ -317,6 +320,7 @@ def _report(recording: Recording, config: Config, result: Reconstruction, folder
     clouds = () if pictures else recording.sample(_CLOUDS)
     extras = ReportExtras(
         title=title,
+        headline=device_sentence(recording, result) if component is None else "",
         filter_steps=_filter_steps(config, recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth,

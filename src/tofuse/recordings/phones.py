@@ -22,6 +22,8 @@ Float64 = NDArray[np.float64]
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 SENSOR = "iPhone or iPad LiDAR (direct ToF)"
+# Of the metadata: which program found the poses that a phone recorded.
+POSES_BY = "poses_by"
 IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, which its intrinsics are for
 CONFIDENCE_MAX = 2.0
 
@@ -96,6 +98,7 @@ class PhoneSource(FileSource):
         self.cameras: list[Pinhole | InputError] = []
         self.metadata |= {
             "sensor": SENSOR,
+            POSES_BY: "ARKit",
             "depth_kind": "z",
             "depth_unit_m": 0.001,
             "confidence_max": CONFIDENCE_MAX,

@@ -26,6 +26,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
     CONFIDENCE_MAX,
+    POSES_BY,
     SENSOR,
     lens,
     refuse_replacement,
@@ -93,7 +94,7 @@ class Record3DSource(FileSource):
             inside = numbers < len(poses)
             self.reference = np.full((len(numbers), 4, 4), np.nan)
             self.reference[inside] = poses[numbers[inside]]
-        self.metadata |= {"sensor": SENSOR, "depth_kind": "z"}
+        self.metadata |= {"sensor": SENSOR, "depth_kind": "z", POSES_BY: "ARKit"}
         if store.has_confidence:
             self.metadata["confidence_max"] = CONFIDENCE_MAX
         else:
