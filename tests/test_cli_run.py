@@ -131,6 +131,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "findings",
         "warnings",
         "components",
+        "T_up_world",
     }
     assert data["schema"] == 1
     assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}

@@ -254,6 +254,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "accuracy",
         "reasons",
         "frames",
+        "T_up_world",
         "components",
         "loops",
         "optimiser",

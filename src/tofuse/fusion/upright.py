@@ -16,7 +16,14 @@ _MAX_TILT, _ANGLE = np.radians(50.0), np.radians(12.0)
 _LEAST_SHARE, _MOST_BELOW = 0.04, 0.02
 
 
-def upright(mesh: Mesh, poses: Float64) -> Float64:
+def T_up_world(mesh: Mesh | None, poses: Float64) -> Float64:
+    """Return the motion (4, 4) of `upright`, which is a rotation about the world's origin."""
+    T = np.eye(4)
+    T[:3, :3] = upright(mesh, poses)
+    return T
+
+
+def upright(mesh: Mesh | None, poses: Float64) -> Float64:
     """Return the rotation (3, 3) from the world into axes x right, y up, z towards the viewer.
 
     Up is the normal of the floor, where there is one: the largest plane across the cameras' up
@@ -34,7 +41,7 @@ def upright(mesh: Mesh, poses: Float64) -> Float64:
     up = -known[:, :3, 1].mean(0)
     length = np.linalg.norm(up)
     up = up / length if length > 0.1 else -known[0, :3, 1]
-    floor = _floor(mesh, up)
+    floor = None if mesh is None else _floor(mesh, up)
     y = up if floor is None else floor
     back = -known[0, :3, 2]
     if np.linalg.norm(np.cross(y, back)) < 0.1:  # it looks straight down, or up

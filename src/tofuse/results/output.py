@@ -25,7 +25,7 @@ from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
-from tofuse.fusion.upright import upright
+from tofuse.fusion.upright import T_up_world, upright
 from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
@@ -410,6 +410,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 }
                 for f in d.frames
             ],
+            "T_up_world": T_up_world(result.mesh, result.trajectory),
             "components": [_component(c) for c in result.components],
             "loops": [
                 {
