@@ -428,6 +428,10 @@ def test_disconnected_parts_are_named() -> None:
     (bridged,) = judge(CASES["bridged_gap"])[1]
     text = "Frames 5-8 are connected to the rest by extrapolated motion only."
     assert (bridged.text, bridged.ranges) == (text, ((5, 8),))
+    measured = replace(CASES["bridged_gap"], accuracy=Accuracy(0.005, 0.001, 0.001, True))
+    assert codes(measured) == []
+    loose = replace(measured, accuracy=Accuracy(assessed=True, unbounded=(5, 6, 7, 8)))
+    assert "bridged_gap" in codes(loose)
     (hanging,) = judge(CASES["single_link"])[1]
     text = (
         "Frames 5-8 are connected to the rest by a single registration, which no other view "

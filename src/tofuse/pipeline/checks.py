@@ -219,7 +219,8 @@ def _connections(e: Evidence) -> Iterator[Reason]:
             "overlap found.",
         )
     bridged = union(r for c in e.components if c.joined == "motion" for r in c.frames)
-    if bridged:
+    # Where all poses are bounded, measurements connect both sides by now.
+    if bridged and (e.accuracy.unbounded or not e.accuracy.assessed):
         text = (
             f"{_sentence(bridged)} {'is' if is_one(bridged) else 'are'} connected to the rest by "
             "extrapolated motion only."
