@@ -34,7 +34,7 @@ _OPEN = np.array([30.0] * 3 + [10.0] * 3)
 _UNBOUNDED = np.array([3.0, 1.0])
 # What shows is the part of the errors in which views differ. Errors of the sensor that all views of
 # a place share show in nothing: in total they are so many times larger.
-_HIDDEN = 1.3
+_HIDDEN = 1.6
 # Directions of two frames are different ones above this share of the strongest.
 _DISTINCT = 0.3
 _NONE = np.zeros((0, 6))
