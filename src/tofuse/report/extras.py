@@ -22,8 +22,6 @@ class ReportExtras:
     ----------
     title
         For example the name of the input.
-    headline
-        Said above everything else; may be empty.
     filter_steps
         ("raw", frame), then (name, frame) after each filter in order, for one sample frame.
     reference
@@ -35,12 +33,14 @@ class ReportExtras:
         Of the result's samples of frames, in their order.
     clouds
         About a dozen evenly spaced, unfiltered views, where views are clouds.
+    headline
+        Said above everything else; may be empty.
     """
 
     title: str
-    headline: str = ""
     filter_steps: tuple[tuple[str, Frame], ...] = ()
     reference: Float64 | None = None
     truth_points: Float32 | None = None
     pictures: tuple[Pictures, ...] = ()
     clouds: tuple[CloudFrame, ...] = ()
+    headline: str = ""
