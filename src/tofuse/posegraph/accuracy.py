@@ -30,13 +30,14 @@ _LEVEL = 0.95
 _EVEN, _WORST = 50, 10
 # What a direction that nothing measures is given, as good as unbounded: m and rad.
 _OPEN = np.array([30.0] * 3 + [10.0] * 3)
-# No error is known to be larger than this: m and rad.
-_UNBOUNDED = np.array([3.0, 1.0])
+# The tracker knows no direction worse than from its prediction, by 0.3 m and 0.3 rad. What is known
+# no better than that is not measured; in a large model, what is off by a share of its diagonal.
+_UNMEASURED_M, _UNMEASURED_RAD, _UNMEASURED_SHARE = 0.3, 0.3, 0.05
 # What shows is the part of the errors in which views differ. Errors of the sensor that all views of
 # a place share show in nothing: in total they are so many times larger.
 _HIDDEN = 1.6
 # Directions of two frames are different ones above this share of the strongest.
-_DISTINCT = 0.3
+_DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
 # Near the final pose.
 _ALIGNMENT = ProjectiveOptions()
@@ -133,16 +134,18 @@ def degenerate_directions(
     out = []
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
         i, j = int(graph.ids[a]), int(graph.ids[b])
-        directions = unobservable.get(j, _NONE)
-        if (i, j) not in own and (i in unobservable or j in unobservable):
-            if i in views and j in views:
-                found = align(views[j], [Target(views[i], np.eye(4))], T_i_j, _ALIGNMENT)
-                directions = found.unobservable * UNITS
-            else:
-                # A motion of i moves j the other way, as seen from j.
-                there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
-                directions = np.concatenate([there, directions])
-        out.append(directions)
+        # A motion of i moves j the other way, as seen from j.
+        there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
+        known = np.concatenate([there, unobservable.get(j, _NONE)])
+        found = known
+        if (i, j) in own:
+            found = unobservable.get(j, _NONE)
+        elif len(known) and i in views and j in views:
+            aligned = align(views[j], [Target(views[i], np.eye(4))], T_i_j, _ALIGNMENT)
+            found = aligned.unobservable * UNITS
+        # A direction is known to some degrees only, and what is left of it would still look
+        # measured: where a pair is degenerate, so it is in all that its views were.
+        out.append(np.concatenate([found, known]) if len(found) else _NONE)
     return out
 
 
@@ -194,8 +197,9 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
     n = len(graph.ids)
     if n < 2:
         return Accuracy()
-    covariances, unbounded = _single(graph)
-    free = tuple(graph.ids[unbounded].tolist())
+    limits = np.array([max(_UNMEASURED_M, _UNMEASURED_SHARE * diagonal_m), _UNMEASURED_RAD])
+    covariances, unbounded = _single(graph, limits)
+    free = tuple(graph.ids[unbounded.any(1)].tolist())
     even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))
     size = np.nan_to_num(np.trace(covariances[:, :3, :3], axis1=1, axis2=2), nan=np.inf)
     loosest = np.argsort(-size, kind="stable")[:_WORST]
@@ -205,21 +209,22 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
         first = WorstFrame(free[0] if free else int(graph.ids[-1]), np.inf, np.inf)
         return Accuracy(assessed=True, worst=first, unbounded=free)
     rms = np.isin(looked_at, even)
-    of_all, of_each = [], []
+    of_all: list[float] = []
+    single: list[Float64] = []
     both = (shown.position_m, shown.rotation_rad)
     for part, extra in zip(_aligned(C, graph.poses[looked_at], rms), both, strict=True):
         overall, each = _bounds(part, rms)
         of_all.append(_HIDDEN * float(np.hypot(overall, extra)))
-        of_each.append(_HIDDEN * np.hypot(each, extra))
-    worst = int(np.argmax(np.maximum(of_each[0] / _UNBOUNDED[0], of_each[1] / _UNBOUNDED[1])))
-    position, rotation = _finite(of_all[0], of_all[1])
-    single = _finite(float(of_each[0][worst]), float(of_each[1][worst]))
+        single.append(_HIDDEN * np.hypot(each, extra))
+    of_each = np.where(unbounded[looked_at], np.inf, np.stack(single, 1))
+    worst = int(np.argmax((of_each / limits).max(1)))
+    position, rotation = np.where(unbounded.any(0), np.inf, of_all).tolist()
     return Accuracy(
         position,
         rotation,
         position / diagonal_m if diagonal_m > 0 else np.inf,
         True,
-        WorstFrame(int(graph.ids[looked_at[worst]]), *single),
+        WorstFrame(int(graph.ids[looked_at[worst]]), *of_each[worst].tolist()),
         free,
     )
 
@@ -236,37 +241,30 @@ def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
     return _HIDDEN**2 * C
 
 
-def _single(graph: PoseGraph) -> tuple[Float64, NDArray[np.bool_]]:
-    """Covariances (N, 6, 6) of the poses, and which of them are not bounded, (N,).
+def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+    """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
 
     Relative to the first one; to another if that is one of the few that are not bounded.
     """
     covariances = pose_covariances(graph)
-    unbounded = _is_unbounded(covariances)
-    if 2 * unbounded.sum() > len(unbounded):
-        many = np.flatnonzero(unbounded)
+    unbounded = _is_unbounded(covariances, limits)
+    if 2 * unbounded.any(1).sum() > len(unbounded):
+        many = np.flatnonzero(unbounded.any(1))
         other = pose_covariances(graph, int(many[len(many) // 2]))
-        if _is_unbounded(other).sum() < unbounded.sum():
-            return other, _is_unbounded(other)
+        others = _is_unbounded(other, limits)
+        if others.any(1).sum() < unbounded.any(1).sum():
+            return other, others
     return covariances, unbounded
 
 
-def _is_unbounded(covariances: Float64) -> NDArray[np.bool_]:
-    """(N,) poses of which some direction is known no better than from the motion."""
+def _is_unbounded(covariances: Float64, limits: Float64) -> NDArray[np.bool_]:
+    """(N, 2) whether a direction of position or rotation is known no better than the limits."""
     known = np.isfinite(covariances).all((1, 2))
-    out = np.asarray(~known, np.bool_)
+    out = np.ones((len(covariances), 2), np.bool_)
     C = covariances[known]
-    for part, limit in ((C[:, :3, :3], _UNBOUNDED[0]), (C[:, 3:, 3:], _UNBOUNDED[1])):
-        out[known] |= np.linalg.eigvalsh(part)[:, -1] > limit**2
+    for k, part in enumerate((C[:, :3, :3], C[:, 3:, 3:])):
+        out[known, k] = np.linalg.eigvalsh(part)[:, -1] > limits[k] ** 2
     return out
-
-
-def _finite(position_m: float, rotation_rad: float) -> tuple[float, float]:
-    """Bounds, inf where they say nothing: a pose that may be turned any way may be anywhere."""
-    return (
-        position_m if position_m < _UNBOUNDED[0] else np.inf,
-        rotation_rad if rotation_rad < _UNBOUNDED[1] else np.inf,
-    )
 
 
 def _aligned(C: Float64, poses: Float64, rms: NDArray[np.bool_]) -> tuple[Float64, Float64]:
