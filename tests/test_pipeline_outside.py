@@ -66,6 +66,8 @@ def test_what_is_beside_the_images_counts_when_asked_for_and_is_told(beside, roo
     assert off(both) < off(alone) + 0.001
     # How loosely the path is held is told with them, but the verdict is that of the images.
     assert both.diagnostics.verdict == alone.diagnostics.verdict
+    stated, by_images = (r.diagnostics.accuracy for r in (both, alone))
+    assert stated.rotation_rad == pytest.approx(by_images.rotation_rad, rel=0.05)
     last = [r.diagnostics.frames[-1].covariance for r in (both, alone)]
     assert last[0] is not None
     assert last[1] is not None

@@ -27,21 +27,15 @@ from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.recordings.frames import RangeFrame
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate_recording
+from walks import round_walk, true_poses
 
 N = 14
-SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
-STEP = se3.exp(np.array([0.2, 0, 0.1, 0, 2 * np.pi / N, 0]))
-TRUE = np.stack([np.linalg.matrix_power(STEP, k) for k in range(N)])
+TRUE = true_poses(N)
 X, TURN = np.eye(6)[:1], np.eye(6)[4:5]
 
 
 def walk(rng: np.random.Generator | None = None, *, loops=((0, N - 1), (2, 9))) -> PoseGraph:
-    def measured(i: int, j: int) -> Measured:
-        noise = np.zeros(6) if rng is None else SIGMA * rng.standard_normal(6)
-        return Measured(i, j, se3.inverse(TRUE[i]) @ TRUE[j] @ se3.exp(noise), np.diag(SIGMA**-2.0))
-
-    steps = [measured(k, k + 1) for k in range(N - 1)]
-    return build_graph(range(N), TRUE, steps, [measured(i, j) for i, j in loops])
+    return round_walk(N, rng, loops)
 
 
 def bounded(graph, unobservable, unmeasured=()) -> PoseGraph:

@@ -18,26 +18,15 @@ from tofuse.posegraph.trust import (
     relative_covariance,
     without_left_out,
 )
+from walks import round_walk, step_of, true_poses
 
 N = 12
-SIGMA = np.array([0.004, 0.002, 0.003, 0.001, 0.004, 0.002])
-STEP = se3.exp(np.array([0.2, 0, 0.1, 0, 2 * np.pi / N, 0]))
-TRUE = np.stack([np.linalg.matrix_power(STEP, k) for k in range(N)])
+STEP = step_of(N)
+TRUE = true_poses(N)
 
 
 def walk(rng: np.random.Generator | None = None, *, loops=((0, N - 1), (2, 9))) -> PoseGraph:
-    """A round walk, of which every step and loop is measured with the same noise."""
-
-    def measured(i: int, j: int) -> Measured:
-        noise = np.zeros(6) if rng is None else SIGMA * rng.standard_normal(6)
-        T = se3.inverse(TRUE[i]) @ TRUE[j] @ se3.exp(noise)
-        return Measured(i, j, T, np.diag(SIGMA**-2.0))
-
-    steps = [measured(k, k + 1) for k in range(N - 1)]
-    poses = [np.eye(4)]
-    for step in steps:
-        poses.append(poses[-1] @ step.T_i_j)
-    return build_graph(range(N), np.stack(poses), steps, [measured(i, j) for i, j in loops])
+    return round_walk(N, rng, loops)
 
 
 @pytest.fixture(scope="module")

@@ -131,13 +131,11 @@ def _wait() -> None:
 def register(arguments: argparse.Namespace) -> int:
     """``tofuse register``."""
     from tofuse.cli import registering
-    from tofuse.errors import InputError
     from tofuse.pipeline.pair import PairOptions, exit_status, register_files
     from tofuse.report.pair_words import belief
     from tofuse.results.pair import pair_json
 
-    if arguments.overwrite and arguments.out is None:
-        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
+    _check_overwrite(arguments)
     options = PairOptions(
         guess=arguments.guess,
         out=arguments.out,
@@ -168,12 +166,10 @@ def register(arguments: argparse.Namespace) -> int:
 
 def judge(arguments: argparse.Namespace) -> int:
     """``tofuse judge``."""
-    from tofuse.errors import InputError
     from tofuse.pipeline.judging import JudgeOptions, judge_files, sentence
     from tofuse.results.output import plain
 
-    if arguments.overwrite and arguments.out is None:
-        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
+    _check_overwrite(arguments)
     options = JudgeOptions(
         out=arguments.out,
         overwrite=arguments.overwrite,
@@ -208,6 +204,14 @@ def judge(arguments: argparse.Namespace) -> int:
     if options.out is not None:
         console.print(f"see {options.out / 'report.html'}", markup=False)
     return status
+
+
+def _check_overwrite(arguments: argparse.Namespace) -> None:
+    """Refuse --overwrite where --out is optional and not given."""
+    from tofuse.errors import InputError
+
+    if arguments.overwrite and arguments.out is None:
+        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
 
 
 def demo(arguments: argparse.Namespace) -> int:

@@ -107,8 +107,12 @@ def sightings(frames: Sequence[RangeFrame], poses: ArrayLike) -> Sightings:
     """
     T = np.asarray(poses, float)
     rows = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), _VIEWS)
-    options = SurfaceOptions()
-    return compared([surface_map(frames[k], options).thinned(_COLUMNS) for k in rows], T[rows])
+    return compared([prepared(frames[k]) for k in rows], T[rows])
+
+
+def prepared(frame: RangeFrame) -> SurfaceMap:
+    """A frame as `compared` takes it."""
+    return surface_map(frame, SurfaceOptions()).thinned(_COLUMNS)
 
 
 def whole(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:

@@ -140,8 +140,7 @@ def evaluate_trajectory(
     moved = T_align @ T_estimate
     errors = moved[:, :3, 3] - T_reference[:, :3, 3]
     distances = np.linalg.norm(errors, axis=1)
-    turn = mean_rotation(T_reference[:, :3, :3] @ np.swapaxes(T_estimate[:, :3, :3], 1, 2))
-    angles = se3.angle(np.swapaxes(T_reference[:, :3, :3], 1, 2) @ (turn @ T_estimate[:, :3, :3]))
+    angles = angles_between(T_estimate, T_reference)
     return TrajectoryError(
         associated=len(pairs),
         coverage=_coverage(estimate_times, estimate, reference_times, reference, frame_times),
@@ -203,13 +202,22 @@ def align(estimate: ArrayLike, reference: ArrayLike) -> Float64:
     return T
 
 
+def distances_between(estimate: Float64, reference: Float64) -> Float64:
+    """(N,) distances of the positions of poses (N, 4, 4), matched in order, after `align`, m."""
+    moved = align(estimate, reference) @ estimate
+    return np.asarray(np.linalg.norm(moved[:, :3, 3] - reference[:, :3, 3], axis=1), np.float64)
+
+
+def angles_between(estimate: Float64, reference: Float64) -> Float64:
+    """(N,) angles of poses (N, 4, 4), after the rotation that brings them together best, rad."""
+    R_estimate, R_reference = estimate[:, :3, :3], reference[:, :3, :3]
+    turn = mean_rotation(R_reference @ np.swapaxes(R_estimate, 1, 2))
+    return np.asarray(se3.angle(np.swapaxes(R_reference, 1, 2) @ (turn @ R_estimate)), np.float64)
+
+
 def displacement(before: Float64, after: Float64) -> tuple[float, float]:
     """Rms by which poses (N, 4, 4) differ: positions, m, and rotations, rad, each aligned."""
-    distance = np.linalg.norm((align(after, before) @ after - before)[:, :3, 3], axis=1)
-    R_before, R_after = before[:, :3, :3], after[:, :3, :3]
-    turn = mean_rotation(R_before @ np.swapaxes(R_after, 1, 2))
-    angle = se3.angle(np.swapaxes(R_before, 1, 2) @ turn @ R_after)
-    return _rms(distance), _rms(angle)
+    return _rms(distances_between(after, before)), _rms(angles_between(after, before))
 
 
 def relative_error(estimate: Float64, reference: Float64, frames: int) -> RelativeError:

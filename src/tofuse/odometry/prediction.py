@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.registration.projective import UNITS
+from tofuse.registration.projective import UNITS, span
 
 Float64 = NDArray[np.float64]
 
@@ -113,8 +113,7 @@ def _errors(
         P = np.eye(6)
         weak = np.concatenate([np.zeros((0, 6)), *unobservable[i : i + ahead + 1]])
         if len(weak):
-            u, s, _ = np.linalg.svd((weak / UNITS).T, full_matrices=False)
-            u = u[:, s > _DISTINCT * s[0]]
+            u = span(weak, _DISTINCT)
             P -= u @ u.T
         seen = P @ error
         squares += [seen[:3] @ seen[:3], seen[3:] @ seen[3:]]

@@ -53,7 +53,6 @@ class Judged:
 
     sequential: Float64
     optimisation: Optimisation
-    covariances: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +62,6 @@ class Closed:
     loops: list[ClosedLoop]
     sequential: Float64
     optimisation: Optimisation
-    covariances: Float64
     told: Told
     judged: Judged
 
@@ -140,6 +138,9 @@ class BackEnd:
         self._given, self._kept, self._progress, self._watch = given, kept, progress, watch
         self._posed = [e for e in log.posed if e.record.index in poses]
         self._tracks = not isinstance(config.odometry, GivenPoses)
+        self._unobservable = {
+            e.record.index: e.record.unobservable for e in self._posed if len(e.record.unobservable)
+        }
 
     def run(self, stages: Stages, components: tuple[Component, ...]) -> Reconstruction:
         """Make the reconstruction; `stages` keeps what there is after each step."""
@@ -165,8 +166,8 @@ class BackEnd:
         with self._watch.timing("loops"):
             tracked = self.graph(())
             # Where the camera may be: the motion there need not be like that of other stretches.
-            covariances = pose_covariances(self.graph((), cautious=True))
-            unsure = dict(zip(tracked.ids.tolist(), covariances, strict=True))
+            wary = self.graph((), cautious=True) if self._unobservable else tracked
+            unsure = dict(zip(wary.ids.tolist(), pose_covariances(wary), strict=True))
             found = self._kept.loops.finish(self._poses, unsure)
             loops = with_joins(found, self._joins)
             graph = self.graph(loops)
@@ -185,13 +186,12 @@ class BackEnd:
             loops = _decided(loops, optimisation)
             optimisation = without_left_out(optimisation)
         graph = optimisation.graph
-        covariances = pose_covariances(graph)
-        judged = Judged(led, optimisation, covariances)
+        judged = Judged(led, optimisation)
         if told:
             # The verdict stays with what was seen: no file beside the images makes it better.
             seen = self.graph(loops).with_poses(graph.poses)
-            judged = Judged(led, replace(optimisation, graph=seen), pose_covariances(seen))
-        return Closed(loops, sequential, optimisation, covariances, told, judged)
+            judged = Judged(led, replace(optimisation, graph=seen))
+        return Closed(loops, sequential, optimisation, told, judged)
 
     def _refine(self, closed: Closed) -> Refined:
         graph = closed.optimisation.graph
@@ -347,10 +347,26 @@ class BackEnd:
         Not assessed where registrations don't know their errors.
         """
         if not self._kept.knows_errors:
-            return Accuracy(), closed.covariances
-        unobservable = {
-            e.record.index: e.record.unobservable for e in self._posed if len(e.record.unobservable)
-        }
+            return Accuracy(), pose_covariances(closed.optimisation.graph)
+        refinement = refined.refinement
+        graph = seen = self._measured(refined.graph)
+        if closed.told:  # as the verdict, the accuracy stays with what was seen
+            alone = closed.judged.optimisation.graph
+            if refinement.kept:
+                alone = self.graph(closed.loops, refinement)
+            seen = self._measured(alone)
+        moved = 0.0, 0.0
+        if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
+            moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
+        excess = 0.0 if sightings is None else sightings.excess_m()
+        suspicion, gap = refinement.suspicion, (0.0, 0.0)
+        if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
+            gap = suspicion.gap.before
+        shown = Shown(*moved, excess, *gap)
+        return accuracy_of(seen, shown, model.cloud.diagonal_m), covariances_of(graph, shown)
+
+    def _measured(self, graph: PoseGraph) -> PoseGraph:
+        """The graph without what is only extrapolated from the motion."""
         bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
         own = {
             (e.step.reference, e.record.index)
@@ -358,17 +374,8 @@ class BackEnd:
             if e.step is not None and e.step.reference is not None
         }
         views = {v.index: v.view for v in self._kept.views.of(self._poses)}
-        directions = degenerate_directions(refined.graph, unobservable, own, views)
-        graph = without_degenerate(refined.graph, directions, bridges)
-        moved = 0.0, 0.0
-        if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
-            moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
-        excess = 0.0 if sightings is None else sightings.excess_m()
-        suspicion, gap = refined.refinement.suspicion, (0.0, 0.0)
-        if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
-            gap = suspicion.gap.before
-        shown = Shown(*moved, excess, *gap)
-        return accuracy_of(graph, shown, model.cloud.diagonal_m), covariances_of(graph, shown)
+        directions = degenerate_directions(graph, self._unobservable, own, views)
+        return without_degenerate(graph, directions, bridges)
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
         """The records with the covariances (P, 6, 6) of the frames that have a pose here."""

@@ -19,7 +19,7 @@ from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import in_words as camera_in_words
 from tofuse.posegraph.trust import loop_errors
 from tofuse.registration.base import Registration
-from tofuse.results.ranges import Range, in_words, is_one, runs, size, union
+from tofuse.results.ranges import Range, in_words, is_one, runs, runs_of, size, union
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
 
@@ -151,8 +151,7 @@ class Evidence:
 
     def runs_of(self, frames: Collection[int]) -> tuple[Range, ...]:
         """Ranges of the records with these indices."""
-        chosen = set(frames)
-        return self.runs([record.index in chosen for record in self.records])
+        return runs_of([record.index for record in self.records], frames)
 
 
 def tolerance_of(given_m: float | None, diagonal_m: float) -> float:
@@ -416,8 +415,7 @@ def bounds(a: Accuracy, tolerance_m: float, frames: Sequence[int]) -> Iterator[R
     """Give reasons where an accuracy of frames with these indices is not within a tolerance."""
     if not a.assessed:
         return
-    chosen = set(a.unbounded)
-    free = runs(frames, [k in chosen for k in frames])
+    free = runs_of(frames, a.unbounded)
     if free:
         text = (
             f"{_poses_of(free)} not constrained in some direction (degenerate geometry): the "

@@ -20,11 +20,11 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import Consistency, map_consistency
-from tofuse.evaluation.sightings import Sightings, sightings
-from tofuse.evaluation.trajectory import align
-from tofuse.evaluation.trajectory import displacement as displacement_of
+from tofuse.evaluation.sightings import Sightings, compared, prepared
+from tofuse.evaluation.trajectory import displacement, distances_between
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.pipeline.checks import bounds, images, tolerance_of
@@ -38,7 +38,7 @@ from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, Source, evenly
 from tofuse.results.card import bound, length
 from tofuse.results.output import OutputFolder, accuracy_json, plain, reasons_json, write_result
-from tofuse.results.ranges import in_words, runs
+from tofuse.results.ranges import in_words, runs_of
 from tofuse.results.types import Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
 
@@ -134,25 +134,27 @@ def judge(
     """
     progress = progress or Silent()
     poses = poses_for(recording, trajectory)
-    config = replace(from_method("default", view_kind(recording)), tolerance_m=tolerance_m)
-    check_views(replace(config, odometry=GivenPoses()), view_kind(recording))
+    kind = view_kind(recording)
     # What else moves with the camera says nothing of these poses.
-    config = replace(config, outside=())
+    config = replace(from_method("default", kind), tolerance_m=tolerance_m, outside=())
+    given = replace(config, odometry=GivenPoses())
+    check_views(given, kind)
+    compared_images = _Images(recording)
 
     def made(led: Recording, by: Config) -> tuple[Reconstruction, Seen]:
         result = reconstruct(led, by, threads=threads, progress=progress)
-        return result, Seen.of(recording, result.trajectory)
+        return result, compared_images.under(result.trajectory)
 
     progress.stage("comparing images")
-    seen = Seen.of(recording, poses)
-    refined, after = made(with_odometry(recording, poses), replace(config, odometry=GivenPoses()))
+    seen = compared_images.under(poses)
+    refined, after = made(with_odometry(recording, poses), given)
     started = True
     if not after.is_supported:
         other, seen_other = made(recording, config)
         if seen_other.support > after.support:
             refined, after, started = other, seen_other, False
-    displacement = _displacement(poses, refined.trajectory)
-    accuracy = _accuracy(displacement, poses, refined)
+    distances = _distances(poses, refined.trajectory)
+    accuracy = _accuracy(distances, poses, refined)
     reasons = ranked([*_reasons(poses, accuracy, seen, after, refined, tolerance_m)])
     return Judgement(
         poses,
@@ -161,7 +163,7 @@ def judge(
         reasons,
         _consistency(recording, poses),
         _consistency(recording, refined.trajectory),
-        displacement,
+        distances,
         refined,
         started,
     )
@@ -172,20 +174,6 @@ class Seen:
     """What overlapping images say of poses."""
 
     sightings: Sightings
-
-    @classmethod
-    def of(cls, recording: Recording, poses: Float64) -> Seen:
-        """Compare some of the frames of a recording under their poses (N, 4, 4)."""
-        frames, chosen = [], []
-        for k in evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist():
-            try:
-                frame = recording[k]
-            except UnreadableFrameError:
-                continue
-            if isinstance(frame, RangeFrame):
-                frames.append(frame)
-                chosen.append(k)
-        return cls(sightings(frames, poses[chosen]))
 
     @property
     def overlapping(self) -> float:
@@ -202,6 +190,31 @@ class Seen:
     def is_supported(self) -> bool:
         """Whether all views overlap with others, and hardly anything contradicts the poses."""
         return self.support >= _SUPPORTED
+
+
+class _Images:
+    """Some frames of a recording, each read and prepared once, to be compared under any poses."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._views: dict[int, SurfaceMap | None] = {}
+
+    def under(self, poses: Float64) -> Seen:
+        """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
+        rows = evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
+        found = [(k, view) for k in rows if (view := self._view(k)) is not None]
+        chosen = [k for k, _ in found]
+        return Seen(compared([view for _, view in found], poses[chosen]))
+
+    def _view(self, k: int) -> SurfaceMap | None:
+        """The k-th frame, prepared; None if it can't be read."""
+        if k not in self._views:
+            try:
+                frame = self._recording[k]
+            except UnreadableFrameError:
+                frame = None
+            self._views[k] = prepared(frame) if isinstance(frame, RangeFrame) else None
+        return self._views[k]
 
 
 @dataclass(frozen=True)
@@ -298,7 +311,7 @@ def device_sentence(recording: Recording, result: Reconstruction) -> str:
     by, poses = recording.metadata.get(POSES_BY), recording.reference
     if by is None or poses is None:
         return ""
-    apart = _displacement(poses, result.trajectory)
+    apart = _distances(poses, result.trajectory)
     apart = apart[np.isfinite(apart)]
     if len(apart) < 2:
         return ""
@@ -361,29 +374,27 @@ def with_odometry(recording: Recording, poses: Float64) -> Recording:
     return replace(recording, source=source)
 
 
-def _displacement(poses: Float64, refined: Float64) -> Float64:
+def _distances(poses: Float64, refined: Float64) -> Float64:
     both = np.isfinite(poses[:, 0, 0]) & np.isfinite(refined[:, 0, 0])
     out = np.full(len(poses), np.nan)
     if both.any():
-        moved = align(poses[both], refined[both]) @ poses[both] - refined[both]
-        out[both] = np.linalg.norm(moved[:, :3, 3], axis=1)
+        out[both] = distances_between(poses[both], refined[both])
     return out
 
 
-def _accuracy(displacement: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
+def _accuracy(distances: Float64, poses: Float64, refined: Reconstruction) -> Accuracy:
     """Of the given poses: how far from the refined ones, and how far those may be off."""
     known = refined.diagnostics.accuracy
-    both = np.flatnonzero(np.isfinite(displacement))
+    both = np.flatnonzero(np.isfinite(distances))
     if not known.assessed or not len(both):
         return known
-    _, turned = displacement_of(refined.trajectory[both], poses[both])
+    moved, turned = displacement(refined.trajectory[both], poses[both])
     # In the worst case both are in one direction.
-    position = float(np.sqrt((displacement[both] ** 2).mean())) + known.position_m
-    rotation = turned + known.rotation_rad
-    worst = int(both[np.argmax(displacement[both])])
+    position, rotation = moved + known.position_m, turned + known.rotation_rad
+    worst = int(both[np.argmax(distances[both])])
     at_worst = WorstFrame(
         int(refined.diagnostics.frames[worst].index),
-        float(displacement[worst]) + known.position_m,
+        float(distances[worst]) + known.position_m,
         rotation,
     )
     if known.unbounded and known.worst is not None:
@@ -418,7 +429,7 @@ def _reasons(
     jumped = {k: words for k, words in jumps(_or_none(poses), moments) if k not in own}
     if jumped:
         first = next(iter(jumped))
-        where = runs(indices, [k in jumped for k in range(len(indices))])
+        where = runs_of(indices, [indices[k] for k in jumped])
         text = (
             f"The poses of {in_words(where)} jump, and the refined ones don't; that of frame "
             f"{indices[first]} is {jumped[first]}."

@@ -1,11 +1,11 @@
 """How far off the poses may be: 95 % bounds, from what the recording itself shows.
 
 The joint covariance of the poses says what noise, and the errors that the patches of a view share,
-leave room for. Two things come on top of it. By how much the refinement moved the trajectory is by
-how much the errors of single registrations, which are correlated, had bent it: what is left is in
-proportion. And views far apart in time that see the same surface disagree by more than consecutive
-ones do, if poses are wrong. `docs/uncertainty.md` shows how the factors were found, on recordings
-of other cameras and scenes than those on which they were tested.
+leave room for. Three things come on top of it. By how much the refinement moved the trajectory is
+by how much the errors of single registrations, which are correlated, had bent it: what is left is
+in proportion. Views far apart in time that see the same surface disagree by more than consecutive
+ones do, if poses are wrong. And a loop that another calibration would close shows that this one
+bends the path. `docs/uncertainty.md` says how the factor for what shows in nothing was found.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.trust import joint_covariance, pose_covariances
-from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
+from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
 
 Float64 = NDArray[np.float64]
 
@@ -30,16 +30,16 @@ _LEVEL = 0.95
 _EVEN, _WORST = 50, 10
 # What a direction that nothing measures is given, as good as unbounded: m and rad.
 _OPEN = np.array([30.0] * 3 + [10.0] * 3)
-# The tracker knows no direction worse than from its prediction, by 0.3 m and 0.3 rad. What is known
-# no better than that is not measured; in a large model, what is off by a share of its diagonal.
-_UNMEASURED_M, _UNMEASURED_RAD, _UNMEASURED_SHARE = 0.3, 0.3, 0.05
+# In a large model what is off by this share of its diagonal is not measured.
+_UNMEASURED_SHARE = 0.05
 # What shows is the part of the errors in which views differ. Errors of the sensor that all views of
 # a place share show in nothing: in total they are so many times larger.
 _HIDDEN = 1.6
 # Directions of two frames are different ones above this share of the strongest.
 _DISTINCT = 0.1
 _NONE = np.zeros((0, 6))
-# Near the final pose.
+# Near the final pose. No direction is known worse than by its prior: what is known no better than
+# that is not measured.
 _ALIGNMENT = ProjectiveOptions()
 
 
@@ -175,8 +175,7 @@ def without_degenerate(
             continue
         if not len(weak):
             continue
-        u, s, _ = np.linalg.svd((weak / UNITS).T, full_matrices=False)
-        u = u[:, s > _DISTINCT * s[0]]
+        u = span(weak, _DISTINCT)
         H = information[k] * np.outer(UNITS, UNITS)
         scaled = H - H @ u @ np.linalg.pinv(u.T @ H @ u, hermitian=True) @ u.T @ H
         free = u @ np.linalg.inv(u.T @ open_variance @ u) @ u.T
@@ -197,7 +196,8 @@ def accuracy_of(graph: PoseGraph, shown: Shown, diagonal_m: float) -> Accuracy:
     n = len(graph.ids)
     if n < 2:
         return Accuracy()
-    limits = np.array([max(_UNMEASURED_M, _UNMEASURED_SHARE * diagonal_m), _UNMEASURED_RAD])
+    least_m, least_rad = _ALIGNMENT.prior_m, _ALIGNMENT.prior_rad
+    limits = np.array([max(least_m, _UNMEASURED_SHARE * diagonal_m), least_rad])
     covariances, unbounded = _single(graph, limits)
     free = tuple(graph.ids[unbounded.any(1)].tolist())
     even = np.unique(np.linspace(0, n - 1, min(n, _EVEN)).round().astype(int))

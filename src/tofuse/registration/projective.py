@@ -198,6 +198,18 @@ class Aligned:
         return self.landed / self.points if self.points else 0.0
 
 
+def span(directions: Float64, least: float) -> Float64:
+    """(6, m) orthonormal basis of directions (k, 6), m and rad, in `UNITS`.
+
+    Parameters
+    ----------
+    least
+        Directions are different ones above this share of the strongest.
+    """
+    u, s, _ = np.linalg.svd((directions / UNITS).T, full_matrices=False)
+    return np.asarray(u[:, s > least * s[0]], np.float64)
+
+
 def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> Registration:
     """An alignment with one target as a registration.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.posegraph.accuracy import Accuracy
-from tofuse.results.ranges import in_words, runs
+from tofuse.results.ranges import in_words, runs_of
 from tofuse.results.types import Reconstruction
 from tofuse.results.verdict import ADVICE, ranked
 
@@ -41,17 +41,11 @@ def bound(a: Accuracy, diagonal_m: float) -> str:
 def weakest_frame(a: Accuracy) -> str:
     """Say which frames are known least, and how well; empty where nothing was assessed."""
     if a.unbounded:
-        indices = list(a.unbounded)
-        where = in_words(runs(range(indices[0], indices[-1] + 1), _marked(indices)))
-        return f"{where}, not bounded"
+        where = runs_of(range(a.unbounded[0], a.unbounded[-1] + 1), a.unbounded)
+        return f"{in_words(where)}, not bounded"
     if a.worst is None:
         return ""
     return f"frame {a.worst.frame}, {length(a.worst.position_m)}"
-
-
-def _marked(indices: list[int]) -> list[bool]:
-    chosen = set(indices)
-    return [k in chosen for k in range(indices[0], indices[-1] + 1)]
 
 
 def length(metres: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -31,6 +31,12 @@ def runs(frames: Sequence[int], marked: Sequence[bool]) -> tuple[Range, ...]:
     return tuple(
         (int(frames[a]), int(frames[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)
     )
+
+
+def runs_of(frames: Sequence[int], chosen: Collection[int]) -> tuple[Range, ...]:
+    """Return the runs, as `runs` does, of the frames whose index is chosen."""
+    indices = set(chosen)
+    return runs(frames, [k in indices for k in frames])
 
 
 def union(ranges: Iterable[Range]) -> tuple[Range, ...]:
