@@ -14,7 +14,9 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_numbers
 from tofuse.geometry.quaternion import to_matrix
-from tofuse.recordings.frames import Frame
+from tofuse.recordings.deprojected import Deprojection, find_deprojection
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.recordings.organised import SAMPLES
 from tofuse.recordings.reader import SURE, Sniff
 from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
 
@@ -58,7 +60,8 @@ class CloudFileSource(FileSource):
         self.files = files
         self.load_frame, self.load_moved = load_frame, load_moved
         self._far = False
-        self._kept: dict[int, Frame] = {}  # read to find the shift
+        self._kept: dict[int, Frame] = {}  # read to find shift and camera
+        self._seen: Deprojection | None = None
         if is_folder(path):
             self._read_timestamps(path / "timestamps.txt")
             if is_file(path / "groundtruth.txt"):
@@ -71,11 +74,16 @@ class CloudFileSource(FileSource):
         if load_moved is not None:
             self._shift, self._kept = find_shift(self._read, len(files))
             note_shift(self, path, self._shift)
+            self._seen = self._deprojection()
+            if self._seen is not None:
+                self.metadata["depth_kind"] = "z"
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
         kept = self._kept.pop(index, None)
         frame = self._read(index) if kept is None else kept
+        if self._seen is not None and isinstance(frame, CloudFrame):
+            return self._seen.image(frame)
         farthest = float(np.abs(frame.points).max(initial=0))
         if farthest > MAP_COORDINATES_M and not self._far:
             self._far = True
@@ -91,6 +99,26 @@ class CloudFileSource(FileSource):
         if self.load_moved is not None and self._shift.any():
             return self.load_moved(file, index, time, self._shift)
         return self.load_frame(file, index, time)
+
+    def _deprojection(self) -> Deprojection | None:
+        """The camera that all clouds were deprojected from, by some that can be read."""
+        if self._shift.any():
+            return None
+        clouds: list[CloudFrame] = []
+        for index in range(0, len(self.files), max(1, len(self.files) // SAMPLES)):
+            if len(clouds) == SAMPLES:
+                break
+            try:
+                frame = self._kept[index] if index in self._kept else self._read(index)
+            except InputError:
+                continue
+            if not isinstance(frame, CloudFrame):
+                return None
+            clouds.append(frame)
+            # Most clouds are not, as one shows.
+            if len(clouds) == 1 and find_deprojection(clouds) is None:
+                return None
+        return find_deprojection(clouds)
 
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):

@@ -1,0 +1,127 @@
+"""Clouds that are images without their grid: the camera is recovered from the points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tofuse.errors import UnreadableFrameError
+from tofuse.files.ply import write_ply
+from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
+from tofuse.recordings.deprojected import find_deprojection
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.open import open_recording
+
+PINHOLE = Pinhole(160, 120, 140.0, 141.0, 82.3, 57.9)
+LENSES: dict[str, Camera] = {
+    "pinhole": PINHOLE,
+    "brown": BrownConrady(160, 120, 140.0, 141.0, 82.3, 57.9, k1=-0.25, k2=0.1, p1=1e-3),
+    "rational": Rational(160, 120, 140.0, 140.0, 79.0, 61.0, k1=0.1, k2=-0.01, k4=0.3, k5=0.02),
+}
+
+
+def seen(camera: Camera, seed: int) -> RangeFrame:
+    """A wavy wall with holes, one of them over whole columns."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    depth = 1.5 + 0.5 * np.sin(u / 30 + seed) + 0.3 * np.cos(v / 20) + 0.01 * rng.random(u.shape)
+    depth[rng.random(u.shape) < 0.2] = 0
+    depth[:, 40:43] = 0
+    amplitude = rng.uniform(10, 1000, u.shape).astype(np.float32)
+    return RangeFrame(seed, 0.0, camera, depth.astype(np.float32), amplitude_image=amplitude)
+
+
+def cloud_of(frame: RangeFrame, order: NDArray[np.intp] | None = None) -> CloudFrame:
+    order = np.arange(len(frame)) if order is None else order
+    amplitude = frame.amplitude
+    assert amplitude is not None
+    return CloudFrame(frame.index, 0.0, frame.points[order], amplitude=amplitude[order])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_image_comes_back_from_shuffled_points(lens: str) -> None:
+    frames = [seen(LENSES[lens], k) for k in range(3)]
+    rng = np.random.default_rng(7)
+    clouds = [cloud_of(f, rng.permutation(len(f))) for f in frames]
+    found = find_deprojection(clouds[:2])
+    assert found is not None
+    assert (found.camera.width, found.camera.height) == (160, 120)
+    assert isinstance(found.camera, Pinhole) == (lens == "pinhole")
+    # Where nothing was measured the rays are those of the lens, too.
+    off = np.abs(found.camera.rays() - LENSES[lens].rays()) * 140
+    assert off.max() < 0.01
+    for frame, cloud in zip(frames, clouds, strict=True):
+        image = found.image(cloud)
+        np.testing.assert_array_equal(image.depth, frame.depth)
+        there = frame.valid
+        assert image.amplitude_image is not None
+        assert frame.amplitude_image is not None
+        np.testing.assert_array_equal(image.amplitude_image[there], frame.amplitude_image[there])
+        np.testing.assert_allclose(image.points, frame.points, atol=2e-5)
+
+
+def test_coordinates_rounded_to_a_millimetre_will_do() -> None:
+    cloud = cloud_of(seen(PINHOLE, 0))
+    rounded = CloudFrame.of(np.round(cloud.points, 3))
+    found = find_deprojection([rounded])
+    assert found is not None
+    assert len(found.image(rounded)) == len(rounded)
+
+
+def moved(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    turn = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    return (points @ turn.T + (0.1, 0.2, 3.0)).astype(np.float32)
+
+
+@pytest.mark.parametrize("spoilt", ["moved", "merged", "averaged", "scattered", "behind", "few"])
+def test_other_clouds_stay_clouds(spoilt: str) -> None:
+    rng = np.random.default_rng(1)
+    points = cloud_of(seen(PINHOLE, 0)).points
+    off = rng.normal(0, 0.004, points.shape).astype(np.float32)
+    scattered = rng.uniform((-1, -1, 1), (1, 1, 3), (20_000, 3)).astype(np.float32)
+    other = {
+        "moved": moved(points),
+        "merged": np.concatenate([points, moved(points)]),
+        "averaged": points + off,
+        "scattered": scattered,
+        "behind": -points,
+        "few": points[:300],
+    }[spoilt]
+    assert find_deprojection([CloudFrame.of(other)]) is None
+
+
+def test_a_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
+    frames = [seen(LENSES["brown"], k) for k in range(4)]
+    for k, frame in enumerate(frames[:3]):
+        write_ply(tmp_path / f"{k}.ply", frame.points, scalars={"amplitude": frame.amplitude})
+    write_ply(tmp_path / "3.ply", np.zeros((0, 3)))
+    recording = open_recording(tmp_path)
+    assert recording.format == "ply"
+    for k, frame in enumerate(frames[:3]):
+        image = recording[k]
+        assert isinstance(image, RangeFrame)
+        np.testing.assert_array_equal(image.depth, frame.depth)
+        assert image.amplitude_image is not None
+    assert len(recording[3]) == 0
+
+
+def test_a_folder_with_another_kind_of_cloud_stays_clouds(tmp_path: Path) -> None:
+    frames = [seen(PINHOLE, k) for k in range(3)]
+    for k, frame in enumerate(frames):
+        points = np.concatenate([frame.points, moved(frame.points)]) if k else frame.points
+        write_ply(tmp_path / f"{k}.ply", points)
+    assert isinstance(open_recording(tmp_path)[0], CloudFrame)
+
+
+def test_a_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
+    frames = [seen(PINHOLE, k % 5) for k in range(24)]
+    for k, frame in enumerate(frames):
+        points = moved(frame.points) if k == 4 else frame.points
+        write_ply(tmp_path / f"{k:02d}.ply", points)
+    recording = open_recording(tmp_path)
+    assert isinstance(recording[5], RangeFrame)
+    with pytest.raises(UnreadableFrameError, match="off the rays of those before it"):
+        recording[4]
