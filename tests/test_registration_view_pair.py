@@ -10,6 +10,7 @@ import pytest
 import tofuse
 from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import RayTable
 from tofuse.kernels.threads import threads
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import Agreement
@@ -58,6 +59,29 @@ def test_a_pair_far_apart_is_found_and_believed(far):
 def test_the_covariance_tells_how_large_the_error_is(far):
     gap = se3.log(se3.inverse(far.T_target_source) @ TRUE)
     assert gap @ far.information @ gap < 22.5  # 99.9 % of a chi square of six dimensions
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_camera_on_its_side_is_found(quarters):
+    # Beyond the reach of the exhaustive search, whose poses are upright.
+    image = seen(at(-0.3, 0.4, 0.4), 1)
+    turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters)
+    rays = np.rot90(image.camera.rays() @ turn.T.astype(np.float32), -quarters)
+    assert image.amplitude_image is not None
+    source = replace(
+        image,
+        camera=RayTable(rays),
+        depth=np.rot90(image.depth, -quarters),
+        amplitude_image=np.rot90(image.amplitude_image, -quarters),
+        sigma_image=None,
+    )
+    roll = np.eye(4)
+    roll[:2, :2] = turn
+    found = tofuse.register(source, seen(A, 0))
+    metres, degrees = error(found.T_target_source @ roll, se3.inverse(A) @ at(-0.3, 0.4, 0.4))
+    assert metres < 0.02
+    assert degrees < 0.5
+    assert found.believed
 
 
 def test_views_of_different_rooms_are_not_believed(pair):

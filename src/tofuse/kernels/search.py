@@ -133,6 +133,38 @@ def _judge(
 
 
 @kernel
+def thinned(
+    rotations: Float64, translations: Float64, depth: float, apart: float, count: int
+) -> NDArray[np.int64]:
+    """Choose the first `count` poses, leaving out those near an earlier one that was chosen.
+
+    Poses (N, 3, 3) and (N, 3) are near each other if they move points at `depth` by less than
+    `apart`, both m.
+    """
+    chosen = np.empty(min(count, len(rotations)), np.int64)
+    size = 0
+    for k in range(len(rotations)):
+        free = True
+        for other in chosen[:size]:
+            trace = 0.0
+            squared = 0.0
+            for i in range(3):
+                for j in range(3):
+                    trace += rotations[k, i, j] * rotations[other, i, j]
+                squared += (translations[k, i] - translations[other, i]) ** 2
+            turned = np.sqrt(max(3.0 - trace, 0.0))  # about the angle
+            if turned * depth + np.sqrt(squared) <= apart:
+                free = False
+                break
+        if free:
+            chosen[size] = k
+            size += 1
+            if size == count:
+                break
+    return chosen[:size]
+
+
+@kernel
 def score_grid(
     source_points: Float32,
     source_normals: Float32,

@@ -121,35 +121,64 @@ def agreement(
     T_target_source
         (4, 4) maps points of the source into the target.
     """
-    options = AgreementOptions() if options is None else options
-    T = np.ascontiguousarray(T_target_source, np.float64)
-    total = np.zeros(kernels.AGREE_SIZE)
-    count = 0
-    differences = []
-    for seen, by, pose in ((source, target, T), (target, source, se3.inverse(T))):
-        points = ViewPoints.of(seen, options.points)
-        count += len(points.points)
-        differences.append(np.empty(len(points.points), np.float32))
-        total += _one_way(points, by, np.ascontiguousarray(pose), options, differences[-1])
-    on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
-    # Exposure is what most of them differ by; the way back sees its negative.
-    lighter = np.concatenate([differences[0], -differences[1]])
-    lighter = lighter[np.isfinite(lighter)]
-    clash, alike = 0, float(on_surface)
-    if len(lighter):
-        apart = np.abs(lighter - np.median(lighter)) / options.albedo
-        clash = int(np.count_nonzero(apart > _CLASH))
-        alike -= float(np.minimum(apart**2, 1 + options.clash_weight).sum(dtype=np.float64))
-    share = 1 / max(count, 1)
-    return Agreement(
-        overlap=float(total[kernels.COMPARED] * share),
-        support=float((on_surface - clash) * share),
-        violation=float(violation * share),
-        clash=float(clash * share),
-        rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
-        points=count,
-        score=float(share * (alike - options.violation_weight * violation)),
-    )
+    return Comparison.of(source, target, options).at(T_target_source)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two views, prepared to be judged at many poses.
+
+    Attributes
+    ----------
+    ways
+        Points of one view, and the view that they are looked up in with its `nearest_depth`: from
+        the source to the target, and back.
+    """
+
+    ways: tuple[tuple[ViewPoints, SurfaceMap, Float32], tuple[ViewPoints, SurfaceMap, Float32]]
+    options: AgreementOptions
+
+    @classmethod
+    def of(
+        cls, source: SurfaceMap, target: SurfaceMap, options: AgreementOptions | None = None
+    ) -> Comparison:
+        """Prepare two views."""
+        options = AgreementOptions() if options is None else options
+        there = ViewPoints.of(source, options.points), target, nearest_depth(target)
+        back = ViewPoints.of(target, options.points), source, nearest_depth(source)
+        return cls((there, back), options)
+
+    def at(self, T_target_source: Float64) -> Agreement:
+        """Judge a pose (4, 4); see `agreement`."""
+        options = self.options
+        T = np.ascontiguousarray(T_target_source, np.float64)
+        total = np.zeros(kernels.AGREE_SIZE)
+        count = 0
+        differences = []
+        for (points, by, nearest), pose in zip(self.ways, (T, se3.inverse(T)), strict=True):
+            count += len(points.points)
+            differences.append(np.empty(len(points.points), np.float32))
+            pose = np.ascontiguousarray(pose)
+            total += _one_way(points, by, nearest, pose, options, differences[-1])
+        on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
+        # Exposure is what most of them differ by; the way back sees its negative.
+        lighter = np.concatenate([differences[0], -differences[1]])
+        lighter = lighter[np.isfinite(lighter)]
+        clash, alike = 0, float(on_surface)
+        if len(lighter):
+            apart = np.abs(lighter - np.median(lighter)) / options.albedo
+            clash = int(np.count_nonzero(apart > _CLASH))
+            alike -= float(np.minimum(apart**2, 1 + options.clash_weight).sum(dtype=np.float64))
+        share = 1 / max(count, 1)
+        return Agreement(
+            overlap=float(total[kernels.COMPARED] * share),
+            support=float((on_surface - clash) * share),
+            violation=float(violation * share),
+            clash=float(clash * share),
+            rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
+            points=count,
+            score=float(share * (alike - options.violation_weight * violation)),
+        )
 
 
 def nearest_depth(view: SurfaceMap) -> Float32:
@@ -164,12 +193,11 @@ def nearest_depth(view: SurfaceMap) -> Float32:
 def _one_way(
     points: ViewPoints,
     view: SurfaceMap,
+    nearest: Float32,
     T: Float64,
     options: AgreementOptions,
     differences: Float32,
 ) -> Float64:
-    nearest = nearest_depth(view)
-
     def work(a: int, b: int) -> Float64:
         return kernels.agree(
             points.points,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -15,6 +17,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
+from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.registration.viewpoint import as_image, viewpoint_of
@@ -22,6 +25,8 @@ from tofuse.registration.viewpoint import as_image, viewpoint_of
 Float64 = NDArray[np.float64]
 
 FEWEST_POINTS = 10
+# Poses that shapes propose, at most.
+PROPOSALS = 8
 
 
 @part("registration", "any-pair")
@@ -54,8 +59,10 @@ class AnyPair(Registrar):
             if len(view) < FEWEST_POINTS:
                 raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
         searches = self.search or guess is None
-        seen = _registered_as_images(source, target, guess, search=searches)
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
+        # Of other clouds the shapes are compared below.
+        proposals = partial(_alike, source, target, rng) if are_images else None
+        seen = _registered_as_images(source, target, guess, proposals, search=searches)
         if seen is not None and (seen.believed or are_images):
             return seen
         if not searches and guess is not None:
@@ -63,8 +70,22 @@ class AnyPair(Registrar):
         return register_clouds(source, target, guess, rng, seen)
 
 
+def _alike(source: Frame, target: Frame, rng: np.random.Generator) -> Float64:
+    """Poses (N, 4, 4), under any rotation, that shapes which are alike propose."""
+    try:
+        found = Fpfh(signed=True).candidates(source, target, rng)
+    except RegistrationError:
+        return np.zeros((0, 4, 4))
+    return np.stack([pose.T_target_source for pose in found.poses[:PROPOSALS]])
+
+
 def _registered_as_images(
-    source: Frame, target: Frame, guess: Float64 | None, *, search: bool
+    source: Frame,
+    target: Frame,
+    guess: Float64 | None,
+    proposals: Callable[[], Float64] | None,
+    *,
+    search: bool,
 ) -> Registration | None:
     """Register what both cameras saw; None where a view is no image, or has too little surface.
 
@@ -89,7 +110,7 @@ def _registered_as_images(
             )
         return None  # as clouds, the unit of one of them may be found to be wrong
     if search or start is None:
-        found = register_pair(data, model, start)
+        found = register_pair(data, model, start, proposals=proposals)
     else:
         found = follow(data, model, start)
     return None if found is None else found.between(T_target_camera, T_camera_source)

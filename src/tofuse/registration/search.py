@@ -8,7 +8,7 @@ grid is yaw and two translations; else it has all six dimensions. There is nothi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -23,7 +23,7 @@ from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import (
     Agreement,
     AgreementOptions,
-    agreement,
+    Comparison,
     nearest_depth,
 )
 from tofuse.registration.floor import Floor, FloorOptions, find_floors
@@ -53,10 +53,12 @@ _GRID = 128
 _LEAST_POINTS = 50
 # Points of a view of which the search takes its samples.
 _SEEN = 3000
-# The whole grid is scored on a third of the points, and the best so many times the candidates on
+# The whole grid is scored on a sixth of the points, and the best so many times the candidates on
 # all.
-_COARSE_SHARE, _KEPT = 3, 200
+_COARSE_SHARE, _KEPT = 6, 200
 _CHUNKS = 16
+# Reaches of the two-way ICP, iteration by iteration, in those of the first.
+_NARROWER = 0.85 ** np.arange(28)
 
 
 @dataclass(frozen=True)
@@ -251,49 +253,103 @@ def search(
     Match or None
         None where a view has too few surfaces to be searched with.
     """
-    options = SearchOptions() if options is None else options
-    source, target = with_rough_planes(source), with_rough_planes(target)
-    s, t = _prepare(source), _prepare(target)
-    if min(len(s.points), len(t.points)) < _LEAST_POINTS:
-        return None
-    found: list[Candidate] = []
-    if options.mode != "full":
-        floors = find_floors((source, target), options.floor, gravity)
-        if floors is not None:
-            poses = _planar(s, t, floors[0], floors[1], options)
-            found = _settled(source, target, s, t, poses, options)
-        convinced = bool(found) and max(c.score for c in found) >= options.convincing
-        if options.mode == "planar" or (options.mode == "auto" and convinced):
-            return Match(_finished(source, target, found, options), "planar") if found else None
-    found += _settled(source, target, s, t, _full(s, t, options), options)
-    return Match(_finished(source, target, found, options), "full")
+    prepared = Search.of(source, target, options)
+    return None if prepared is None else prepared.everywhere(gravity)
 
 
-def _finished(
-    source: SurfaceMap, target: SurfaceMap, found: list[Candidate], options: SearchOptions
-) -> tuple[Candidate, ...]:
-    """Order candidates, after albedo has placed the best ones where geometry alone can't."""
-    distinct = _distinct(found, options)
-    if not (source.has_photo and target.has_photo):
-        return distinct
-    best, rest = distinct[: options.photo_candidates], distinct[options.photo_candidates :]
-    targets = [Target(target, np.eye(4))]
-    moved = run_all(
-        [
-            partial(align, source, targets, candidate.T_target_source, _PHOTOMETRIC)
-            for candidate in best
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Two views, prepared to be searched.
+
+    Attributes
+    ----------
+    source, target
+        Their surfaces, with rough planes where there are no others.
+    compared
+        How they are judged.
+    """
+
+    source: SurfaceMap
+    target: SurfaceMap
+    compared: Comparison
+    options: SearchOptions
+    s: _View
+    t: _View
+
+    @classmethod
+    def of(
+        cls, source: SurfaceMap, target: SurfaceMap, options: SearchOptions | None = None
+    ) -> Search | None:
+        """Prepare two views; None where one has too few surfaces to be searched with."""
+        options = SearchOptions() if options is None else options
+        source, target = with_rough_planes(source), with_rough_planes(target)
+        s, t = _prepare(source), _prepare(target)
+        if min(len(s.points), len(t.points)) < _LEAST_POINTS:
+            return None
+        compared = Comparison.of(source, target, options.agreement)
+        return cls(source, target, compared, options, s, t)
+
+    def everywhere(self, gravity: tuple[Float64, Float64] | None = None) -> Match | None:
+        """Search the whole grid; see `search`."""
+        s, t, options = self.s, self.t, self.options
+        found: list[Candidate] = []
+        if options.mode != "full":
+            floors = find_floors((self.source, self.target), options.floor, gravity)
+            if floors is not None:
+                found = self._settled(_planar(s, t, floors[0], floors[1], options))
+            convinced = bool(found) and max(c.score for c in found) >= options.convincing
+            if options.mode == "planar" or (options.mode == "auto" and convinced):
+                return Match(self._ordered(found), "planar") if found else None
+        found += self._settled(_full(s, t, options))
+        return Match(self._ordered(found), "full")
+
+    def among(self, poses: Float64, match: Match) -> Match:
+        """Settle other poses T_target_source (N, 4, 4) too, and order them among those found."""
+        if not len(poses):
+            return match
+        return replace(match, candidates=self._ordered([*match.candidates, *self._settled(poses)]))
+
+    def _settled(self, poses: Float64) -> list[Candidate]:
+        """Settle poses by two-way ICP, and judge them."""
+        s, t, options = self.s, self.t, self.options
+        poses = poses.copy()
+        floor = _noise_floor(s, t, options)
+        depth = 0.5 * (s.depth + t.depth)
+        reaches = np.maximum(0.25 * depth * _NARROWER, 3 * floor)
+        _settle(s, t, poses, reaches, options.settle_points, options)
+        judged = self._judged(poses)
+        best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
+        finer = np.stack([candidate.T_target_source for candidate in best])
+        reaches = np.maximum(8 * floor * _NARROWER, 1.3 * floor)
+        _settle(s, t, finer, reaches, _POLISH_POINTS, options)
+        return judged + self._judged(finer)
+
+    def _judged(self, poses: Sequence[Float64] | Float64) -> list[Candidate]:
+        said = run_all([partial(self.compared.at, T) for T in poses])
+        return [Candidate(T, each) for T, each in zip(poses, said, strict=True)]
+
+    def _ordered(self, found: list[Candidate]) -> tuple[Candidate, ...]:
+        """Order candidates, after albedo has placed the best ones where geometry alone can't."""
+        source, target, options = self.source, self.target, self.options
+        distinct = _distinct(found, options)
+        if not (source.has_photo and target.has_photo):
+            return distinct
+        best, rest = distinct[: options.photo_candidates], distinct[options.photo_candidates :]
+        targets = [Target(target, np.eye(4))]
+        moved = run_all(
+            [
+                partial(align, source, targets, candidate.T_target_source, _PHOTOMETRIC)
+                for candidate in best
+            ]
+        )
+        placed = self._judged([aligned.T_world_source for aligned in moved])
+        # Where geometry leaves a pose open, it may fit better a little off the place that albedo
+        # knows.
+        kept = [
+            new if new.score > old.score - _GIVEN_UP else old
+            for old, new in zip(best, placed, strict=True)
         ]
-    )
-    placed = [
-        Candidate(T, agreement(source, target, T, options.agreement))
-        for T in (aligned.T_world_source for aligned in moved)
-    ]
-    # Where geometry leaves a pose open, it may fit a little better off the place that albedo knows.
-    kept = [
-        new if new.score > old.score - _GIVEN_UP else old
-        for old, new in zip(best, placed, strict=True)
-    ]
-    return _distinct([*kept, *rest], options)
+        return _distinct([*kept, *rest], options)
 
 
 def _prepare(view: SurfaceMap) -> _View:
@@ -441,47 +497,10 @@ def _best(
     order = np.lexsort((top, -finer))
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
-    chosen: list[int] = []
-    free = np.ones(len(top), bool)
-    for k in range(len(top)):
-        if not free[k]:
-            continue
-        chosen.append(k)
-        if len(chosen) == count:
-            break
-        turned = np.sqrt(np.maximum(3 - np.einsum("ij,kij->k", R[k], R), 0))  # about the angle
-        moved = np.linalg.norm(x - x[k], axis=1)
-        free &= turned * depth + moved > 1.5 * scorer.reach
+    chosen = kernels.thinned(R, x, depth, 1.5 * scorer.reach, count)
     poses = np.tile(np.eye(4), (len(chosen), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = R[chosen], x[chosen]
     return poses
-
-
-def _settled(
-    source: SurfaceMap,
-    target: SurfaceMap,
-    s: _View,
-    t: _View,
-    poses: Float64,
-    options: SearchOptions,
-) -> list[Candidate]:
-    """Settle poses by two-way ICP, and judge them."""
-    floor = _noise_floor(s, t, options)
-    depth = 0.5 * (s.depth + t.depth)
-    reaches = np.maximum(0.25 * depth * 0.85 ** np.arange(28), 3 * floor)
-    _settle(s, t, poses, reaches, options.settle_points, options)
-    judged = _judged(source, target, poses, options)
-    best = sorted(judged, key=lambda candidate: -candidate.score)[:_POLISHED]
-    finer = np.stack([candidate.T_target_source for candidate in best])
-    _settle(
-        s,
-        t,
-        finer,
-        np.maximum(8 * floor * 0.85 ** np.arange(28), 1.3 * floor),
-        _POLISH_POINTS,
-        options,
-    )
-    return judged + _judged(source, target, finer, options)
 
 
 def _noise_floor(s: _View, t: _View, options: SearchOptions) -> float:
@@ -504,12 +523,6 @@ def _settle(
         len(poses),
         _CHUNKS,
     )
-
-
-def _judged(
-    source: SurfaceMap, target: SurfaceMap, poses: Float64, options: SearchOptions
-) -> list[Candidate]:
-    return [Candidate(T, agreement(source, target, T, options.agreement)) for T in poses]
 
 
 def _distinct(found: list[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:

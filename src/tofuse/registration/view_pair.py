@@ -7,6 +7,7 @@ aligned, and judged by what both images saw of it and by its lead over its rival
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,8 +26,7 @@ from tofuse.registration.projective import (
     align,
     registration_of,
 )
-from tofuse.registration.rough import with_rough_planes
-from tofuse.registration.search import Candidate, Match, SearchOptions, search
+from tofuse.registration.search import Candidate, Match, Search, SearchOptions
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import (
     COARSE,
@@ -88,6 +88,7 @@ def register_pair(
     usual: UsualFit | None = None,
     options: SearchOptions | None = None,
     always_search: bool = False,
+    proposals: Callable[[], Float64] | None = None,
 ) -> Registration | None:
     """Register two prepared views.
 
@@ -101,6 +102,9 @@ def register_pair(
         How far and how finely is searched, at a depth of some metres.
     always_search
         Whether to search even if the pose that was followed from the guess is as good as certain.
+    proposals
+        Gives poses (N, 4, 4) beyond the reach of the search, which are tried where what it finds is
+        not believed.
 
     Returns
     -------
@@ -114,18 +118,14 @@ def register_pair(
     near = pair.followed(np.eye(4) if guess is None else guess)
     if near is not None and near.is_certain and not always_search:
         return pair.registration(near, near.evidence, None)
-    match = search(source, target, pair.options)
-    if match is None:
+    prepared = Search.of(source, target, pair.options)
+    match = None if prepared is None else prepared.everywhere()
+    if prepared is None or match is None:
         return None
-    rough = with_rough_planes(source), with_rough_planes(target)
-    best = pair.settled(match, rough)
-    confirmed = near is not None and not near.degenerate and pair.same(near, best)
-    if guess is not None and near is not None:
-        best = pair.nearer(near, best, rough)
-    rival = pair.rival(best, match)
-    lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
-    evidence = Evidence.of(best.agreement, lead, best.degenerate)
-    return replace(pair.registration(best, evidence, rival), confirmed=confirmed)
+    found = pair.chosen(near, match, prepared, guess is not None)
+    if found.believed or proposals is None:
+        return found
+    return pair.chosen(near, prepared.among(proposals(), match), prepared, guess is not None)
 
 
 def follow(
@@ -196,23 +196,39 @@ class _Pair:
         said = agreement(self.source, self.target, T, self.options.agreement)
         return _Pose(T, there, options, said) if said.score > 0 else None
 
-    def settled(self, match: Match, rough: tuple[SurfaceMap, SurfaceMap]) -> _Pose:
+    def chosen(
+        self, near: _Pose | None, match: Match, prepared: Search, guessed: bool
+    ) -> Registration:
+        """Choose among the poses of a search and the one that was followed from the start.
+
+        If that is where somebody guessed it to be, it is preferred.
+        """
+        best = self.settled(match, prepared)
+        confirmed = near is not None and not near.degenerate and self.same(near, best)
+        if guessed and near is not None:
+            best = self.nearer(near, best, prepared)
+        rival = self.rival(best, match)
+        lead = best.agreement.score - (max(rival.score, 0.0) if rival else 0.0)
+        evidence = Evidence.of(best.agreement, lead, best.degenerate)
+        return replace(self.registration(best, evidence, rival), confirmed=confirmed)
+
+    def settled(self, match: Match, prepared: Search) -> _Pose:
         """Align the best pose of a search, unless the views agree clearly less with that."""
         slack = _AFTER_SEARCH * min(1.0, self.source.depth / _NEAR_M)
         options = replace(_PATIENT, prior_m=slack, prior_rad=_AFTER_SEARCH)
         aligned = self._there(match.T_target_source, options)
-        said = agreement(*rough, aligned.T_world_source, self.options.agreement)
+        said = prepared.compared.at(aligned.T_world_source)
         if said.score >= match.score - _GIVEN_UP:
             return _Pose(aligned.T_world_source, aligned, options, said)
         return _Pose(match.T_target_source, aligned, options, match.agreement)
 
-    def nearer(self, near: _Pose, best: _Pose, rough: tuple[SurfaceMap, SurfaceMap]) -> _Pose:
+    def nearer(self, near: _Pose, best: _Pose, prepared: Search) -> _Pose:
         """Of the pose that was followed from the guess and the best one, the one to take.
 
         A lead that is no evidence does not outweigh the guess, and neither does one along
         directions that are degenerate: there the pose with the largest overlap leads.
         """
-        said = agreement(*rough, near.T_target_source, self.options.agreement)
+        said = prepared.compared.at(near.T_target_source)
         near = replace(near, agreement=said)
         if said.score >= best.agreement.score - _TIE:
             return near
