@@ -56,6 +56,8 @@ class Config:
         Sensors beside the camera whose measurements count.
     joining
         Connects components that were tracked apart.
+    self_calibration
+        Whether a recording that shows an error of its camera is reconstructed again without it.
     tolerance_m
         A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
         of the model's diagonal, at least 1 cm.
@@ -72,6 +74,7 @@ class Config:
     model_filters: tuple[Filter, ...] = ()
     outside: tuple[Outside, ...] = ()
     joining: Joining = Joining()  # noqa: RUF009 - immutable
+    self_calibration: bool = True
     tolerance_m: float | None = None
 
     def __post_init__(self) -> None:

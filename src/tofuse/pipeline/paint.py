@@ -6,6 +6,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.errors import UnreadableFrameError
+from tofuse.filters.camera_errors import CameraErrors
 from tofuse.fusion.texture import LitView, Textured, textured
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
@@ -41,6 +42,9 @@ def paint(
     if mesh is None or not len(mesh.faces):
         return None
     chosen = steady(result)
+    wrong = result.diagnostics.calibrated
+    errors = CameraErrors() if wrong is None else CameraErrors(wrong.focal, wrong.offset_m)
+    corrected = errors.start().apply
     progress = progress or Silent()
     progress.stage("painting", len(chosen))
     views: list[LitView] = []
@@ -51,6 +55,7 @@ def paint(
             frame = recording[int(k)]
         except UnreadableFrameError:
             continue
+        frame = corrected(frame)
         view = LitView.of(frame) if isinstance(frame, RangeFrame) else None
         if view is not None and (not views or view.light.shape == views[0].light.shape):
             views.append(view)

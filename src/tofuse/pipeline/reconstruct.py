@@ -23,6 +23,7 @@ from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.self_calibration import self_calibrated
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.noise import noise_model_for
@@ -76,7 +77,26 @@ def reconstruct(
     progress = progress or Silent()
     config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
     config = learnt(fitted(config, recording), recording, threads, progress)
-    stages = stages or NotKept()
+
+    def once(by: Config, stages: Stages) -> Reconstruction:
+        return _once(recording, by, seed, threads, loops, progress, stages)
+
+    result = once(config, stages or NotKept())
+    if not config.self_calibration:
+        return result
+    return self_calibrated(result, config, lambda by: once(by, NotKept()), progress)
+
+
+def _once(
+    recording: Recording,
+    config: Config,
+    seed: int,
+    threads: int | None,
+    loops: Sequence[GivenLoop],
+    progress: Progress,
+    stages: Stages,
+) -> Reconstruction:
+    """Reconstruct a recording; see `reconstruct`."""
     progress.stage("tracking", len(recording))
     # BLAS sums differ with its number of threads; ours don't.
     with threadpool_limits(1):

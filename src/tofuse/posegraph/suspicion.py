@@ -100,6 +100,8 @@ class Suspicion:
         out, see `refine.Support`.
     gap
         Of the longest loop; None where there is none, or nothing was suspected.
+    best
+        Name of the error with which the views agree best; empty where nothing was suspected.
     """
 
     alarm: bool = False
@@ -107,6 +109,7 @@ class Suspicion:
     sigmas: dict[str, float] = field(default_factory=dict)
     support: tuple[float, float] | None = None
     gap: Gap | None = None
+    best: str = ""
 
 
 def suspicion(
@@ -139,7 +142,8 @@ def suspicion(
         return refine(few, poses, patient, calibrate=number, beside=beside, pairs=some)
 
     found = {name: asked(name) for name in looked}
-    best = max(found.values(), key=lambda one: _gain(one, views))
+    name_of_best = max(found, key=lambda name: _gain(found[name], views))
+    best = found[name_of_best]
     large = any(
         abs(one.errors[_NUMBERS[name]]) > max(TOLERANCES[name], _SURE * sigma[_NUMBERS[name]])
         for name, one in found.items()
@@ -155,6 +159,7 @@ def suspicion(
         {name: float(sigma[k]) for name, k in _NUMBERS.items() if name in found},
         (support, support + _gain(best, views)),
         gap,
+        name_of_best,
     )
 
 

@@ -31,7 +31,7 @@ from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
-from tofuse.results.types import Component, Reason, Reconstruction
+from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
 
 UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
 STAGING = f"{UNFINISHED}unfinished"
@@ -394,6 +394,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "seconds": {k: round(v, 4) for k, v in d.seconds.items()},
             "verdict": d.verdict,
             "accuracy": accuracy_json(d.accuracy),
+            "self_calibration": _calibration(d.calibrated),
             "reasons": reasons_json(d.reasons),
             "frames": [
                 {
@@ -504,6 +505,19 @@ def _refinement(r: Refinement | None) -> dict[str, Any] | None:
         "support_after": r.support[1],
         "camera": r.errors,
         "suspicion": _suspicion(r.suspicion),
+    }
+
+
+def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
+    """How the camera was corrected; None where it was not."""
+    if found is None:
+        return None
+    return {
+        "focal": found.focal,
+        "offset_m": found.offset_m,
+        "sigma": dict(found.sigmas),
+        "support_before": found.support[0],
+        "support_after": found.support[1],
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -68,6 +68,28 @@ class FrameRecord:
     component: int | None = None
 
 
+@dataclass(frozen=True)
+class SelfCalibration:
+    """How the stated calibration of a camera was corrected, because its own views say so.
+
+    Attributes
+    ----------
+    focal
+        The true focal length is 1 / (1 + focal) of the stated one.
+    offset_m
+        Added to all ranges, m.
+    sigmas
+        Standard deviations by how much views differ in it, by name as above.
+    support
+        Of the views for each other before they are refined, as stated and as corrected, up to 1.
+    """
+
+    focal: float
+    offset_m: float
+    sigmas: Mapping[str, float]
+    support: tuple[float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
     """Everything that says how far the result can be trusted.
@@ -94,6 +116,8 @@ class Diagnostics:
         Small images of some frames; none of clouds.
     accuracy
         95 % bounds of the poses' errors.
+    calibrated
+        How the camera's calibration was corrected; None where it was left as stated.
     """
 
     verdict: Verdict
@@ -110,6 +134,7 @@ class Diagnostics:
     outside: tuple[OutsideRecord, ...] = ()
     samples: tuple[FrameSample, ...] = ()
     accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
+    calibrated: SelfCalibration | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,88 @@
+"""Correct errors of a camera that are known: its focal length, and an offset of its ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.filters.correction import Correction, Corrector
+from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+
+Float64 = NDArray[np.float64]
+
+# More is no error of a camera, but another camera.
+_MOST_FOCAL, _MOST_OFFSET_M = 0.5, 1.0
+
+
+@part("correction", "camera-errors")
+@dataclass(frozen=True)
+class CameraErrors(Correction):
+    """Put points where they are, if the camera errs like this.
+
+    Attributes
+    ----------
+    focal
+        Share by which points are too near to the optical axis: the true focal length is
+        1 / (1 + focal) of the stated one.
+    offset_m
+        Added to all ranges, m.
+    """
+
+    focal: float = 0.0
+    offset_m: float = 0.0
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if not abs(self.focal) <= _MOST_FOCAL:
+            raise ValueError(f"focal is {self.focal}, not -{_MOST_FOCAL} to {_MOST_FOCAL}")
+        if not abs(self.offset_m) <= _MOST_OFFSET_M:
+            raise ValueError(f"offset_m is {self.offset_m}, not -{_MOST_OFFSET_M} to 1")
+
+    def start(self) -> Corrector:
+        """See `Correction.start`."""
+        return _Corrector(self)
+
+    def and_then(self, other: CameraErrors) -> CameraErrors:
+        """Return what is wrong with the camera if this is, and `other` with what is left."""
+        focal = self.focal + other.focal + self.focal * other.focal
+        return CameraErrors(focal, self.offset_m + other.offset_m)
+
+    def camera(self, stated: Camera) -> Camera:
+        """Return the true camera."""
+        if isinstance(stated, Pinhole):
+            share = 1 + self.focal
+            return replace(stated, fx=stated.fx / share, fy=stated.fy / share)
+        return RayTable(np.asarray(stated.rays() * np.float32(1 + self.focal)))
+
+
+@dataclass(eq=False)
+class _Corrector(Corrector):
+    options: CameraErrors
+    # Frames share their camera, and what is worked out for it.
+    _cameras: dict[Camera, Camera] = field(default_factory=dict)
+
+    def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
+        """See `Corrector.apply`; clouds have no camera."""
+        if not isinstance(frame, RangeFrame):
+            return frame
+        options = self.options
+        if options.focal:
+            if frame.camera not in self._cameras:
+                self._cameras[frame.camera] = options.camera(frame.camera)
+            frame = replace(frame, camera=self._cameras[frame.camera])
+        if options.offset_m:
+            # What is valid stays valid.
+            least = np.float32(1e-3)
+            longer = np.maximum(frame.radial_range + np.float32(options.offset_m), least)
+            depth = np.where(frame.depth > 0, longer, np.float32(0))
+            frame = replace(frame, depth=depth, depth_kind="range")
+        return frame
+
+    def alone(self, frame: Frame) -> bool:
+        """See `Corrector.alone`."""
+        return True

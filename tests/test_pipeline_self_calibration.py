@@ -1,0 +1,229 @@
+"""A recording that shows an error of its camera is reconstructed without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.evaluation.trajectory import displacement
+from tofuse.filters.camera_errors import CameraErrors
+from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.pipeline.config import changed, from_method
+from tofuse.pipeline.progress import Silent
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.self_calibration import in_words, self_calibrated
+from tofuse.posegraph.accuracy import Accuracy
+from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.suspicion import Suspicion
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.results.output import run_json
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import simulate
+
+CAMERA = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5)
+
+
+def frame(camera=CAMERA, kind="z") -> RangeFrame:
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[0, 0] = 0
+    return RangeFrame(0, 0.0, camera, depth, kind)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, RayTable(CAMERA.rays())])
+@pytest.mark.parametrize("kind", ["z", "range"])
+def test_points_are_put_where_they_are(camera, kind) -> None:
+    before = frame(camera, kind)
+    after = CameraErrors(focal=0.1, offset_m=0.05).start().apply(before)
+    assert isinstance(after, RangeFrame)
+    np.testing.assert_array_equal(after.valid, before.valid)
+    slopes = [f.points[:, :2] / f.points[:, 2:] for f in (before, after)]
+    np.testing.assert_allclose(slopes[1], 1.1 * slopes[0], rtol=1e-5, atol=1e-6)
+    rays = np.concatenate([1.1 * slopes[0], np.ones((len(slopes[0]), 1))], axis=1)
+    ranges = before.radial_range[before.valid] if kind == "range" else None
+    if ranges is not None:
+        expected = (ranges + 0.05)[:, None] * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        np.testing.assert_allclose(after.points, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_lens_keeps_its_distortion() -> None:
+    lens = BrownConrady(8, 6, 10.0, 11.0, 3.5, 2.5, k1=-0.1)
+    true = CameraErrors(focal=0.25).camera(lens)
+    assert true == replace(lens, fx=8.0, fy=8.8)
+
+
+def test_errors_add_up() -> None:
+    both = CameraErrors(0.1, 0.02).and_then(CameraErrors(0.1, 0.01))
+    assert both.focal == pytest.approx(0.21)
+    assert both.offset_m == pytest.approx(0.03)
+    assert in_words(both) == "a focal length 17.4% smaller and ranges 30 mm longer"
+
+
+def test_a_cloud_has_no_camera() -> None:
+    cloud = CloudFrame.of(np.ones((5, 3)))
+    assert CameraErrors(0.1, 0.1).start().apply(cloud) is cloud
+
+
+@pytest.mark.parametrize("wrong", [{"focal": 0.6}, {"offset_m": -2.0}, {"focal": np.nan}])
+def test_no_camera_is_that_far_off(wrong) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        CameraErrors(**wrong)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Once round a room, with its true camera."""
+    folder = tmp_path_factory.mktemp("calibration") / "room"
+    return open_recording(
+        simulate("room", folder, every=12, frames=60, seed=10, effects=Effects(multipath=False))
+    )
+
+
+def seen_by(recording: Recording, share: float) -> Recording:
+    """The recording as if its camera had so many times its focal length."""
+    frames = []
+    for item in recording:
+        assert isinstance(item, RangeFrame)
+        camera = item.camera
+        assert isinstance(camera, Pinhole)
+        frames.append(
+            replace(item, camera=replace(camera, fx=share * camera.fx, fy=share * camera.fy))
+        )
+    source = ArraySource(frames, recording.reference, metadata=dict(recording.metadata))
+    return Recording.of(source, recording.path, recording.format)
+
+
+def error_of(recording: Recording, result) -> float:
+    assert recording.reference is not None
+    assert result.has_pose.all()
+    return displacement(recording.reference, result.trajectory)[0]
+
+
+@pytest.fixture(scope="module")
+def wrong(recording):
+    return seen_by(recording, 1.05)
+
+
+def test_a_wrong_focal_length_is_corrected(wrong) -> None:
+    result = reconstruct(wrong)
+    found = result.diagnostics.calibrated
+    assert found is not None
+    assert found.focal == pytest.approx(0.05, abs=0.01)
+    assert found.offset_m == 0
+    assert 0 < found.sigmas["focal"] < 0.01
+    assert found.support[1] > found.support[0]
+    written = run_json(result)
+    assert written["self_calibration"]["focal"] == found.focal
+    assert written["config"]["corrections"][0] == {
+        "part": "camera-errors",
+        "focal": found.focal,
+        "offset_m": 0.0,
+    }
+    codes = {r.code for r in result.diagnostics.reasons}
+    assert "self_calibrated" in codes
+    assert "calibration_alarm" not in codes
+    config = changed(from_method("default"), {"self_calibration": False}, where="test")
+    stated = reconstruct(wrong, config)
+    assert stated.diagnostics.calibrated is None
+    assert "calibration_alarm" in {r.code for r in stated.diagnostics.reasons}
+    assert error_of(wrong, result) < 0.3 * error_of(wrong, stated)
+    assert error_of(wrong, result) < result.diagnostics.accuracy.position_m
+
+
+def test_a_right_one_is_left_as_it_is(recording) -> None:
+    result = reconstruct(recording)
+    assert result.diagnostics.calibrated is None
+    assert run_json(result)["self_calibration"] is None
+    assert "self_calibrated" not in {r.code for r in result.diagnostics.reasons}
+
+
+def said(result, error: float | None, bound: float, posed: int = 3, support: float = 0.5):
+    """A result whose views show an error of the focal length."""
+    found = Suspicion(error is not None, {"focal": error or 0.0}, {"focal": 0.001}, best="focal")
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    refinement = Refinement(poses, True, 3, 3, support=(support, 0.9), suspicion=found)
+    d = replace(
+        result.diagnostics,
+        refinement=refinement,
+        accuracy=Accuracy(bound, 0.01, 0.01, True),
+        reasons=(),
+    )
+    trajectory = np.where(np.arange(len(result.trajectory))[:, None, None] < posed, np.eye(4), None)
+    return replace(result, trajectory=trajectory.astype(float), diagnostics=d)
+
+
+@pytest.fixture(scope="module")
+def any_result(room_recording):
+    return reconstruct(open_recording(room_recording).select(end=3))
+
+
+def test_without_an_alarm_nothing_is_done(any_result) -> None:
+    first = said(any_result, None, 0.1)
+
+    def never(config):
+        raise AssertionError("reconstructed again")
+
+    assert self_calibrated(first, from_method("default"), never, Silent()) is first
+
+
+@pytest.mark.parametrize(
+    ("again", "kept"),
+    [
+        ({"bound": 0.05}, True),
+        ({"bound": 0.2}, False),
+        ({"bound": 0.05, "posed": 2}, False),
+        ({"bound": np.inf, "support": 0.9}, False),
+    ],
+)
+def test_a_correction_stays_only_where_it_helps(any_result, again, kept) -> None:
+    first = said(any_result, 0.05, 0.1)
+    configs = []
+
+    def once(config):
+        configs.append(config)
+        return said(any_result, None, **again)
+
+    result = self_calibrated(first, from_method("default"), once, Silent())
+    assert (result.diagnostics.calibrated is not None) == kept
+    assert configs[0].corrections[0] == CameraErrors(focal=0.05)
+    assert (result is first) == (not kept)
+
+
+def test_where_nothing_is_bounded_the_views_decide(any_result) -> None:
+    first = said(any_result, 0.05, np.inf)
+    for support, kept in ((0.6, True), (0.4, False)):
+        result = self_calibrated(
+            first,
+            from_method("default"),
+            lambda _, s=support: said(any_result, None, np.inf, support=s),
+            Silent(),
+        )
+        assert (result.diagnostics.calibrated is not None) == kept
+
+
+def test_a_second_estimate_is_added_to_the_first(any_result) -> None:
+    results = iter([said(any_result, 0.01, 0.05), said(any_result, 0.01, 0.02)])
+    configs = []
+
+    def once(config):
+        configs.append(config)
+        return next(results)
+
+    result = self_calibrated(said(any_result, 0.04, 0.1), from_method("default"), once, Silent())
+    assert result.diagnostics.calibrated is not None
+    assert result.diagnostics.calibrated.focal == pytest.approx(1.04 * 1.01 - 1)
+    # Each time from the stated calibration, not on top of what was corrected.
+    assert [c.corrections[0].focal for c in configs] == pytest.approx([0.04, 1.04 * 1.01 - 1])
+    assert len(configs[1].corrections) == len(configs[0].corrections)
+
+
+def test_no_camera_is_corrected_by_half(any_result) -> None:
+    first = said(any_result, 0.7, 0.1)
+
+    def never(config):
+        raise AssertionError("reconstructed again")
+
+    assert self_calibrated(first, from_method("default"), never, Silent()) is first
