@@ -120,6 +120,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "config",
         "seconds",
         "verdict",
+        "self_calibration",
         "accuracy",
         "reasons",
         "frames",

@@ -486,22 +486,36 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from tofuse.errors import InputError
     from tofuse.evaluation.consistency import map_consistency, poses_of_frames
     from tofuse.evaluation.trajectory import evaluate_trajectory
-    from tofuse.files.trajectory import read_tum
+    from tofuse.files.trajectory_formats import read_poses
     from tofuse.recordings.open import open_recording, read_reference
+    from tofuse.results.output import clock_of
 
     estimate_file, reference_file = arguments.estimate, arguments.reference
-    if estimate_file.is_dir():
-        estimate_file = estimate_file / "trajectory.txt"
-    times, poses = read_tum(estimate_file)
-    reference_times, reference = read_reference(reference_file)
     recording = None if arguments.recording is None else open_recording(arguments.recording)
     frame_times = None if recording is None else recording.timestamps
+    clock = clock_of(estimate_file)
+    if recording is not None:
+        clock = recording.timestamps, recording.indices
+    estimate, known = read_poses(estimate_file), read_reference(reference_file)
+    if clock is None and (estimate.timestamps is None) != (known.timestamps is None):
+        untimed = estimate_file if estimate.timestamps is None else reference_file
+        raise InputError(
+            "has poses by frame, the other file by time",
+            where=untimed,
+            remedy="give the recording, which knows the times: --recording",
+        )
+    times, poses = estimate.timed(clock, estimate_file)
+    reference_times, reference = known.timed(clock, reference_file)
     try:
         error = evaluate_trajectory(times, poses, reference_times, reference, frame_times)
     except InputError as wrong:
         both = f"{estimate_file}, {reference_file}"
         raise InputError(wrong.problem, where=both, remedy=wrong.remedy) from wrong
     data: dict[str, Any] = error.to_dict()
+    interval = None
+    if arguments.reference_error is not None:
+        interval = error.ate_within(arguments.reference_error)
+        data["ate_interval_m"] = list(interval)
     if recording is not None:
         poses_here = poses_of_frames(recording.timestamps, times, poses)
         data["map_consistency"] = map_consistency(recording, poses_here).to_dict()
@@ -511,6 +525,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
     table = Table.grid(padding=(0, 2))
     table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of those known)")
     table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
+    if interval is not None:
+        table.add_row("true ATE within", f"{interval[0]:.4f} to {interval[1]:.4f} m")
     table.add_row("ATE largest", f"{error.ate_max_m:.4f} m")
     for r in error.relative:
         value = "too few poses"

@@ -224,7 +224,10 @@ def _judge(commands: Any) -> None:
     )
     p.add_argument("recording", metavar="RECORDING", help="images of a depth camera")
     p.add_argument(
-        "trajectory", type=Path, metavar="TRAJECTORY", help="a TUM trajectory, or a result"
+        "trajectory",
+        type=Path,
+        metavar="TRAJECTORY",
+        help="a trajectory of any known format, or a result",
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the refined result (none)")
     p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
@@ -398,15 +401,21 @@ def _noise(commands: Any) -> None:
 
 def _evaluate(commands: Any) -> None:
     p = _command(commands, "evaluate", "compare a trajectory with a reference")
-    p.add_argument("estimate", type=Path, metavar="ESTIMATE", help="a TUM trajectory or a result")
+    p.add_argument("estimate", type=Path, metavar="ESTIMATE", help="a trajectory or a result")
     p.add_argument(
         "reference",
         type=Path,
         metavar="REFERENCE",
-        help="a TUM trajectory, or a recording that comes with reference poses",
+        help="a trajectory, or a recording that comes with reference poses",
     )
     p.add_argument(
         "--recording", type=Path, metavar="REC", help="also measure how well its images agree"
+    )
+    p.add_argument(
+        "--reference-error",
+        type=_length,
+        metavar="LENGTH",
+        help="how far off the reference itself may be (rms), as 20mm: gives an interval of the ATE",
     )
     p.add_argument("--json", action="store_true", help="as JSON")
 

@@ -87,6 +87,12 @@ class TrajectoryError:
     pairs: Integers
     position_errors: Float64
 
+    def ate_within(self, reference_m: float) -> tuple[float, float]:
+        """Bounds in m of the true ATE, if the reference is off by up to `reference_m`, rms after
+        alignment: the rms distance after alignment obeys the triangle inequality.
+        """
+        return max(self.ate_rms_m - reference_m, 0.0), self.ate_rms_m + reference_m
+
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as plain data, angles in degrees."""
         return {

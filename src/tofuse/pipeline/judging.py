@@ -22,7 +22,7 @@ from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import Consistency, map_consistency
 from tofuse.evaluation.sightings import Sightings, compared, prepared
 from tofuse.evaluation.trajectory import displacement, distances_between
-from tofuse.files.trajectory import associated_poses, read_tum
+from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
@@ -122,8 +122,9 @@ def judge(
     recording
         What `tofuse.open` gives; images of a camera.
     trajectory
-        A TUM file, the folder of a result, or (N, 4, 4) T_world_camera of the frames, NaN where
-        there is none. Poses of a file belong to the frames that are nearest in time, within 20 ms.
+        A file of any format of `files.trajectory_formats`, the folder of a result, or (N, 4, 4)
+        T_world_camera of the frames, NaN where there is none. Poses with times belong to the frames
+        that are nearest in time, within 20 ms.
     tolerance_m
         As of `Config`.
 
@@ -333,8 +334,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
     if isinstance(trajectory, str | Path):
         path = Path(trajectory)
         where = str(path)
-        times, given = read_tum(path / "trajectory.txt" if path.is_dir() else path)
-        poses = associated_poses(recording.timestamps, times, given)
+        poses = read_poses(path).of_frames(recording.timestamps, recording.indices)
     else:
         poses = np.array(trajectory, float)
         if poses.shape != (len(recording), 4, 4):

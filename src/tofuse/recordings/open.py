@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.reading import input_error, is_folder, list_folder
-from tofuse.files.trajectory import read_tum
+from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, known, name_of
 from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
@@ -237,12 +237,8 @@ def _short_names(paths: list[Path]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(p) for p in paths]
 
 
-def read_reference(path: str | Path) -> tuple[Float64, Float64]:
+def read_reference(path: str | Path) -> TimedPoses:
     """Read the reference poses in a file, or those that a recording of any format comes with.
-
-    Returns
-    -------
-    (N,) timestamps in s and (N, 4, 4) T_world_camera.
 
     Raises
     ------
@@ -250,23 +246,28 @@ def read_reference(path: str | Path) -> tuple[Float64, Float64]:
         If it can't be read, or the recording comes with no reference.
     """
     path = Path(path)
-    beside = path / "groundtruth.txt"
-    if not path.is_dir() or beside.is_file():  # then the images don't matter
+    if not path.is_dir() or (path / "groundtruth.txt").is_file():  # then the images don't matter
         try:
-            return read_tum(beside if path.is_dir() else path)
+            return read_poses(path / "groundtruth.txt" if path.is_dir() else path)
         except InputError as no_trajectory:
             try:
                 recording = open_recording(path)
             except InputError:
                 raise no_trajectory from None
     else:
-        recording = open_recording(path)
+        try:
+            recording = open_recording(path)
+        except InputError as no_recording:
+            try:
+                return read_poses(path)
+            except InputError:
+                raise no_recording from None
     poses = recording.reference
     if poses is None or not np.isfinite(poses).all((1, 2)).any():
         raise InputError(
             "comes with no reference poses",
             where=path,
-            remedy="give a TUM trajectory (timestamp tx ty tz qx qy qz qw)",
+            remedy="give a trajectory, such as TUM's (timestamp tx ty tz qx qy qz qw)",
         )
     known = np.isfinite(poses).all((1, 2))
-    return recording.timestamps[known], poses[known]
+    return TimedPoses(poses[known], timestamps=recording.timestamps[known])

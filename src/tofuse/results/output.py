@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse._version import __version__
 from tofuse.errors import InputError, OutputError
@@ -32,6 +33,8 @@ from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
 from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
+
+Float64 = NDArray[np.float64]
 
 UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
 STAGING = f"{UNFINISHED}unfinished"
@@ -452,6 +455,18 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
     )
+
+
+def clock_of(folder: Path) -> tuple[Float64, NDArray[np.intp]] | None:
+    """(N,) times in s and (N,) numbers of the frames of a result; None where `folder` is none."""
+    if not is_result(folder):
+        return None
+    frames = read_run_json(folder / "run.json").get("frames", [])
+    try:
+        times = np.array([frame["timestamp"] for frame in frames], float)
+        return times, np.array([frame["index"] for frame in frames], np.intp)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError("has no times of frames", where=folder / "run.json") from error
 
 
 def accuracy_json(a: Accuracy) -> dict[str, Any]:

@@ -1,0 +1,312 @@
+"""Trajectories as other programs write them, told apart by what is in the file.
+
+TUM, EuRoC (CSV), KITTI, Open3D and Redwood (.log), COLMAP (images.txt), nerfstudio and
+NeRFCapture (transforms.json), NumPy (.npy), and the result of a run. Some have a time for each
+pose, the others the number of its frame.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import input_error, is_file, is_folder, read_text
+from tofuse.files.trajectory import associated_poses, read_tum
+from tofuse.geometry import se3
+from tofuse.geometry.quaternion import to_matrix
+
+Float64 = NDArray[np.float64]
+Intp = NDArray[np.intp]
+
+# Files that a folder may hold poses in, the first that is there counts.
+NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
+_KNOWN = "TUM, EuRoC, KITTI, .log, COLMAP's images.txt, transforms.json or .npy"
+# Times in nanoseconds are larger than any in seconds.
+_NANOSECONDS = 1e12
+# Cameras of OpenGL look along -z, with y up.
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPoses:
+    """Poses of a camera, and which frames they belong to.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) T_world_camera, x right, y down, z forward.
+    timestamps
+        (N,) s; None where the format has none.
+    frames
+        (N,) numbers of their frames where it has no timestamps: counted from 0, or as in the names
+        of the images.
+    """
+
+    poses: Float64
+    timestamps: Float64 | None = None
+    frames: Intp | None = None
+
+    def of_frames(self, timestamps: Float64, frames: Intp) -> Float64:
+        """(M, 4, 4) poses of frames with these times and numbers (M,), NaN where there is none.
+
+        If there are as many poses as frames, and they are counted from 0, they are in their order.
+        """
+        if self.timestamps is not None:
+            return associated_poses(timestamps, self.timestamps, self.poses)
+        assert self.frames is not None
+        if np.array_equal(self.frames, np.arange(len(frames))):
+            return self.poses
+        out = np.full((len(frames), 4, 4), np.nan)
+        row = {int(number): k for k, number in enumerate(self.frames)}
+        for k, number in enumerate(frames.tolist()):
+            if number in row:
+                out[k] = self.poses[row[number]]
+        return out
+
+    def timed(self, clock: Clock | None, where: str | Path) -> tuple[Float64, Float64]:
+        """(M,) times and (M, 4, 4) poses, those whose frames the clock knows.
+
+        Without times and without a clock the numbers of the frames are the times.
+
+        Raises
+        ------
+        InputError
+            If the clock knows none of the frames; it names `where`.
+        """
+        if self.timestamps is not None:
+            return self.timestamps, self.poses
+        assert self.frames is not None
+        if clock is None:
+            return self.frames.astype(np.float64), self.poses
+        poses = self.of_frames(*clock)
+        known = np.isfinite(poses).all((1, 2))
+        if not known.any():
+            raise InputError("has poses of other frames than the recording", where=where)
+        return clock[0][known], poses[known]
+
+
+# (N,) times and (N,) numbers of the frames of a recording.
+Clock = tuple[Float64, Intp]
+
+
+def read_poses(path: str | Path) -> TimedPoses:
+    """Read a trajectory of any of the formats, or that in a folder.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it can't be read.
+    """
+    path = Path(path)
+    if is_folder(path):
+        found = next((path / name for name in NAMES if is_file(path / name)), None)
+        if found is None:
+            raise InputError(f"holds none of {', '.join(NAMES)}", where=path)
+        path = found
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return _numpy(path)
+    text = read_text(path)
+    if suffix == ".json":
+        return _transforms(text, path)
+    rows = list(_rows(text))
+    if not rows:
+        raise InputError("holds no poses", where=path, remedy=f"give {_KNOWN}")
+    return _reader(text, rows, path)(rows, path)
+
+
+_Rows = Sequence[tuple[int, list[str]]]
+_Reader = Callable[[_Rows, Path], TimedPoses]
+
+
+def _reader(text: str, rows: _Rows, path: Path) -> _Reader:
+    """Which format lines are of, by how many cells they have."""
+    first = rows[0][1]
+    count = len(first)
+    if count == 3 and len(rows) > 1 and len(rows[1][1]) == 4:
+        return _log
+    if count == 12:
+        return _kitti
+    if count >= 10 and not _is_number(first[9]):
+        return _colmap
+    if count >= 8 and _is_number(first[0]) and float(first[0]) > _NANOSECONDS:
+        return _euroc
+    if count == 8:
+        return lambda _rows, path: _tum(path)
+    raise InputError(
+        f"has lines of {count} columns, as no trajectory that is known has",
+        where=path,
+        remedy=f"give {_KNOWN}",
+    )
+
+
+def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of each line that is neither empty nor a comment."""
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = line.split("#", 1)[0].replace(",", " ").split()
+        if cells:
+            yield number, cells
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _tum(path: Path) -> TimedPoses:
+    times, poses = read_tum(path)
+    return TimedPoses(poses, timestamps=times)
+
+
+def _numbers(rows: _Rows, path: Path, count: int) -> tuple[Float64, list[int]]:
+    """(N, count) first numbers of the rows and their lines, without rows that are not finite."""
+    table, lines = [], []
+    for number, cells in rows:
+        try:
+            row = [float(cell) for cell in cells[:count]]
+        except ValueError as error:
+            raise InputError(str(error), where=f"{path}, line {number}") from error
+        if len(row) < count:
+            raise InputError(
+                f"has {len(row)} numbers, the first line {count} or more",
+                where=f"{path}, line {number}",
+            )
+        if np.isfinite(row).all():  # programs write NaN where they were lost
+            table.append(row)
+            lines.append(number)
+    return np.array(table, float).reshape(-1, count), lines
+
+
+def _rigid(T: Float64, where: str) -> Float64:
+    return se3.orthonormalise(se3.check_pose(T, where=where))
+
+
+def _from_quaternions(q_xyzw: Float64, t: Float64, path: Path, lines: Sequence[int]) -> Float64:
+    off = np.abs(np.linalg.norm(q_xyzw, axis=1) - 1)
+    if (off > 0.1).any():
+        raise InputError(
+            "holds no unit quaternion", where=f"{path}, line {lines[int(np.argmax(off))]}"
+        )
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, :3, 3] = t
+    if len(t):
+        poses[:, :3, :3] = to_matrix(q_xyzw)
+    return poses
+
+
+def _euroc(rows: _Rows, path: Path) -> TimedPoses:
+    """Lines of ns, x y z, qw qx qy qz, and maybe more, as EuRoC's ground truth."""
+    table, lines = _numbers(rows, path, 8)
+    poses = _from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], path, lines)
+    return TimedPoses(poses, timestamps=1e-9 * table[:, 0])
+
+
+def _kitti(rows: _Rows, path: Path) -> TimedPoses:
+    """Lines of 3 x 4 matrices, one for each frame."""
+    out = np.tile(np.eye(4), (len(rows), 1, 1))
+    known = []
+    for k, (number, cells) in enumerate(rows):
+        table, _ = _numbers([(number, cells)], path, 12)
+        if len(table):
+            out[k, :3] = table.reshape(3, 4)
+            out[k] = _rigid(out[k], f"{path}, line {number}")
+            known.append(k)
+    return TimedPoses(out[known], frames=np.array(known, np.intp))
+
+
+def _log(rows: _Rows, path: Path) -> TimedPoses:
+    """A line of three numbers, the first the frame, and four of a matrix, for each pose."""
+    if len(rows) % 5:
+        raise InputError(f"has {len(rows)} lines, not 5 for each pose", where=path)
+    poses, frames = [], []
+    for k in range(0, len(rows), 5):
+        number, head = rows[k]
+        where = f"{path}, line {number}"
+        table, _ = _numbers(rows[k + 1 : k + 5], path, 4)
+        if not head[0].isdecimal():
+            raise InputError(f"names frame {head[0]!r}", where=where)
+        if len(table) == 4:
+            poses.append(_rigid(table, where))
+            frames.append(int(head[0]))
+    return TimedPoses(_stacked(poses), frames=np.array(frames, np.intp))
+
+
+def _colmap(rows: _Rows, path: Path) -> TimedPoses:
+    """COLMAP's images: id, qw qx qy qz, x y z of T_camera_world, camera, name; then points."""
+    # The second line of each image holds its points in threes; those have no name in the tenth.
+    images = [(n, c) for n, c in rows if len(c) == 10 and not _is_number(c[9])]
+    table, lines = _numbers(images, path, 8)
+    T_camera_world = _from_quaternions(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
+    names = [cells[9] for _, cells in images]
+    return TimedPoses(se3.inverse(T_camera_world), frames=_numbers_in(names, path))
+
+
+def _transforms(text: str, path: Path) -> TimedPoses:
+    """NeRF's JSON: for each frame a path and T_world_camera with the axes of OpenGL."""
+    try:
+        data: Any = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is no JSON ({error})", where=path) from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError("has no list 'frames'", where=path, remedy=f"give {_KNOWN}")
+    poses, names = [], []
+    for k, frame in enumerate(frames):
+        where = f"{path}, frame {k}"
+        matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
+        try:
+            T = np.array(matrix, float)
+        except (TypeError, ValueError) as error:
+            raise InputError("has no 'transform_matrix' of 4 x 4", where=where) from error
+        poses.append(_rigid(T, where) @ _OPENGL)
+        names.append(str(frame.get("file_path", k)))
+    return TimedPoses(_stacked(poses), frames=_numbers_in(names, path))
+
+
+def _numpy(path: Path) -> TimedPoses:
+    """(N, 4, 4) or (N, 3, 4), one for each frame, NaN where there is none."""
+    try:
+        # Mapped, so that a header can't make us allocate more than the file holds.
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise input_error(error, path) from error
+    except Exception as error:  # its header is Python, and damaged Python raises anything
+        raise InputError("is no array", where=path, remedy="write it by numpy.save") from error
+    if table.ndim != 3 or table.shape[1:] not in ((4, 4), (3, 4)) or table.dtype.kind not in "fiu":
+        raise InputError(f"is of shape {table.shape}", where=path, remedy="write (N, 4, 4)")
+    out = np.tile(np.eye(4), (len(table), 1, 1))
+    out[:, :3] = table[:, :3]
+    known = np.flatnonzero(np.isfinite(out).all((1, 2)))
+    poses = [_rigid(out[k], f"{path}, pose {k}") for k in known]
+    return TimedPoses(_stacked(poses), frames=known)
+
+
+def _stacked(poses: Sequence[Float64]) -> Float64:
+    return np.stack(poses) if poses else np.zeros((0, 4, 4))
+
+
+def _numbers_in(names: Sequence[str], path: Path) -> Intp:
+    """The last number in each name, which counts frames."""
+    found = [re.findall(r"[0-9]+", Path(name).stem) for name in names]
+    if not all(found):
+        missing = names[[bool(digits) for digits in found].index(False)]
+        raise InputError(
+            f"names the image {missing!r}, which has no number",
+            where=path,
+            remedy="name images by the number of their frame",
+        )
+    numbers = np.array([int(digits[-1][-18:]) for digits in found], np.intp)
+    if len(np.unique(numbers)) != len(numbers):
+        raise InputError("names two images with the same number", where=path)
+    return numbers
