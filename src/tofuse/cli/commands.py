@@ -56,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         min_depth=arguments.min_depth,
         max_depth=arguments.max_depth,
         guess=arguments.guess,
+        prior=arguments.prior,
         loops=arguments.loops,
         object=arguments.object,
         unwrap=arguments.unwrap,

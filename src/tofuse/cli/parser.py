@@ -172,6 +172,13 @@ def _processing(p: argparse.ArgumentParser) -> None:
         help="where each registration starts",
     )
     g.add_argument(
+        "--prior",
+        choices=("auto", "none", "device"),
+        default="auto",
+        help="what else counts, where it agrees: gravity and a phone's own poses (auto), nothing, "
+        "or the poses of any device (auto)",
+    )
+    g.add_argument(
         "--loops", type=Path, metavar="FILE", help="loops known beforehand, one `i j` a line"
     )
     g.add_argument(

@@ -29,13 +29,14 @@ from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.pipeline.checks import bounds, images, tolerance_of
 from tofuse.pipeline.config import Config, check_views, from_method
+from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct, view_kind
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.phones import POSES_BY
-from tofuse.recordings.recording import Recording, Source, evenly
+from tofuse.recordings.recording import Recording, evenly
 from tofuse.results.card import bound, length
 from tofuse.results.output import OutputFolder, accuracy_json, plain, reasons_json, write_result
 from tofuse.results.ranges import in_words, runs_of
@@ -353,25 +354,6 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64) -> Float64
             remedy="give timestamps in seconds on the clock of the recording",
         )
     return poses
-
-
-@dataclass
-class _Led:
-    """A source with other odometry."""
-
-    source: Source
-    odometry: Float64 | None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.source, name)
-
-
-def with_odometry(recording: Recording, poses: Float64) -> Recording:
-    """The recording with poses (N, 4, 4) as its odometry."""
-    of_source = np.full((len(recording.source.timestamps), 4, 4), np.nan)
-    of_source[recording.indices] = poses
-    source: Any = _Led(recording.source, of_source)
-    return replace(recording, source=source)
 
 
 def _distances(poses: Float64, refined: Float64) -> Float64:

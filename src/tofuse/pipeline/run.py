@@ -21,6 +21,7 @@ from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_
 from tofuse.pipeline.judging import device_sentence
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.paint import paint
+from tofuse.pipeline.priors import Prior, with_prior
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import (
     fitted,
@@ -71,6 +72,7 @@ class Options:
     min_depth: float | None = None
     max_depth: float | None = None
     guess: Literal["identity", "previous", "odometry"] | None = None
+    prior: Prior = "auto"
     loops: Path | None = None
     object: bool = False
     unwrap: bool = False
@@ -101,6 +103,8 @@ def run(
             recording = average_still(recording)
         _preview(recording, progress)
         config = resolve(options, view_kind(recording))
+        if not options.object:  # of an object that is the world no sensor knows the motion
+            recording, config = with_prior(recording, config, options.prior)
         _check_guess(options, recording)
         if options.unwrap:
             _check_unwrap(recording)

@@ -1,0 +1,79 @@
+"""What sensors beside the depth camera know of the poses, used as far as it agrees with tracking.
+
+Gravity comes from an accelerometer; poses from odometry beside the images, or from the device that
+recorded them, as phones do (`recordings.phones`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.pipeline.config import Config
+from tofuse.posegraph.outside import GravityEdges, OdometryEdges
+from tofuse.recordings.phones import POSES_BY
+from tofuse.recordings.recording import Recording, Source
+
+Float64 = NDArray[np.float64]
+
+Prior = Literal["auto", "none", "device"]
+
+
+def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Recording, Config]:
+    """Return the recording and the configuration that use what the device knows of its poses.
+
+    Parameters
+    ----------
+    prior
+        "none": nothing; "device": gravity if it is known, and the poses of the odometry or of the
+        device; "auto": what the configuration says, and where that listens to gravity, the poses of
+        the device as well.
+
+    Raises
+    ------
+    InputError
+        If the poses of the device are asked for, and there are none.
+    """
+    if prior not in get_args(Prior):
+        raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
+    if prior == "none":
+        return recording, replace(config, outside=())
+    if any(isinstance(sensor, OdometryEdges) for sensor in config.outside):
+        return recording, config
+    listens = any(isinstance(sensor, GravityEdges) for sensor in config.outside)
+    poses = recording.reference if POSES_BY in recording.metadata else None
+    if prior == "auto" and (not listens or poses is None):
+        return recording, config
+    if recording.odometry is None:
+        if poses is None:
+            raise InputError(
+                "is device, and the recording comes with no poses of its device",
+                where="--prior",
+                remedy="put an odometry.txt beside the images, or use --prior auto",
+            )
+        recording = with_odometry(recording, poses)
+    gravity = () if listens else (GravityEdges(),)
+    return recording, replace(config, outside=(*config.outside, *gravity, OdometryEdges()))
+
+
+@dataclass
+class _Led:
+    """A source with other odometry."""
+
+    source: Source
+    odometry: Float64 | None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+
+def with_odometry(recording: Recording, poses: Float64) -> Recording:
+    """The recording with poses (N, 4, 4) as its odometry."""
+    of_source = np.full((len(recording.source.timestamps), 4, 4), np.nan)
+    of_source[recording.indices] = poses
+    source: Any = _Led(recording.source, of_source)
+    return replace(recording, source=source)
