@@ -27,12 +27,12 @@ from tofuse.posegraph.loops import (
 from tofuse.posegraph.trust import relative_covariance
 from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import Frame
+from tofuse.registration.base import Registration
 from tofuse.registration.likeness import look_of
-from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
+from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
-from tofuse.registration.uncertainty import covariance
-from tofuse.registration.verification import UsualFit, both_ways_agree
-from tofuse.registration.view_pair import register_pair
+from tofuse.registration.verification import UsualFit
+from tofuse.registration.view_pair import follow, register_pair
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -41,10 +41,11 @@ _POINTS = 600
 # The trajectory has drifted when a loop closes: little, or much. Neighbouring pixels share their
 # noise, so that all of them would say hardly more than every second one.
 _NEAR = (Level(4, 15, 0.03, 0.1), Level(2, 8, 0.005, 0.02), Level(2, 8, 0.0, 0.0))
-_FAR = (Level(4, 20, 0.15, 0.3), *_NEAR)
-_ALIGNMENT = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)
-# Sigma, in units of 1 cm and 1 degree, above which a direction keeps the prediction: never.
-_NOT_HELD = 1e6
+# Nothing keeps the prediction.
+_FREELY = ProjectiveOptions(
+    levels=_NEAR, prior_m=3.0, prior_rad=3.0, held=1e6, common_tilt=0.0, common_slope=0.0
+)
+_UNLIKE = "does not fit as views of this camera usually do, or not the same from both ends"
 _TOO_FAR = "looks alike, but the trajectory can't have drifted so far"
 # Of an alignment: a loop's views show each other more than by chance.
 _LEAST_OVERLAP = 0.3
@@ -57,9 +58,9 @@ _LEARN = 40
 class Revisits(LoopDetector):
     """Aligns views that, as the trajectory has it, overlap again after they did not.
 
-    A loop is accepted if it fits, holds the camera in most directions, and is found the same from
-    both ends. Where an alignment from the drifted pose does not fit, the best candidates are
-    searched exhaustively (`registration.search`). What a search found is accepted if it leads
+    A loop is registered from where the trajectory has it (`registration.view_pair.follow`), and
+    accepted if it is believed and constrained in most directions. The best of the other candidates
+    are searched exhaustively (`register_pair`). What a search found is accepted if it leads
     clearly, or if another loop beside it says the same: places look alike, but not twice in the
     same way.
 
@@ -72,17 +73,11 @@ class Revisits(LoopDetector):
         between must have seen either.
     per_view
         At most so many candidates for each view, those of the largest overlap.
-    alignment
-        How two views are aligned, apart from the levels.
-    near, far
-        Levels to try, and those where they fail; at least two each.
     unusual
         A loop must fit as neighbouring views of this camera do: no statistic of the alignment may
         be so many standard deviations above its median (`registration.verification`).
     weak
         Most directions that a loop may leave open: there its covariance says that it knows nothing.
-    both_ways_m, both_ways_rad
-        How far apart the alignments of either view with the other may end.
     searches
         At most so many of the candidates that did not fit are searched, those of the largest
         overlap.
@@ -99,12 +94,7 @@ class Revisits(LoopDetector):
     overlap: float = 0.4
     apart: float = 0.1
     per_view: int = 2
-    alignment: ProjectiveOptions = _ALIGNMENT
-    near: tuple[Level, ...] = _NEAR
-    far: tuple[Level, ...] = _FAR
     unusual: float = 3.0
-    both_ways_m: float = 0.03
-    both_ways_rad: float = 0.03
     weak: int = 2
     searches: int = 6
     search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
@@ -122,8 +112,6 @@ class Revisits(LoopDetector):
             raise ValueError(f"weak is {self.weak}, not 0 to 5")
         if not 0.5 <= self.unusual <= 100:
             raise ValueError(f"unusual is {self.unusual}, not 0.5 to 100")
-        if not (self.both_ways_m > 0 and self.both_ways_rad > 0):
-            raise ValueError("both_ways_m and both_ways_rad must be above 0")
 
     def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
         """See `LoopDetector.start`. There is nothing random in it."""
@@ -237,7 +225,9 @@ class _RevisitLoops(Loops):
                 continue
             self._learnt.add(pair)
             guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
-            aligned = self._freely(a.view.bare(), b.view.bare(), guess, self._options.near)
+            target = [Target(a.view.bare(), np.eye(4))]
+            scale = self._usual.noise_scale
+            aligned = align(b.view.bare(), target, guess, _FREELY, usual_scale=scale)
             if aligned.overlap >= _LEAST_OVERLAP:
                 self._usual.learn(aligned, b.view.depth)
 
@@ -245,21 +235,29 @@ class _RevisitLoops(Loops):
         """Align the later view with the earlier one, and back; once for each pair."""
         pair = target.index, source.index
         if pair not in self._confirmed:
-            self._confirmed[pair] = self._aligned(target, source)
+            self._confirmed[pair] = self._followed(target, source)
         return self._confirmed[pair]
 
-    def _aligned(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
-        options = self._options
+    def _followed(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
+        """Register two views from where the trajectory has them."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Else all views would keep, until the end, what they are compared with here.
-        target, source = target.bare(), source.bare()
-        there = self._align(target, source, guess, options.near)
-        objection = self._objection(there)
+        made = follow(source.bare(), target.bare(), guess, usual=self._usual)
+        if made is None:
+            return ClosedLoop(LoopRecord(target.index, source.index, False, _UNLIKE))
+        objection = self._objection(made)
+        record = LoopRecord(
+            target.index,
+            source.index,
+            not objection,
+            objection or f"right with a probability of {made.probability:.0%}",
+            overlap=made.overlap,
+            rms_m=made.rms_m if np.isfinite(made.rms_m) else None,
+            free_space_violation=made.violation,
+        )
         if objection:
-            again = self._align(target, source, guess, options.far)
-            if not self._objection(again):
-                there, objection = again, ""
-        return self._decided(target, source, there, objection)
+            return ClosedLoop(record)
+        return ClosedLoop(record, made.T_target_source, made.information)
 
     def _alike(
         self, surfaces: Sequence[SurfaceMap], closed: Mapping[tuple[int, int], ClosedLoop]
@@ -364,78 +362,9 @@ class _RevisitLoops(Loops):
             and se3.angle(away) < self._options.same_rad
         )
 
-    def _decided(
-        self, target: SurfaceMap, source: SurfaceMap, there: Aligned, objection: str
-    ) -> ClosedLoop:
-        """Accept an alignment to which there is no objection, if the way back agrees."""
-        options = self._options
-        T = there.T_world_source
-        if not objection:
-            back = self._freely(source, target, se3.inverse(T), options.near)
-            objection = self._misfit(back)
-            if not objection and not both_ways_agree(
-                T, back.T_world_source, options.both_ways_m, options.both_ways_rad
-            ):
-                objection = "the alignment back ends elsewhere"
-        record = LoopRecord(
-            target.index,
-            source.index,
-            not objection,
-            objection or f"{there.inlier_share:.0%} of what both see fits",
-            overlap=there.overlap,
-            rms_m=there.rms_m if np.isfinite(there.rms_m) else None,
-            free_space_violation=there.in_front / max(there.compared, 1),
-        )
-        if objection:
-            return ClosedLoop(record)
-        C = covariance(source, [Target(target, np.eye(4))], there, options.alignment)
-        return ClosedLoop(record, T, np.asarray(np.linalg.inv(C), np.float64))
-
-    def _align(
-        self, target: SurfaceMap, source: SurfaceMap, guess: Float64, levels: tuple[Level, ...]
-    ) -> Aligned:
-        """Align with nothing held at the guess, which has drifted; then see what is held."""
-        freely = self._freely(target, source, guess, levels)
-        if self._misfit(freely):
-            return freely
-        options = replace(self._options.alignment, levels=levels[-2:])
-        return align(
-            source,
-            [Target(target, np.eye(4))],
-            freely.T_world_source,
-            options,
-            usual_scale=self._usual.noise_scale,
-        )
-
-    def _freely(
-        self, target: SurfaceMap, source: SurfaceMap, guess: Float64, levels: tuple[Level, ...]
-    ) -> Aligned:
-        options = replace(
-            self._options.alignment,
-            levels=levels,
-            held=_NOT_HELD,
-            common_tilt=0.0,
-            common_slope=0.0,
-        )
-        return align(
-            source,
-            [Target(target, np.eye(4))],
-            guess,
-            options,
-            usual_scale=self._usual.noise_scale,
-        )
-
-    def _misfit(self, aligned: Aligned) -> str:
-        if aligned.overlap < _LEAST_OVERLAP:
-            return f"only {aligned.overlap:.0%} of the points land in the other view"
-        return self._usual.assess(aligned).reason
-
-    def _objection(self, aligned: Aligned) -> str:
-        found = self._misfit(aligned)
-        if found:
-            return found
-        if not aligned.converged:
-            return "the alignment did not converge"
-        if len(aligned.unobservable) > self._options.weak:
-            return f"{len(aligned.unobservable)} directions are degenerate"
-        return ""
+    def _objection(self, made: Registration) -> str:
+        if made.overlap is not None and made.overlap < _LEAST_OVERLAP:
+            return f"only {made.overlap:.0%} of the points land in the other view"
+        if len(made.unobservable) > self._options.weak:
+            return f"{len(made.unobservable)} directions are degenerate"
+        return "" if made.believed else made.reason
