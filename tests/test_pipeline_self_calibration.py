@@ -114,7 +114,8 @@ def test_a_wrong_focal_length_is_corrected(wrong) -> None:
     assert found.focal == pytest.approx(0.05, abs=0.01)
     assert found.offset_m == 0
     assert 0 < found.sigmas["focal"] < 0.01
-    assert found.support[1] > found.support[0]
+    assert found.bound_m[1] < 0.5 * found.bound_m[0]
+    assert found.bound_m[1] == result.diagnostics.accuracy.position_m
     written = run_json(result)
     assert written["self_calibration"]["focal"] == found.focal
     assert written["config"]["corrections"][0] == {

@@ -62,6 +62,9 @@ def test_what_does_not_close_a_loop_is_no_cure():
     assert not Gap(0, 9, (0.3, 0.2), (0.2, 0.15)).closes  # not by half
     assert not Gap(0, 9, (0.09, 0.048), (0.17, 0.059)).closes
     assert not Gap(0, 9, (0.3, 0.02), (0.1, 0.04)).closes  # turned instead
+    # Of a turn on the spot the angle counts, a few centimetres more or less do not.
+    assert Gap(0, 9, (0.047, 0.18), (0.063, 0.046), 2.5).closes
+    assert not Gap(0, 9, (0.047, 0.18), (0.063, 0.16), 2.5).closes
     assert not Gap(0, 9, (0.005, 0.001), (0.05, 0.001)).closes
 
 

@@ -18,6 +18,7 @@ from tofuse.filters.camera_errors import CameraErrors
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.suspicion import Suspicion
+from tofuse.results.card import length
 from tofuse.results.types import Diagnostics, Reason, Reconstruction, SelfCalibration
 from tofuse.results.verdict import ranked
 
@@ -55,7 +56,7 @@ def self_calibrated(
             wrong.focal,
             wrong.offset_m,
             {_FIELDS[suspicion.best]: suspicion.sigmas[suspicion.best]},
-            (_support(first), _support(again)),
+            (_bound(first), _bound(again)),
         )
         best, corrected = replace(again, diagnostics=_told(again, said)), wrong
     return best
@@ -93,9 +94,20 @@ def _is_better(again: Reconstruction, before: Reconstruction) -> bool:
     """Whether as many frames have a pose, and show a smaller error."""
     if again.has_pose.sum() < before.has_pose.sum():
         return False
-    new, old = again.diagnostics.accuracy.position_m, before.diagnostics.accuracy.position_m
+    new, old = _bound(again), _bound(before)
     # Where something is not bounded whatever the calibration, the views decide.
     return new < old if np.isfinite([new, old]).any() else _support(again) > _support(before)
+
+
+def _bound(result: Reconstruction) -> float:
+    return result.diagnostics.accuracy.position_m
+
+
+def _gain(before: float, after: float) -> str:
+    """What became of the bound, in words."""
+    if not np.isfinite([before, after]).all():
+        return ""
+    return f" The poses are off by up to {length(after)} (95 % bound) instead of {length(before)}."
 
 
 def _support(result: Reconstruction) -> float:
@@ -111,7 +123,7 @@ def _told(result: Reconstruction, said: SelfCalibration) -> Diagnostics:
     wrong = CameraErrors(said.focal, said.offset_m)
     text = (
         f"The calibration of the camera was corrected: views agree with {in_words(wrong)} "
-        f"than stated (support {said.support[0]:.1%} before, {said.support[1]:.1%} now)."
+        f"than stated.{_gain(*said.bound_m)}"
     )
     reason = Reason("self_calibrated", ((indices[0], indices[-1]),), text)
     return replace(d, calibrated=said, reasons=ranked([*d.reasons, reason]))

@@ -62,21 +62,26 @@ class Gap:
     """A loop of views that overlap one after the other, and its ends too.
 
     `before` and `after` are by how much (m, rad) the neighbours, each aligned by itself, miss what
-    its ends say: without and with the errors that were estimated.
+    its ends say: without and with the errors that were estimated. `depth` is that of the views, m.
     """
 
     i: int
     j: int
     before: tuple[float, float]
     after: tuple[float, float]
+    depth: float = 0.0
 
     @property
     def closes(self) -> bool:
         """Whether the errors explain it: one part is less than half, the other not more.
 
-        A gap of less than a centimetre and half a degree says nothing, as not every error bends
-        every path.
+        Or what the views see is put down at less than half the distance. A gap of less than a
+        centimetre and half a degree says nothing, as not every error bends every path.
         """
+        seen = [m + self.depth * rad for m, rad in (self.after, self.before)]
+        least = _CLOSED[0] + self.depth * _CLOSED[1]
+        if self.depth and seen[0] < 0.5 * seen[1] and seen[1] > least:
+            return True
         parts = list(zip(self.before, self.after, _CLOSED, strict=True))
         if any(b > max(a, least) for a, b, least in parts):
             return False
@@ -199,7 +204,8 @@ def loop_gap(
             way = way @ step
         miss = se3.inverse(T[-1]) @ way
         gaps.append((float(np.linalg.norm(miss[:3, 3])), float(se3.angle(miss))))
-    return Gap(views[i].surface.index, views[j].surface.index, gaps[0], gaps[1])
+    depth = 0.5 * (views[i].surface.depth + views[j].surface.depth)
+    return Gap(views[i].surface.index, views[j].surface.index, gaps[0], gaps[1], depth)
 
 
 def longest_loop(pairs: Integers) -> tuple[int, int] | None:

@@ -531,8 +531,8 @@ def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
         "focal": found.focal,
         "offset_m": found.offset_m,
         "sigma": dict(found.sigmas),
-        "support_before": found.support[0],
-        "support_after": found.support[1],
+        "stated_bound_m": found.bound_m[0],
+        "corrected_bound_m": found.bound_m[1],
     }
 
 

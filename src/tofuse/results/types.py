@@ -80,14 +80,15 @@ class SelfCalibration:
         Added to all ranges, m.
     sigmas
         Standard deviations by how much views differ in it, by name as above.
-    support
-        Of the views for each other before they are refined, as stated and as corrected, up to 1.
+    bound_m
+        95 % bounds of the poses' rms error with the calibration as stated, and as corrected; inf
+        where the poses are not bounded.
     """
 
     focal: float
     offset_m: float
     sigmas: Mapping[str, float]
-    support: tuple[float, float]
+    bound_m: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
