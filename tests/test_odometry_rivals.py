@@ -107,3 +107,30 @@ def test_a_new_component_goes_on_as_the_camera_moved() -> None:
     assert "nothing predicted it" not in steps[13].reason
     for step, pose in zip(steps[12:], WALK[12:], strict=True):
         assert off(step, pose, WALK[12])[0] < 0.03
+
+
+def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
+    """Steps of 26 cm before a wall: the wall fits anywhere, what stands before it is out of reach."""
+    from tofuse.evaluation.trajectory import displacement
+    from tofuse.pipeline.config import changed, from_method
+    from tofuse.pipeline.reconstruct import reconstruct
+    from tofuse.recordings.open import open_recording
+    from tofuse.simulation.effects import Effects
+    from tofuse.simulation.record import simulate
+
+    folder = simulate(
+        "rail",
+        tmp_path / "rail",
+        camera="ifm-o3r",
+        seed=10,
+        every=20,
+        frames=16,
+        effects=Effects(multipath=False),
+    )
+    recording = open_recording(folder)
+    config = changed(from_method("default"), {"refinement": {"part": "none"}}, where="test")
+    result = reconstruct(recording, config)
+    assert recording.reference is not None
+    assert result.has_pose.all()
+    assert displacement(recording.reference, result.trajectory)[0] < 0.04
+    assert not any(len(f.unobservable) for f in result.diagnostics.frames)

@@ -38,6 +38,8 @@ class Rivals:
     ) -> None:
         self._usual, self._motion = usual, motion
         self._segmentation, self._relocalizer = segmentation, relocalizer
+        # Degenerate directions of the last view.
+        self._degenerate = 0
 
     def best(self, attempts: Attempts, now: Moment, *, in_sequence: bool) -> Attempt | None:
         """The explanation to believe; None where everything contradicts.
@@ -47,7 +49,26 @@ class Rivals:
         found = self._first_usual(attempts, now)
         if found is None and in_sequence:
             found = self._unrivalled(attempts, now) or self._searched(attempts, now)
+        elif found is not None and in_sequence and self._slipped(found):
+            found = self._constrained(found, attempts, now)
+        self._degenerate = 0 if found is None else len(found.aligned.unobservable)
         return found
+
+    def _slipped(self, attempt: Attempt) -> bool:
+        """Whether a view is less constrained than the one before it was.
+
+        What constrains it may be out of reach of an alignment that began at the wrong place, and
+        the rest fits anywhere along a wall.
+        """
+        return len(attempt.aligned.unobservable) > self._degenerate
+
+    def _constrained(self, attempt: Attempt, attempts: Attempts, now: Moment) -> Attempt:
+        """The pose of a search, where that is better constrained and explains the view better."""
+        other = self._searched(attempts, now)
+        if other is None or len(other.aligned.unobservable) >= len(attempt.aligned.unobservable):
+            return attempt
+        poses = self._explained(other, attempts, now), self._explained(attempt, attempts, now)
+        return other if poses[0] > poses[1] else attempt
 
     def _first_usual(self, attempts: Attempts, now: Moment) -> Attempt | None:
         """The first alignment that fits as usual, and that the camera's motion allows.
