@@ -110,7 +110,7 @@ def test_a_new_component_goes_on_as_the_camera_moved() -> None:
 
 
 def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
-    """Steps of 26 cm before a wall: the wall fits anywhere, what stands before it is out of reach."""
+    """Steps of 26 cm: a wall fits anywhere, and what stands before it is out of reach."""
     from tofuse.evaluation.trajectory import displacement
     from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
