@@ -38,7 +38,8 @@ class Mesh:
     color
         (N, 3) uint8 RGB (albedo as grey where there is no colour), or None.
     sigma
-        (N,) float32, how well the vertex is known along its normal as the views' noise tells, m.
+        (N,) float32, how well the vertex is known along its normal as the views' noise tells, m;
+        with the errors of their poses once these are known (`pose_errors`).
     views
         (N,) int32, how many views saw it.
     offset

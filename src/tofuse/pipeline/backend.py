@@ -13,6 +13,7 @@ from tofuse.evaluation.sightings import Sightings, sightings
 from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
+from tofuse.fusion.pose_errors import with_pose_errors
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.prediction import Prediction, runs, with_prediction
@@ -230,6 +231,8 @@ class BackEnd:
         with self._watch.timing("checking"):
             sightings = self._sightings(graph)
             accuracy, covariances = self._accuracy(closed, refined, model, sightings)
+            if kept.knows_errors:
+                model = self._with_pose_errors(model, graph, covariances)
             records = self._records(covariances)
             evidence = Evidence(
                 records,
@@ -364,6 +367,13 @@ class BackEnd:
             gap = suspicion.gap.before
         shown = Shown(*moved, excess, *gap)
         return accuracy_of(seen, shown, model.cloud.diagonal_m), covariances_of(graph, shown)
+
+    def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
+        """The model with the errors of the poses (P, 6, 6) in its accuracy."""
+        frames = [f for f in self._kept.checks if f.index in self._poses]
+        row = {int(frame): k for k, frame in enumerate(graph.ids)}
+        at = np.array([row[f.index] for f in frames], np.intp)
+        return with_pose_errors(model, frames, graph.poses[at], covariances[at])
 
     def _measured(self, graph: PoseGraph) -> PoseGraph:
         """The graph without what is only extrapolated from the motion."""

@@ -1,0 +1,127 @@
+"""What errors of the poses do to the surface: the part of its accuracy that noise does not tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.model import Model
+from tofuse.geometry import se3
+from tofuse.kernels.kdtree import KdTree
+from tofuse.recordings.frames import RangeFrame
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# It varies slowly over the surface: cells of this share of the model's diagonal are asked.
+_CELL = 0.01
+# A view sees a cell if its depth there differs by less than this share and one cell.
+_SAME = 0.05
+# Standard deviation in m where a view's pose is not constrained.
+_UNKNOWN_M = 10.0
+
+
+def with_pose_errors(
+    model: Model, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
+) -> Model:
+    """Return the model, with errors of the poses in the `sigma` of its points.
+
+    Parameters
+    ----------
+    frames
+        Images that see the model.
+    poses, covariances
+        (F, 4, 4) T_world_camera of them and (F, 6, 6) of its right perturbation, NaN where the pose
+        is not constrained.
+    """
+    cloud, mesh = model.cloud, model.mesh
+    if cloud.sigma is None or not len(cloud) or not len(frames):
+        return model
+    cells = _Cells.of(cloud)
+    more = _sigma(cells, frames, poses, covariances)
+    if more is None:
+        return model
+    sigma = np.hypot(cloud.sigma, more[cells.of_point]).astype(np.float32)
+    if mesh is not None and len(mesh):
+        own = sigma
+        if len(mesh) != len(cloud):  # holes were filled, or it has fewer faces
+            nearest, _ = KdTree(cells.points).nearest(mesh.vertices.astype(np.float64))
+            own = np.hypot(mesh.sigma, more[nearest]).astype(np.float32)
+        mesh = replace(mesh, sigma=own)
+    return Model(replace(cloud, sigma=sigma), mesh)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cubes that hold points: their edge, a point of each (M, 3), and the cell of every point (N,).
+
+    Points are relative to `offset`.
+    """
+
+    size: float
+    points: Float64
+    offset: Float64
+    of_point: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, cloud: Cloud) -> _Cells:
+        size = max(_CELL * cloud.diagonal_m, 1e-6)
+        cell = np.floor((cloud.points - cloud.points.min(0)) / np.float32(size)).astype(np.int64)
+        count = cell.max(0) + 1
+        key = (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
+        _, first, of_point = np.unique(key, return_index=True, return_inverse=True)
+        return cls(size, cloud.points[first].astype(np.float64), cloud.offset, of_point)
+
+
+def _sigma(
+    cells: _Cells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
+) -> Float64 | None:
+    """(M,) of each cell, by the view that knows it best; None if no view sees any."""
+    world = cells.points + cells.offset
+    best = np.full(len(world), np.inf)
+    for frame, T, C in zip(frames, poses, covariances, strict=True):
+        at = se3.transform(se3.inverse(T), world)
+        seen = _seen(frame, at, cells.size)
+        if np.isfinite(C).all():
+            variance = _variance(at[seen], C)
+        else:
+            variance = np.full(int(seen.sum()), _UNKNOWN_M**2)
+        best[seen] = np.minimum(best[seen], variance)
+    known = np.isfinite(best)
+    if not known.any():
+        return None
+    # What no compared image shows is as good as what is beside it.
+    nearest, _ = KdTree(world[known]).nearest(world[~known])
+    best[~known] = best[known][nearest]
+    return np.asarray(np.sqrt(best), np.float64)
+
+
+def _seen(frame: RangeFrame, points: Float64, size: float) -> NDArray[np.bool_]:
+    """(N,) which points (N, 3) of the camera's frame an image measured."""
+    pixel = np.nan_to_num(np.rint(frame.camera.project(points)), nan=-1.0, posinf=-1, neginf=-1)
+    limits = (frame.camera.width, frame.camera.height)
+    inside = ((pixel >= 0) & (pixel < limits)).all(1) & (points[:, 2] > 0)
+    column, row = np.where(inside[:, None], pixel, 0).astype(np.intp).T
+    z = frame.z[row, column].astype(np.float64)
+    near = np.abs(z - points[:, 2]) < _SAME * points[:, 2] + size
+    return np.asarray(inside & (z > 0) & near)
+
+
+def _variance(points: Float64, C: Float64) -> Float64:
+    """(N,) variance of points (N, 3) of a camera along any axis, by that of its pose (6, 6), m^2.
+
+    The mean of the three axes: a perturbation moves a point p by t + r x p.
+    """
+    moved, turned, mixed = C[:3, :3], C[3:, 3:], C[:3, 3:]
+    squared = (points**2).sum(1)
+    # E |r x p|^2, and E t . (r x p) = p . E (t x r).
+    by_turn = squared * np.trace(turned) - np.einsum("ni,ij,nj->n", points, turned, points)
+    skew = np.array(
+        [mixed[1, 2] - mixed[2, 1], mixed[2, 0] - mixed[0, 2], mixed[0, 1] - mixed[1, 0]]
+    )
+    variance = (np.trace(moved) + by_turn + 2 * points @ skew) / 3
+    return np.asarray(np.maximum(variance, 0.0), np.float64)

@@ -1,0 +1,129 @@
+"""The accuracy of a surface has that of the poses in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.model import Model
+from tofuse.fusion.pose_errors import _variance, with_pose_errors
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import Pinhole
+from tofuse.recordings.frames import RangeFrame
+
+CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
+SIGMA = 1e-3
+
+
+def wall(z: float = 2.0) -> RangeFrame:
+    return RangeFrame(0, 0.0, CAMERA, np.full((30, 40), z, np.float32))
+
+
+def model_of(points, offset=(0.0, 0, 0)) -> Model:
+    n = len(points)
+    cloud = Cloud(
+        np.asarray(points, np.float32),
+        None,
+        None,
+        np.ones(n, np.int32),
+        np.array(offset),
+        np.full(n, SIGMA, np.float32),
+    )
+    return Model(cloud, None)
+
+
+def covariance(position_m: float, rotation_rad: float = 0.0):
+    return np.diag([position_m**2] * 3 + [rotation_rad**2] * 3)
+
+
+def test_the_variance_is_that_of_draws() -> None:
+    rng = np.random.default_rng(2)
+    root = rng.normal(0, 1e-3, (6, 6))
+    C = root @ root.T
+    points = rng.uniform(-2, 2, (5, 3))
+    draws = rng.multivariate_normal(np.zeros(6), C, 40_000)
+    for k, point in enumerate(points):
+        moved = draws[:, :3] + np.cross(draws[:, 3:], point)
+        assert _variance(points, C)[k] == pytest.approx((moved**2).sum(1).mean() / 3, rel=0.05)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0, 0), (10.0, -5, 2)])
+def test_errors_of_the_pose_add_to_the_noise(offset) -> None:
+    points = wall().points
+    T = np.eye(4)
+    T[:3, 3] = offset
+    found = with_pose_errors(
+        model_of(points, offset), [wall()], T[None], covariance(0.02)[None]
+    ).cloud.sigma
+    np.testing.assert_allclose(found, np.hypot(SIGMA, 0.02), rtol=1e-4)
+
+
+def test_a_turn_moves_what_is_far_away() -> None:
+    points = wall().points
+    found = with_pose_errors(
+        model_of(points), [wall()], np.eye(4)[None], covariance(0, 0.01)[None]
+    ).cloud.sigma
+    middle = np.argmin(np.linalg.norm(points[:, :2], axis=1))
+    expected = np.hypot(SIGMA, 0.01 * 2.0 * np.sqrt(2 / 3))
+    assert found[middle] == pytest.approx(expected, rel=0.02)
+
+
+def test_the_view_that_knows_a_place_best_decides() -> None:
+    poses = np.stack([np.eye(4), np.eye(4)])
+    both = np.stack([covariance(0.05), covariance(0.01)])
+    found = with_pose_errors(model_of(wall().points), [wall(), wall()], poses, both).cloud.sigma
+    np.testing.assert_allclose(found, np.hypot(SIGMA, 0.01), rtol=1e-4)
+
+
+def test_a_view_says_nothing_of_what_it_does_not_see() -> None:
+    behind = wall(4.0).points
+    poses = np.stack([np.eye(4), np.eye(4)])
+    frames = [wall(2.0), wall(4.0)]  # the first sees something before it
+    both = np.stack([covariance(0.001), covariance(0.05)])
+    found = with_pose_errors(model_of(behind), frames, poses, both).cloud.sigma
+    np.testing.assert_allclose(found, np.hypot(SIGMA, 0.05), rtol=1e-4)
+
+
+def test_a_pose_that_is_not_constrained_leaves_the_surface_unknown() -> None:
+    nothing = np.full((1, 6, 6), np.nan)
+    found = with_pose_errors(model_of(wall().points), [wall()], np.eye(4)[None], nothing)
+    assert (found.cloud.sigma > 1).all()
+
+
+def test_what_no_view_sees_leaves_the_model_as_it_is() -> None:
+    model = model_of(-wall().points)
+    same = with_pose_errors(model, [wall()], np.eye(4)[None], covariance(0.1)[None])
+    assert same is model
+    assert with_pose_errors(model, [], np.zeros((0, 4, 4)), np.zeros((0, 6, 6))) is model
+
+
+def test_the_pose_of_the_camera_counts() -> None:
+    T = se3.exp(np.array([1.0, 2, 3, 0.1, 0.5, -0.2]))
+    points = se3.transform(T, wall().points.astype(float))
+    found = with_pose_errors(model_of(points), [wall()], T[None], covariance(0.03)[None])
+    np.testing.assert_allclose(found.cloud.sigma, np.hypot(SIGMA, 0.03), rtol=1e-4)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_the_vertices_of_the_surface_have_it_too(same) -> None:
+    points = wall().points
+    model = model_of(points)
+    vertices = points if same else points[::2]
+    n = len(vertices)
+    mesh = Mesh(
+        vertices,
+        np.zeros((1, 3), np.int32),
+        np.tile(np.float32([0, 0, -1]), (n, 1)),
+        None,
+        np.full(n, SIGMA, np.float32),
+        np.ones(n, np.int32),
+        np.zeros(3),
+    )
+    found = with_pose_errors(
+        Model(model.cloud, mesh), [wall()], np.eye(4)[None], covariance(0.02)[None]
+    ).mesh
+    assert found is not None
+    assert len(found.sigma) == n
+    np.testing.assert_allclose(found.sigma, np.hypot(SIGMA, 0.02), rtol=1e-4)
