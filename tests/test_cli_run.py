@@ -780,3 +780,25 @@ def test_optimize_tells_of_false_loops_and_of_parts(tmp_path, capsys) -> None:
     assert re.search(r"part from vertex 0: 5 poses, 8 edges", told)
     assert re.search(r"part from vertex 9: 1 poses, 0 edges", told)
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
+
+
+def test_how_fine_the_model_is(plain_run, room_recording, tmp_path) -> None:
+    whole = read_ply(plain_run / "mesh.ply")
+    sizes = {}
+    for name, options in (("faces", ["--faces", "500"]), ("voxel", ["--voxel", "5cm"])):
+        out = tmp_path / name
+        assert main(["run", str(room_recording), "--out", str(out), *options]) == 0
+        sizes[name] = len(read_ply(out / "mesh.ply").faces), len(read_ply(out / "cloud.ply"))
+    assert sizes["faces"][0] <= 500
+    assert sizes["faces"][1] == len(read_ply(plain_run / "cloud.ply"))
+    assert sizes["voxel"][0] < 0.5 * len(whole.faces)
+    fusion = run_json(tmp_path / "voxel")["config"]["fusion"]
+    assert fusion["voxel_m"] == 0.05
+
+
+@pytest.mark.parametrize(
+    "options", [["--faces", "0"], ["--faces", "x"], ["--voxel", "0"], ["--voxel", "-1mm"]]
+)
+def test_a_model_of_no_size_is_refused(options, room_recording, tmp_path, capsys) -> None:
+    assert main(["run", str(room_recording), "--out", str(tmp_path / "out"), *options]) == 2
+    assert options[0] in capsys.readouterr().err

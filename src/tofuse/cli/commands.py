@@ -62,6 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
         unwrap=arguments.unwrap,
         tolerance=arguments.tolerance,
         texture=arguments.texture,
+        faces=arguments.faces,
+        voxel=arguments.voxel,
         overwrite=arguments.overwrite,
     )
     if arguments.view:

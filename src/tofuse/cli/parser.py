@@ -130,6 +130,15 @@ def _run(commands: Any) -> None:
     p.add_argument(
         "--texture", action="store_true", help="a texture on the surface, in mesh.glb and mesh.obj"
     )
+    p.add_argument(
+        "--faces", type=_count, metavar="N", help="at most so many triangles (default: all)"
+    )
+    p.add_argument(
+        "--voxel",
+        type=_length,
+        metavar="LENGTH",
+        help="resolution of the model, as 5mm (default: what the camera resolves)",
+    )
     _processing(p)
     g = p.add_argument_group("watch it in the browser")
     g.add_argument(

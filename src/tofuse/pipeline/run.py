@@ -78,6 +78,8 @@ class Options:
     unwrap: bool = False
     tolerance: float | None = None
     texture: bool = False
+    faces: int | None = None
+    voxel: float | None = None
     overwrite: bool = False
 
 
@@ -239,6 +241,10 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
     if options.texture and not config.fusion.texture:
         config = changed(config, {"fusion": {"texture": _TEXTURE}}, where="--texture")
+    if options.faces is not None:
+        config = changed(config, {"fusion": {"faces": options.faces}}, where="--faces")
+    if options.voxel is not None:
+        config = changed(config, {"fusion": {"voxel_m": options.voxel}}, where="--voxel")
     if options.tolerance is not None:
         config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
     front: list[dict[str, Any]] = []
