@@ -800,5 +800,7 @@ def test_how_fine_the_model_is(plain_run, room_recording, tmp_path) -> None:
     "options", [["--faces", "0"], ["--faces", "x"], ["--voxel", "0"], ["--voxel", "-1mm"]]
 )
 def test_a_model_of_no_size_is_refused(options, room_recording, tmp_path, capsys) -> None:
-    assert main(["run", str(room_recording), "--out", str(tmp_path / "out"), *options]) == 2
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", str(room_recording), "--out", str(tmp_path / "out"), *options])
+    assert stopped.value.code == 2
     assert options[0] in capsys.readouterr().err
