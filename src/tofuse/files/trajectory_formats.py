@@ -231,8 +231,8 @@ def _log(rows: _Rows, path: Path) -> TimedPoses:
         raise InputError(f"has {len(rows)} lines, not 5 for each pose", where=path)
     poses, frames = [], []
     for k in range(0, len(rows), 5):
-        number, head = rows[k]
-        where = f"{path}, line {number}"
+        _, head = rows[k]
+        where = f"{path}, pose {k // 5}"
         table, _ = _numbers(rows[k + 1 : k + 5], path, 4)
         if not head[0].isdecimal():
             raise InputError(f"names frame {head[0]!r}", where=where)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_text
+from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, read_json
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
-from tofuse.recordings.sources import read_matrix_pose
 
 Float64 = NDArray[np.float64]
 
@@ -138,23 +138,16 @@ def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Pat
 
 
 def _poses(path: Path, count: int) -> Float64:
-    """Read a .log: for each pose a line of three numbers (the first its frame) and a 4x4 matrix."""
-    lines = [line for line in read_text(path).splitlines() if line.strip()]
-    out = np.full((count, 4, 4), np.nan)
-    if len(lines) % 5:
+    """Read a trajectory.log: (count, 4, 4), NaN for frames that it leaves out."""
+    found = read_poses(path)
+    if found.frames is None:
+        raise InputError("has times instead of frames", where=path, remedy="give a .log")
+    if (found.frames >= count).any():
         raise InputError(
-            f"has {len(lines)} lines, not 5 for each pose", where=path, remedy="check the file"
+            f"has a pose of frame {found.frames.max()}, there are {count}",
+            where=path,
+            remedy="check the counts",
         )
-    for k in range(0, len(lines), 5):
-        where = f"{path}, pose {k // 5}"
-        try:
-            frame = int(lines[k].split()[0])
-            table = np.array([[float(v) for v in line.split()] for line in lines[k + 1 : k + 5]])
-        except (ValueError, IndexError) as error:
-            raise InputError(f"can't be read ({error})", where=where) from error
-        if not 0 <= frame < count:
-            raise InputError(
-                f"is of frame {frame}, there are {count}", where=where, remedy="check the counts"
-            )
-        out[frame] = read_matrix_pose(table, where)
+    out = np.full((count, 4, 4), np.nan)
+    out[found.frames] = found.poses
     return out
