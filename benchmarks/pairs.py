@@ -5,10 +5,13 @@ degrees), how many of those are believed, and how many are believed and wrong; b
 RANSAC over FPFH with point-to-plane ICP, if it is installed. `fit` fits the logistic models of
 `tofuse.registration.confidence` to simulated pairs, some of which share nothing, and prints their
 coefficients, with area under the ROC curve and calibration on scenes that took no part in the fit.
-For them a pose is right within 5 % of the depth and 4 degrees.
+For them a pose is right within 5 % of the depth and 4 degrees. `methods` compares what
+`tofuse.register` chooses for each pair with each of the ways that it chooses from, and with an
+oracle that takes a right one where there is any.
 
     python benchmarks/pairs.py table [--data ../shared/data] [--scenes room kitchen]
     python benchmarks/pairs.py fit
+    python benchmarks/pairs.py methods
 
 Simulated scenes are made once and kept in benchmarks/out/recordings/pairs.
 """
@@ -41,7 +44,9 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.registration.agreement import agreement
+from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
+from tofuse.registration.cloud_pair import register_clouds
 from tofuse.registration.confidence import BELIEVED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.simulation.record import simulate
@@ -217,6 +222,63 @@ def print_table(names: Sequence[str], data: Path, most: int) -> None:
     _print_decoys(names, data, most)
     if peer is None:
         print("\nOpen3D: not installed")
+
+
+def followed(source: RangeFrame, target: RangeFrame) -> Registration:
+    """Align from the identity alone."""
+    return AnyPair(search=False).register(source, target, np.eye(4), np.random.default_rng(0))
+
+
+def searched(source: RangeFrame, target: RangeFrame) -> Registration:
+    """Search the images alone."""
+    maps = (surface_map(frame, SurfaceOptions()) for frame in (source, target))
+    found = register_pair(*maps, always_search=True)
+    if found is None:
+        raise RegistrationError("has too few surfaces", where=f"frame {source.index}")
+    return found
+
+
+def by_shapes(source: RangeFrame, target: RangeFrame) -> Registration:
+    """Compare the points as clouds."""
+    return register_clouds(source, target, None, np.random.default_rng(0), always_search=True)
+
+
+WAYS: dict[str, Method] = {
+    "followed from the identity": followed,
+    "images searched": searched,
+    "clouds by shapes": by_shapes,
+    "chosen (tofuse.register)": tofuse.register,
+}
+
+
+def print_methods(names: Sequence[str], data: Path, most: int) -> None:
+    """How many poses each way finds, of all pairs of each scene, and an oracle among them."""
+    print(f"| Views | pairs | {' | '.join(WAYS)} | oracle |\n|---{'|---' * (len(WAYS) + 2)}|")
+    total = np.zeros(len(WAYS) + 2, int)
+    seconds: dict[str, list[float]] = {way: [] for way in WAYS}
+    for name in names:
+        if not _is_there(name, data):
+            continue
+        recording = opened(name, data)
+        counts = np.zeros(len(WAYS) + 2, int)
+        for apart in SCENES[name].apart:
+            for i, j in chosen(len(recording), apart, most):
+                source, target, T = recording[j], recording[i], recording.reference
+                assert isinstance(source, RangeFrame)
+                assert isinstance(target, RangeFrame)
+                if T is None or not np.isfinite(T[[i, j]]).all():
+                    continue
+                true = se3.inverse(T[i]) @ T[j]
+                made = {way: outcome(method, source, target, true) for way, method in WAYS.items()}
+                right = [o.right for o in made.values()]
+                counts += np.array([1, *right, any(right)])
+                for way, o in made.items():
+                    seconds[way].append(o.seconds)
+        total += counts
+        print(f"| {SCENES[name].title} | {' | '.join(map(str, counts))} |", flush=True)
+    print(f"| all | {' | '.join(map(str, total))} |")
+    medians = (f"{np.median(s):.2f}" for s in seconds.values())
+    print(f"| s a pair | | {' | '.join(medians)} | |")
 
 
 def _print_decoys(names: Sequence[str], data: Path, most: int) -> None:
@@ -418,7 +480,7 @@ def print_fit(title: str, all_of: Samples) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["table", "fit"])
+    parser.add_argument("what", choices=["table", "fit", "methods"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--scenes", nargs="*", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--pairs", type=int, default=8, help="of each step")
@@ -426,11 +488,14 @@ def main(arguments: list[str] | None = None) -> None:
     if given.what == "table":
         print_table(given.scenes, given.data, given.pairs)
         return
-    searched, followed = samples(given.pairs, given.data)
+    if given.what == "methods":
+        print_methods(given.scenes, given.data, given.pairs)
+        return
+    of_search, of_guesses = samples(given.pairs, given.data)
     print_fit(
-        "Searched: constant, root of margin, support, root of contradiction, degenerate", searched
+        "Searched: constant, root of margin, support, root of contradiction, degenerate", of_search
     )
-    print_fit("Followed from a guess: constant, support, root of contradiction", followed)
+    print_fit("Followed from a guess: constant, support, root of contradiction", of_guesses)
 
 
 if __name__ == "__main__":

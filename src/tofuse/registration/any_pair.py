@@ -99,7 +99,9 @@ def _registered_as_images(
         return None
     (data, T_source_camera), (model, T_target_camera) = first, second
     T_camera_source, T_camera_target = se3.inverse(T_source_camera), se3.inverse(T_target_camera)
-    start = None if guess is None else T_camera_target @ guess @ T_source_camera
+    # Views of one recording are near each other more often than not: of poses that can't be told
+    # apart the one at the identity is taken, unless something else was guessed.
+    start = T_camera_target @ (np.eye(4) if guess is None else guess) @ T_source_camera
     if not comparable(data.depth, model.depth):
         if isinstance(source, RangeFrame) and isinstance(target, RangeFrame):
             raise RegistrationError(
@@ -109,7 +111,7 @@ def _registered_as_images(
                 remedy="check the unit of depth",
             )
         return None  # as clouds, the unit of one of them may be found to be wrong
-    if search or start is None:
+    if search:
         found = register_pair(data, model, start, proposals=proposals)
     else:
         found = follow(data, model, start)

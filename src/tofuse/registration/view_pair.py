@@ -226,7 +226,7 @@ class _Pair:
         """Of the pose that was followed from the guess and the best one, the one to take.
 
         A lead that is no evidence does not outweigh the guess, and neither does one along
-        directions that are degenerate: there the pose with the largest overlap leads.
+        directions that are degenerate for both: there the pose with the largest overlap leads.
         """
         said = prepared.compared.at(near.T_target_source)
         near = replace(near, agreement=said)
@@ -236,7 +236,7 @@ class _Pair:
         weak = near.aligned.unobservable
         across = se3.exp((gap - weak.T @ (weak @ gap)) * UNITS)
         same = not self.options.differ(np.eye(4), across)
-        return near if near.degenerate and same else best
+        return near if near.degenerate and best.degenerate and same else best
 
     def same(self, a: _Pose, b: _Pose) -> bool:
         """Whether two poses are one answer."""
