@@ -252,6 +252,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "seconds",
         "verdict",
         "accuracy",
+        "self_calibration",
         "reasons",
         "frames",
         "T_up_world",
