@@ -118,6 +118,11 @@ BAD = {
     "kitti-short.txt": (b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "line 2"),
     "kitti-scaled.txt": (b"2 0 0 0 0 2 0 0 0 0 2 0\n", "no rotation"),
     "short.log": (b"0 0 1\n1 0 0 0\n0 1 0 0\n", "not 5 for each pose"),
+    "huge.log": (b"9" * 5000 + b" 0 1" + b"\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "names frame"),
+    "huge.json": (
+        b'{"frames": [{"transform_matrix": [[1' + b"0" * 400 + b"]]}]}",
+        "transform_matrix",
+    ),
     "images.txt": (b"1 1 0 0 0 0 0 0 1 camera.png\n", "no number"),
     "twice.txt": (b"1 1 0 0 0 0 0 0 1 a1.png\n2 1 0 0 0 0 0 0 1 b1.png\n", "same number"),
     "quaternion.txt": (b"1 3 0 0 0 0 0 0 1 a1.png\n", "unit quaternion"),

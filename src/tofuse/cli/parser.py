@@ -184,8 +184,8 @@ def _processing(p: argparse.ArgumentParser) -> None:
         "--prior",
         choices=("auto", "none", "device"),
         default="auto",
-        help="what else counts, where it agrees: gravity and a phone's own poses (auto), nothing, "
-        "or the poses of any device (auto)",
+        help="what counts beside the images, as far as it agrees with them: gravity and a phone's "
+        "own poses (auto, the default), nothing (none), or also odometry (device)",
     )
     g.add_argument(
         "--loops", type=Path, metavar="FILE", help="loops known beforehand, one `i j` a line"

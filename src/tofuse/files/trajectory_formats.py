@@ -31,6 +31,8 @@ NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "
 _KNOWN = "TUM, EuRoC, KITTI, .log, COLMAP's images.txt, transforms.json or .npy"
 # Times in nanoseconds are larger than any in seconds.
 _NANOSECONDS = 1e12
+# Digits of a number that an int64 holds in any case.
+_DIGITS = 18
 # Cameras of OpenGL look along -z, with y up.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -120,14 +122,14 @@ def read_poses(path: str | Path) -> TimedPoses:
     rows = list(_rows(text))
     if not rows:
         raise InputError("holds no poses", where=path, remedy=f"give {_KNOWN}")
-    return _reader(text, rows, path)(rows, path)
+    return _reader(rows, path)(rows, path)
 
 
 _Rows = Sequence[tuple[int, list[str]]]
 _Reader = Callable[[_Rows, Path], TimedPoses]
 
 
-def _reader(text: str, rows: _Rows, path: Path) -> _Reader:
+def _reader(rows: _Rows, path: Path) -> _Reader:
     """Which format lines are of, by how many cells they have."""
     first = rows[0][1]
     count = len(first)
@@ -140,7 +142,7 @@ def _reader(text: str, rows: _Rows, path: Path) -> _Reader:
     if count >= 8 and _is_number(first[0]) and float(first[0]) > _NANOSECONDS:
         return _euroc
     if count == 8:
-        return lambda _rows, path: _tum(path)
+        return _tum
     raise InputError(
         f"has lines of {count} columns, as no trajectory that is known has",
         where=path,
@@ -164,7 +166,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _tum(path: Path) -> TimedPoses:
+def _tum(_rows: _Rows, path: Path) -> TimedPoses:
     times, poses = read_tum(path)
     return TimedPoses(poses, timestamps=times)
 
@@ -234,8 +236,8 @@ def _log(rows: _Rows, path: Path) -> TimedPoses:
         _, head = rows[k]
         where = f"{path}, pose {k // 5}"
         table, _ = _numbers(rows[k + 1 : k + 5], path, 4)
-        if not head[0].isdecimal():
-            raise InputError(f"names frame {head[0]!r}", where=where)
+        if not (head[0].isdecimal() and len(head[0]) <= _DIGITS):
+            raise InputError(f"names frame {head[0][:40]!r}", where=where)
         if len(table) == 4:
             poses.append(_rigid(table, where))
             frames.append(int(head[0]))
@@ -267,7 +269,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
         matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
         try:
             T = np.array(matrix, float)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError("has no 'transform_matrix' of 4 x 4", where=where) from error
         poses.append(_rigid(T, where) @ _OPENGL)
         names.append(str(frame.get("file_path", k)))
@@ -306,7 +308,7 @@ def _numbers_in(names: Sequence[str], path: Path) -> Intp:
             where=path,
             remedy="name images by the number of their frame",
         )
-    numbers = np.array([int(digits[-1][-18:]) for digits in found], np.intp)
+    numbers = np.array([int(digits[-1][-_DIGITS:]) for digits in found], np.intp)
     if len(np.unique(numbers)) != len(numbers):
         raise InputError("names two images with the same number", where=path)
     return numbers

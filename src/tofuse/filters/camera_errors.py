@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -41,7 +41,9 @@ class CameraErrors(Correction):
         if not abs(self.focal) <= _MOST_FOCAL:
             raise ValueError(f"focal is {self.focal}, not -{_MOST_FOCAL} to {_MOST_FOCAL}")
         if not abs(self.offset_m) <= _MOST_OFFSET_M:
-            raise ValueError(f"offset_m is {self.offset_m}, not -{_MOST_OFFSET_M} to 1")
+            raise ValueError(
+                f"offset_m is {self.offset_m}, not -{_MOST_OFFSET_M} to {_MOST_OFFSET_M}"
+            )
 
     def start(self) -> Corrector:
         """See `Correction.start`."""
@@ -63,8 +65,8 @@ class CameraErrors(Correction):
 @dataclass(eq=False)
 class _Corrector(Corrector):
     options: CameraErrors
-    # Frames share their camera, and what is worked out for it.
-    _cameras: dict[Camera, Camera] = field(default_factory=dict)
+    # The last camera as stated and as it is: frames share theirs, and what is worked out for it.
+    _cameras: tuple[Camera, Camera] | None = None
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`; clouds have no camera."""
@@ -72,9 +74,10 @@ class _Corrector(Corrector):
             return frame
         options = self.options
         if options.focal:
-            if frame.camera not in self._cameras:
-                self._cameras[frame.camera] = options.camera(frame.camera)
-            frame = replace(frame, camera=self._cameras[frame.camera])
+            cameras = self._cameras
+            if cameras is None or cameras[0] != frame.camera:
+                cameras = self._cameras = (frame.camera, options.camera(frame.camera))
+            frame = replace(frame, camera=cameras[1])
         if options.offset_m:
             # What is valid stays valid.
             least = np.float32(1e-3)

@@ -370,9 +370,7 @@ class BackEnd:
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """The model with the errors of the poses (P, 6, 6) in its accuracy."""
-        frames = [f for f in self._kept.checks if f.index in self._poses]
-        row = {int(frame): k for k, frame in enumerate(graph.ids)}
-        at = np.array([row[f.index] for f in frames], np.intp)
+        frames, at = self._checked(graph)
         return with_pose_errors(model, frames, graph.poses[at], covariances[at])
 
     def _measured(self, graph: PoseGraph) -> PoseGraph:
@@ -416,11 +414,14 @@ class BackEnd:
 
     def _sightings(self, graph: PoseGraph) -> Sightings | None:
         """What overlapping images say of the final poses."""
+        frames, at = self._checked(graph)
+        return sightings(frames, graph.poses[at]) if len(frames) > 1 else None
+
+    def _checked(self, graph: PoseGraph) -> tuple[list[RangeFrame], NDArray[np.intp]]:
+        """The images that are compared in the end, and where their poses are in the graph."""
         frames = [f for f in self._kept.checks if f.index in self._poses]
-        if len(frames) < 2:
-            return None
         row = {int(frame): k for k, frame in enumerate(graph.ids)}
-        return sightings(frames, np.stack([graph.poses[row[f.index]] for f in frames]))
+        return frames, np.array([row[f.index] for f in frames], np.intp)
 
     def _scatter(self, poses: Float64) -> Float64:
         out = np.full((len(self._log.entries), 4, 4), np.nan)

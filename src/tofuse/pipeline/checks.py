@@ -462,7 +462,7 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
         return
     gap = found.gap
     (m, rad), (m_after, rad_after) = gap.before, gap.after
-    cure = " or ".join(camera_in_words(found))
+    cure = " or ".join(camera_in_words(found.errors))
     text = (
         f"Odometry drift over loop {gap.i}-{gap.j} is {_length(m)}, {_angle(rad)}. "
         f"{cure[0].upper()}{cure[1:]} would reduce it to {_length(m_after)}, {_angle(rad_after)}: "

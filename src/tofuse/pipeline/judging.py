@@ -137,8 +137,11 @@ def judge(
     progress = progress or Silent()
     poses = poses_for(recording, trajectory)
     kind = view_kind(recording)
-    # What else moves with the camera says nothing of these poses.
-    config = replace(from_method("default", kind), tolerance_m=tolerance_m, outside=())
+    # What else moves with the camera says nothing of these poses, and images are compared with the
+    # camera as it is stated.
+    config = replace(
+        from_method("default", kind), tolerance_m=tolerance_m, outside=(), self_calibration=False
+    )
     given = replace(config, odometry=GivenPoses())
     check_views(given, kind)
     compared_images = _Images(recording)

@@ -10,6 +10,7 @@ from tofuse.filters.camera_errors import CameraErrors
 from tofuse.fusion.texture import LitView, Textured, textured
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
+from tofuse.parts import name_of
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
@@ -42,9 +43,12 @@ def paint(
     if mesh is None or not len(mesh.faces):
         return None
     chosen = steady(result)
-    wrong = result.diagnostics.calibrated
-    errors = CameraErrors() if wrong is None else CameraErrors(wrong.focal, wrong.offset_m)
-    corrected = errors.start().apply
+    # Of what is corrected, the errors of the camera alone move pixels over the surface.
+    correctors = [
+        CameraErrors(item["focal"], item["offset_m"]).start()
+        for item in result.config["corrections"]
+        if item["part"] == name_of(CameraErrors())
+    ]
     progress = progress or Silent()
     progress.stage("painting", len(chosen))
     views: list[LitView] = []
@@ -55,7 +59,8 @@ def paint(
             frame = recording[int(k)]
         except UnreadableFrameError:
             continue
-        frame = corrected(frame)
+        for corrector in correctors:
+            frame = corrector.apply(frame)
         view = LitView.of(frame) if isinstance(frame, RangeFrame) else None
         if view is not None and (not views or view.light.shape == views[0].light.shape):
             views.append(view)

@@ -2,9 +2,9 @@
 
 Refined views say if a focal length or a depth offset bends the path: with that corrected they
 support each other better, and a loop closes that neighbours alone miss (`posegraph.suspicion`). The
-recording is then reconstructed once more with it corrected, and this stays only where the new
-poses show a smaller error than the old ones (`posegraph.accuracy`), or the views fit the poses
-better that tracking and loops give, without any refinement.
+recording is then reconstructed once more with it corrected, and this stays only where the stated
+bound of the poses gets smaller (`posegraph.accuracy`). Where neither trajectory is bounded, views
+must fit better before they are refined.
 """
 
 from __future__ import annotations
@@ -18,12 +18,15 @@ from tofuse.filters.camera_errors import CameraErrors
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.suspicion import Suspicion
+from tofuse.posegraph.suspicion import in_words as errors_in_words
 from tofuse.results.card import length
 from tofuse.results.types import Diagnostics, Reason, Reconstruction, SelfCalibration
 from tofuse.results.verdict import ranked
 
 # The first estimate is made with poses that the error has bent, the second one is not.
 _ROUNDS = 2
+# Options of `CameraErrors` by the names of the errors.
+_FIELDS = {"focal": "focal", "offset": "offset_m"}
 
 Once = Callable[[Config], Reconstruction]
 
@@ -64,14 +67,8 @@ def self_calibrated(
 
 def in_words(wrong: CameraErrors) -> str:
     """What is corrected: "a focal length 4.5 % smaller"."""
-    words = []
-    if wrong.focal:
-        share = 1 / (1 + wrong.focal) - 1
-        words.append(f"a focal length {abs(share):.1%} {'larger' if share > 0 else 'smaller'}")
-    if wrong.offset_m:
-        more = "longer" if wrong.offset_m > 0 else "shorter"
-        words.append(f"ranges {abs(wrong.offset_m) * 1e3:.0f} mm {more}")
-    return " and ".join(words)
+    errors = {name: getattr(wrong, field) for name, field in _FIELDS.items()}
+    return " and ".join(errors_in_words({name: e for name, e in errors.items() if e}))
 
 
 def _shown(result: Reconstruction) -> tuple[Suspicion, CameraErrors] | None:
@@ -85,9 +82,6 @@ def _shown(result: Reconstruction) -> tuple[Suspicion, CameraErrors] | None:
         return found, CameraErrors(**{_FIELDS[found.best]: value})
     except ValueError:
         return None  # no camera is so far off
-
-
-_FIELDS = {"focal": "focal", "offset": "offset_m"}
 
 
 def _is_better(again: Reconstruction, before: Reconstruction) -> bool:

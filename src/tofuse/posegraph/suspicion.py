@@ -11,7 +11,7 @@ The focal length stands for other errors too: a depth that is off by a constant 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -223,14 +223,14 @@ def longest_loop(pairs: Integers) -> tuple[int, int] | None:
     return int(i[k]), int(j[k])
 
 
-def in_words(found: Suspicion) -> list[str]:
-    """What the views say of the camera, in words, for each error by itself."""
+def in_words(errors: Mapping[str, float]) -> list[str]:
+    """Errors of the camera in words, each by itself, by what would be right; see `Suspicion`."""
     words = []
-    if "focal" in found.errors:
-        share = 1 / (1 + found.errors["focal"]) - 1
+    if "focal" in errors:
+        share = 1 / (1 + errors["focal"]) - 1
         more = "larger" if share > 0 else "smaller"
         words.append(f"a focal length {abs(share):.1%} {more}")
-    if "offset" in found.errors:
-        more = "longer" if found.errors["offset"] > 0 else "shorter"
-        words.append(f"ranges {abs(found.errors['offset']) * 1e3:.0f} mm {more}")
+    if "offset" in errors:
+        more = "longer" if errors["offset"] > 0 else "shorter"
+        words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")
     return words

@@ -105,6 +105,7 @@ class CloudFileSource(FileSource):
         if self._shift.any():
             return None
         clouds: list[CloudFrame] = []
+        found: Deprojection | None = None
         for index in range(0, len(self.files), max(1, len(self.files) // SAMPLES)):
             if len(clouds) == SAMPLES:
                 break
@@ -115,10 +116,11 @@ class CloudFileSource(FileSource):
             if not isinstance(frame, CloudFrame):
                 return None
             clouds.append(frame)
-            # Most clouds are not, as one shows.
-            if len(clouds) == 1 and find_deprojection(clouds) is None:
-                return None
-        return find_deprojection(clouds)
+            if found is None:
+                found = find_deprojection(clouds)
+                if found is None:  # as most clouds: one shows it
+                    return None
+        return find_deprojection(clouds) if len(clouds) > 1 else found
 
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):

@@ -241,9 +241,8 @@ def _middle_of(slopes: Float64) -> tuple[Float64, Float64] | None:
         return None
     off = np.abs(slopes - np.median(slopes, axis=0)).max(1)
     part = slopes[np.argpartition(off, _MIDDLE)[:_MIDDLE]]
-    beside, _ = KdTree(np.column_stack([part, np.zeros(len(part))])).neighbours(
-        np.column_stack([part, np.zeros(len(part))]), 5
-    )
+    flat = np.column_stack([part, np.zeros(len(part))])
+    beside, _ = KdTree(flat).neighbours(flat, 5)
     apart = np.abs(part[beside[:, 1:]] - part[:, None]).reshape(-1, 2)
     steps = []
     for along in (0, 1):

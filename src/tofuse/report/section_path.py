@@ -226,7 +226,7 @@ def _camera_check(r: Refinement | None) -> str:
         return out.strip()
     if s.errors:
         verdict = "The camera should be checked" if s.alarm else "That is no reason for an alarm"
-        out += f"The views would agree better with {' or '.join(in_words(s))}. {verdict}. "
+        out += f"The views would agree better with {' or '.join(in_words(s.errors))}. {verdict}. "
     elif not r.errors:
         out += "The views ask for no other focal length, and no offset of the ranges. "
     if s.gap is not None:
