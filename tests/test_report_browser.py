@@ -67,6 +67,14 @@ def test_model_turns_and_toggles_switch(browser, report, tmp_path):
             blue, red = ink[..., 0], ink[..., 2]
             strong = (red - blue > 120) if orange else (blue - red > 120)
             assert strong.sum() > 50
+        bar = page.locator("#viewer .bar")
+        assert bar.is_hidden()
+        for by, end in (("height", "0"), ("accuracy", "±"), ("views", "")):
+            was = seen.pixels("#viewer canvas")
+            page.select_option("select[name=by]", by)
+            page.wait_for_timeout(200)
+            assert changed(was, seen.pixels("#viewer canvas")) > 0.01, by
+            assert bar.locator("span").first.inner_text().startswith(end)
         page.screenshot(path=tmp_path / "desk.png", full_page=True)
         seen.check()
 

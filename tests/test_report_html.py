@@ -16,12 +16,14 @@ import pytest
 from tofuse.fusion.cloud import Cloud, CloudBuilder, empty_cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
+from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.report import plots
 from tofuse.report.extras import ReportExtras
+from tofuse.report.fields import fields
 from tofuse.report.html import write_report
 from tofuse.report.pictures import draw
 from tofuse.report.scene import MAX_FACES, make_scene, packed
@@ -127,11 +129,13 @@ def make_room(frames=24, width=64, height=48):
         },
         samples=samples,
     )
+    cloud = builder.finish()
+    sigma = (0.002 + 0.004 * np.linalg.norm(cloud.points, axis=1)).astype(np.float32)
     result = Reconstruction(
         estimate,
         np.arange(frames) / 10,
         PoseGraph.empty(),
-        builder.finish(),
+        replace(cloud, sigma=sigma),
         diagnostics,
         {"method": "thesis", "filters": [{"part": "confidence", "minimum": 4}]},
         {"path": "room", "format": "native", "frames": frames, "warnings": ["no timestamps.txt"]},
@@ -467,7 +471,11 @@ def test_loops_timings_and_objective(shown):
 
 
 def decode(text, kind):
-    return np.frombuffer(base64.b64decode(text), kind).reshape(-1, 3)
+    return flat(text, kind).reshape(-1, 3)
+
+
+def flat(text, kind):
+    return np.frombuffer(base64.b64decode(text), kind)
 
 
 def test_viewer_holds_a_surface_with_not_too_many_faces():
@@ -513,6 +521,30 @@ def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
         ends = decode(scene["lines"][name], "<f4")
         for center in poses[np.isfinite(poses[:, 0, 0]), :3, 3]:
             assert np.abs(ends - center).max(1).min() < 1e-6
+
+
+def test_model_can_be_coloured_by_what_its_points_know():
+    points = np.array([[0, -2.0, 1], [0, -1, 1], [0, 0, 1], [1, 0, 2]], np.float32)
+    cloud = Cloud(
+        points,
+        None,
+        None,
+        np.array([1, 2, 3, 4], np.int32),
+        np.zeros(3),
+        np.array([0.001, 0.002, 0.004, UNKNOWN_M], np.float32),
+    )
+    found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud), {}))}
+    assert list(found) == ["height", "accuracy", "views"]
+    of = {name: flat(f.packed()["points"], np.uint8).astype(int) for name, f in found.items()}
+    assert of["height"].tolist() == [255, pytest.approx(128, abs=3), 0, 0]
+    assert (np.diff(of["views"]) > 0).all()
+    # The bar is of what is constrained; what is not has the colour of its end, and is named there.
+    accuracy = found["accuracy"]
+    assert of["accuracy"][3] == 255
+    assert (np.diff(of["accuracy"][:3]) > 0).all()
+    assert accuracy.low == pytest.approx(0.00196, rel=0.1)
+    assert accuracy.high == pytest.approx(0.00784, rel=0.1)
+    assert accuracy.said[1].endswith("mm or not constrained")
 
 
 def test_viewer_thins_a_large_model(tmp_path):

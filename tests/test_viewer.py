@@ -155,14 +155,14 @@ def test_options_of_the_page_need_the_page(tmp_path, capsys):
 def test_colours_follow_what_they_stand_for(folder):
     found = read_result(folder)
     assert colorings([found.mesh, found.cloud]) == [
-        "colour", "height", "uncertainty", "view count"
+        "colour", "height", "accuracy", "view count"
     ]  # fmt: skip
     bright = {by: painted(found.mesh, by, found.up)[0].astype(int).sum(1) for by in ("height",)}
     heights = found.mesh.points @ found.up
     assert np.corrcoef(bright["height"], heights)[0, 1] > 0.9
-    colors, told = painted(found.mesh, "uncertainty", found.up)
+    colors, told = painted(found.mesh, "accuracy", found.up)
     assert np.corrcoef(colors.astype(int).sum(1), found.mesh.sigma)[0, 1] > 0.9
-    assert told.endswith("mm (one standard deviation)")
+    assert told.endswith("± mm (95 %)")
     np.testing.assert_array_equal(painted(found.mesh, "colour", found.up)[0], found.mesh.color)
 
 
@@ -237,10 +237,10 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             assert changed(first, drawn(seen)) > 0.02
             page.get_by_label("Surface").click()
             page.get_by_label("Colour by").click()
-            page.get_by_role("option", name="uncertainty").click()
+            page.get_by_role("option", name="accuracy").click()
             colored = drawn(seen)
             assert changed(first, colored) > 0.02
-            assert page.get_by_text("mm (one standard deviation)").is_visible()
+            assert page.get_by_text("± mm (95 %)").is_visible()
 
             shot = page.get_by_alt_text("Range")
             was = shot.get_attribute("src")

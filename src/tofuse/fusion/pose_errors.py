@@ -22,7 +22,7 @@ _CELL = 0.01
 # A view sees a cell if its depth there differs by less than this share and one cell.
 _SAME = 0.05
 # Standard deviation in m where a view's pose is not constrained.
-_UNKNOWN_M = 10.0
+UNKNOWN_M = 10.0
 
 
 def with_pose_errors(
@@ -89,7 +89,7 @@ def _sigma(
         if np.isfinite(C).all():
             variance = _variance(at[seen], C)
         else:
-            variance = np.full(int(seen.sum()), _UNKNOWN_M**2)
+            variance = np.full(int(seen.sum()), UNKNOWN_M**2)
         best[seen] = np.minimum(best[seen], variance)
     known = np.isfinite(best)
     if not known.any():

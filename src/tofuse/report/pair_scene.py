@@ -208,7 +208,6 @@ def packed(scene: PairScene) -> dict[str, Any]:
         "box": whole.tolist(),
         "outlines": {mode: np.round(points, 4).tolist() for mode, points in seen.items()},
         "spacing": 0.01,
-        "heights": [0.0, 1.0],
         "yaw": scene.yaw,
         "pitch": scene.pitch,
         "points": "",

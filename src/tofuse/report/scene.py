@@ -45,6 +45,9 @@ class Scene:
         (L, 2, 3) ends of the accepted loops.
     surface
         All of it; None without one.
+    sigma, views
+        (K,) float, standard deviation of the points in m, and (K,) int, how many views saw them;
+        None where it is not known.
     """
 
     points: Float64
@@ -57,6 +60,8 @@ class Scene:
     reference: Float64
     loops: Float64
     surface: Mesh | None = None
+    sigma: Float32 | None = None
+    views: NDArray[np.int32] | None = None
 
     @cached_property
     def mesh(self) -> Mesh | None:
@@ -143,6 +148,8 @@ def make_scene(
         finite(reference),
         loops[np.isfinite(loops).all((1, 2))],
         result.mesh,
+        None if cloud.sigma is None else cloud.sigma[chosen],
+        None if cloud.views is None else cloud.views[chosen],
     )
 
 
@@ -165,7 +172,6 @@ def packed(scene: Scene) -> dict[str, Any]:
         "size": scene.size,
         "box": scene.box.tolist(),
         "spacing": scene.spacing,
-        "heights": list(height_range(scene.points)),
         "yaw": YAW,
         "pitch": PITCH,
         "points": base64_of(steps),

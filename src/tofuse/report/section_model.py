@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.report import images, plots, words
+from tofuse.report.fields import fields
 from tofuse.report.scene import packed, still
 from tofuse.report.subject import OUTER, Figure, Subject, Values
 
@@ -17,14 +18,12 @@ def model(s: Subject) -> Values:
     """Return the data of the 3D view and its still."""
     scene = s.scene
     if len(scene.points) == 0 and len(scene.after) == 0:
-        return {"scene": None, "still": "", "toggles": [], "thinned": ""}
-    toggles = [("points", "Points", "", True)]
+        return {"scene": None, "still": "", "toggles": [], "colorings": [], "thinned": ""}
+    toggles = [("points", "Points", "", scene.mesh is None)]
     if scene.mesh is not None:
-        toggles.append(("mesh", "Surface", "", False))
+        toggles.insert(0, ("mesh", "Surface", "", True))
     if scene.normals is not None:
         toggles.append(("peel", "Hide walls seen from behind", "", True))
-    if len(scene.points):
-        toggles.append(("height", "Colour by height", "", s.result.cloud.color is None))
     if len(scene.before):
         toggles.append(("before", "Cameras before", "#f0a03c", False))
     if len(scene.after):
@@ -34,12 +33,15 @@ def model(s: Subject) -> Values:
     if len(scene.loops):
         toggles.append(("loops", "Loops", "#5fd08a", True))
     laid = scene.turned(s.straight)
+    by = {field.name: field for field in fields(laid)} if len(scene.points) else {}
+    own = [("", "Colour")] if s.result.cloud.color is not None else []
     shown = len(scene.points)
     thinned = "" if shown == scene.total else f"{shown:,} of {scene.total:,} points are shown."
     return {
-        "scene": packed(laid),
+        "scene": packed(laid) | {"fields": {name: field.packed() for name, field in by.items()}},
         "still": images.data_uri(still(laid)),
         "toggles": toggles,
+        "colorings": own + [(name, field.label) for name, field in by.items()],
         "thinned": thinned,
     }
 

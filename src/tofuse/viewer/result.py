@@ -15,6 +15,7 @@ from tofuse.files.ply import Ply, read_ply
 from tofuse.files.trajectory import read_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
+from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
 from tofuse.results.output import frames_in_main_model, is_result, read_run_json
@@ -168,7 +169,7 @@ def _up(mesh: Layer | None, poses: Float64) -> Float64:
 
 
 # What the model can be coloured by, and the unit of the scale.
-COLORINGS = ("colour", "height", "uncertainty", "view count")
+COLORINGS = ("colour", "height", "accuracy", "view count")
 
 
 def colorings(layers: Sequence[Layer]) -> list[str]:
@@ -176,7 +177,7 @@ def colorings(layers: Sequence[Layer]) -> list[str]:
     needs: dict[str, list[NDArray[Any] | None]] = {
         "colour": [la.color for la in layers],
         "height": [la.points for la in layers],
-        "uncertainty": [la.sigma for la in layers],
+        "accuracy": [la.sigma for la in layers],
         "view count": [la.views for la in layers],
     }
     return [name for name in COLORINGS if any(value is not None for value in needs[name])]
@@ -189,8 +190,8 @@ def painted(layer: Layer, by: str, up: Float64) -> tuple[UInt8, str]:
     values, unit = None, ""
     if by == "height":
         values, unit = layer.points @ up, "m above the first camera"
-    elif by == "uncertainty" and layer.sigma is not None:
-        values, unit = 1000 * layer.sigma, "mm (one standard deviation)"
+    elif by == "accuracy" and layer.sigma is not None:
+        values, unit = 1000 * OF_95_PERCENT * layer.sigma, "± mm (95 %)"
     elif by == "view count":
         values, unit = layer.views, "views"
     if values is None:

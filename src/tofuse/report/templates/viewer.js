@@ -12,10 +12,10 @@
 
   const POINTS = `
     attribute vec3 place, color, normal;
+    attribute float value;
     uniform mat4 view, lens;
     uniform vec3 low, extent, eye;
-    uniform float size, peel, shade, byHeight, least, most;
-    uniform vec2 heights;
+    uniform float size, peel, shade, byValue, least, most;
     varying vec3 tint;
     vec3 ramp(float t) {
       vec3 a = vec3(.27, .0, .33), b = vec3(.13, .57, .55), c = vec3(.99, .91, .15);
@@ -27,7 +27,7 @@
       gl_Position = lens * v;
       if (peel > .5 && dot(normal, eye - p) < 0.) gl_Position = vec4(2., 2., 2., 1.);
       gl_PointSize = clamp(size / max(-v.z, 1e-6), least, most);
-      tint = byHeight > .5 ? ramp(clamp((-p.y - heights.x) / heights.y, 0., 1.)) : mix(vec3(.14), vec3(1.), color);
+      tint = byValue > .5 ? ramp(value) : mix(vec3(.14), vec3(1.), color);
       if (shade > .5) tint *= .6 + .4 * abs(dot(normal, normalize(eye - p)));
     }`;
   const LINES = `
@@ -93,6 +93,18 @@
     normal: layer.normals ? arrays[layer.normals] : null,
   }));
   const mode = () => { const input = box.querySelector("[name=mode]:checked"); return input ? input.value : ""; };
+  const fields = {};
+  for (const name in scene.fields || {}) {
+    const { points, vertices } = scene.fields[name];
+    fields[name] = { points: buffer(bytes(points)), vertices: buffer(bytes(vertices)) };
+  }
+  const by = () => { const input = box.querySelector("[name=by]"); return input ? input.value : ""; };
+  function label() {
+    const bar = box.querySelector(".bar"), field = (scene.fields || {})[by()];
+    if (!bar) return;
+    bar.hidden = !field;
+    if (field) bar.querySelectorAll("span").forEach((end, k) => { end.textContent = field.said[k]; });
+  }
   const lines = {};
   for (const name in scene.lines) {
     const raw = bytes(scene.lines[name]);
@@ -213,9 +225,10 @@
       gl.uniform1f(u("size"), 1.5 * scene.spacing * fy * height / 2);
       gl.uniform1f(u("least"), layers.length ? 2 * ratio : 1);
       gl.uniform1f(u("most"), 10 * ratio);
-      gl.uniform1f(u("byHeight"), on("height") ? 1 : 0);
-      gl.uniform2f(u("heights"), scene.heights[0], Math.max(scene.heights[1] - scene.heights[0], 1e-6));
-      const use = (set) => {
+      const values = fields[by()];
+      const use = (set, value) => {
+        gl.uniform1f(u("byValue"), value ? 1 : 0);
+        if (value) attribute(dots, "value", value, gl.UNSIGNED_BYTE, true, 1);
         gl.uniform1f(u("shade"), set.normal ? 1 : 0);
         attribute(dots, "place", set.place, gl.UNSIGNED_SHORT, true);
         if (set.color) attribute(dots, "color", set.color, gl.UNSIGNED_BYTE, true);
@@ -225,14 +238,14 @@
       if (surface) {
         gl.uniform1f(u("peel"), 0);
         if (on("peel")) gl.enable(gl.CULL_FACE);
-        use(mesh);
+        use(mesh, values && values.vertices);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.faces);
         gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
         gl.disable(gl.CULL_FACE);
       }
       if (on("points") && scene.count) {
         gl.uniform1f(u("peel"), on("peel") && buffers.normal ? 1 : 0);
-        use(buffers);
+        use(buffers, values && values.points);
         gl.drawArrays(gl.POINTS, 0, scene.count);
       }
       for (const layer of shown) {
@@ -244,7 +257,7 @@
         use(layer);
         gl.drawArrays(gl.POINTS, 0, layer.count);
       }
-      for (const name of ["color", "normal"]) {
+      for (const name of ["color", "normal", "value"]) {
         const place = gl.getAttribLocation(dots, name);
         if (place >= 0) gl.disableVertexAttribArray(place);
       }
@@ -259,12 +272,12 @@
       gl.drawArrays(gl.LINES, 0, lines[name].count);
     }
   }
-  function attribute(of, name, source, type, scaled) {
+  function attribute(of, name, source, type, scaled, numbers = 3) {
     const place = gl.getAttribLocation(of, name);
     if (place < 0) return;
     gl.bindBuffer(gl.ARRAY_BUFFER, source);
     gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, 3, type, scaled, 0, 0);
+    gl.vertexAttribPointer(place, numbers, type, scaled, 0, 0);
   }
 
   function plain(of, name, value) {
@@ -349,6 +362,7 @@
   let last = framed();
   box.addEventListener("change", () => {
     box.dataset.mode = mode();
+    label();
     if (String(framed()) === String(last)) { draw(); return; }
     last = framed();
     reset();
@@ -356,6 +370,7 @@
   canvas.addEventListener("webglcontextlost", () => box.classList.replace("live", "without"));
   new ResizeObserver(draw).observe(canvas);
   box.classList.add("live");
+  label();
   reset();
 })();
 
