@@ -46,7 +46,7 @@ FILES = {*SAME, "report.html", "view.npz", "run.json"}
 def light_report(request, monkeypatch):
     """Leave out the report, half of the time of a run, where the test doesn't look at it."""
     if "full_report" not in request.fixturenames:
-        monkeypatch.setattr(run_module, "_report", _stubs)
+        monkeypatch.setattr(run_module, "write_report_files", _stubs)
 
 
 def _stubs(*of_a_run: object) -> None:

@@ -279,7 +279,7 @@ def test_plain_cells_get_smaller_with_more_triangles() -> None:
 def test_a_run_with_a_texture(room_recording: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr(
-        run_module, "_report", lambda *a: (a[-1] / "report.html").write_text("report")
+        run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
     )
     monkeypatch.setattr(run_module, "_TEXTURE", 256)
     monkeypatch.setattr(paint, "_FACES", 3000)

@@ -269,7 +269,9 @@ def killed(out: Path, *words: object, event: int = -1, move: int = -1) -> tuple[
 def test_killed_again_and_again_gives_the_same_bytes(
     room_recording: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(run, "_report", lambda *a: (a[-1] / "report.html").write_text("report"))
+    monkeypatch.setattr(
+        run, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
+    )
     whole, out = tmp_path / "whole", tmp_path / "out"
     words = (room_recording, "--every", 2, "--seed", 2)
     assert main(["run", "--out", str(whole), *map(str, words)]) == 0

@@ -1,8 +1,10 @@
 """tofuse: recordings of Time-of-Flight cameras into one consistent 3D model and a trajectory.
 
 >>> import tofuse
->>> recording = tofuse.open("path")
->>> result = tofuse.reconstruct(recording)
+>>> recording = tofuse.open("path")  # or tofuse.from_arrays(depth, K)
+>>> result = tofuse.reconstruct(recording, progress=True)
+>>> result.save("result")
+>>> result.mesh.save("model.glb")
 >>> T = tofuse.register(source, target).T_target_source
 
 Names are imported when they are first used, so that ``import tofuse`` is quick.
@@ -16,13 +18,18 @@ from typing import TYPE_CHECKING, Any
 from tofuse._version import __version__
 
 if TYPE_CHECKING:
+    from tofuse.api.result import Result, load, reconstruct
     from tofuse.errors import InputError, OutputError, RegistrationError, TofuseError
+    from tofuse.fusion.cloud import Cloud
+    from tofuse.fusion.mesh import Mesh
+    from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
     from tofuse.inspection.inspect import inspect_recording as inspect
     from tofuse.live.player import Player
     from tofuse.pipeline.config import Config
+    from tofuse.pipeline.evaluating import Evaluation, evaluate
     from tofuse.pipeline.judging import Judgement, judge
     from tofuse.pipeline.mapper import Mapper
-    from tofuse.pipeline.reconstruct import reconstruct
+    from tofuse.recordings.arrays import from_arrays
     from tofuse.recordings.frames import CloudFrame, RangeFrame
     from tofuse.recordings.open import open_recording as open  # noqa: A004
     from tofuse.recordings.recording import Recording
@@ -31,43 +38,67 @@ if TYPE_CHECKING:
     from tofuse.results.types import Reconstruction
 
 _HOMES = {
+    "BrownConrady": "tofuse.geometry.cameras",
+    "Cloud": "tofuse.fusion.cloud",
     "CloudFrame": "tofuse.recordings.frames",
     "Config": "tofuse.pipeline.config",
+    "Evaluation": "tofuse.pipeline.evaluating",
+    "Fisheye": "tofuse.geometry.cameras",
     "InputError": "tofuse.errors",
     "Judgement": "tofuse.pipeline.judging",
     "Mapper": "tofuse.pipeline.mapper",
+    "Mesh": "tofuse.fusion.mesh",
     "OutputError": "tofuse.errors",
+    "Pinhole": "tofuse.geometry.cameras",
     "Player": "tofuse.live.player",
     "RangeFrame": "tofuse.recordings.frames",
+    "Rational": "tofuse.geometry.cameras",
+    "RayTable": "tofuse.geometry.cameras",
     "Reconstruction": "tofuse.results.types",
     "Recording": "tofuse.recordings.recording",
     "Registration": "tofuse.registration.base",
     "RegistrationError": "tofuse.errors",
+    "Result": "tofuse.api.result",
     "TofuseError": "tofuse.errors",
+    "evaluate": "tofuse.pipeline.evaluating",
+    "from_arrays": "tofuse.recordings.arrays",
     "inspect": "tofuse.inspection.inspect",
     "judge": "tofuse.pipeline.judging",
+    "load": "tofuse.api.result",
     "open": "tofuse.recordings.open",
-    "reconstruct": "tofuse.pipeline.reconstruct",
+    "reconstruct": "tofuse.api.result",
     "register": "tofuse.registration.register",
 }
 
 __all__ = [
+    "BrownConrady",
+    "Cloud",
     "CloudFrame",
     "Config",
+    "Evaluation",
+    "Fisheye",
     "InputError",
     "Judgement",
     "Mapper",
+    "Mesh",
     "OutputError",
+    "Pinhole",
     "Player",
     "RangeFrame",
+    "Rational",
+    "RayTable",
     "Reconstruction",
     "Recording",
     "Registration",
     "RegistrationError",
+    "Result",
     "TofuseError",
     "__version__",
+    "evaluate",
+    "from_arrays",
     "inspect",
     "judge",
+    "load",
     "open",
     "reconstruct",
     "register",

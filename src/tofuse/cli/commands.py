@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
@@ -486,42 +486,15 @@ def noise(arguments: argparse.Namespace) -> int:
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """``tofuse evaluate``."""
-    from tofuse.errors import InputError
-    from tofuse.evaluation.consistency import map_consistency, poses_of_frames
-    from tofuse.evaluation.trajectory import evaluate_trajectory
-    from tofuse.files.trajectory_formats import read_poses
-    from tofuse.recordings.open import open_recording, read_reference
-    from tofuse.results.output import clock_of
+    from tofuse.pipeline.evaluating import evaluate as evaluate_poses
 
-    estimate_file, reference_file = arguments.estimate, arguments.reference
-    recording = None if arguments.recording is None else open_recording(arguments.recording)
-    frame_times = None if recording is None else recording.timestamps
-    clock = clock_of(estimate_file)
-    if recording is not None:
-        clock = recording.timestamps, recording.indices
-    estimate, known = read_poses(estimate_file), read_reference(reference_file)
-    if clock is None and (estimate.timestamps is None) != (known.timestamps is None):
-        untimed = estimate_file if estimate.timestamps is None else reference_file
-        raise InputError(
-            "has poses by frame, the other file by time",
-            where=untimed,
-            remedy="give the recording, which knows the times: --recording",
-        )
-    times, poses = estimate.timed(clock, estimate_file)
-    reference_times, reference = known.timed(clock, reference_file)
-    try:
-        error = evaluate_trajectory(times, poses, reference_times, reference, frame_times)
-    except InputError as wrong:
-        both = f"{estimate_file}, {reference_file}"
-        raise InputError(wrong.problem, where=both, remedy=wrong.remedy) from wrong
-    data: dict[str, Any] = error.to_dict()
-    interval = None
-    if arguments.reference_error is not None:
-        interval = error.ate_within(arguments.reference_error)
-        data["ate_interval_m"] = list(interval)
-    if recording is not None:
-        poses_here = poses_of_frames(recording.timestamps, times, poses)
-        data["map_consistency"] = map_consistency(recording, poses_here).to_dict()
+    found = evaluate_poses(
+        arguments.estimate,
+        arguments.reference,
+        recording=arguments.recording,
+        reference_error_m=arguments.reference_error,
+    )
+    data, error, interval = found.to_dict(), found.error, found.ate_interval_m
     if arguments.json:
         emit(data)
         return 0
@@ -537,7 +510,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
             angle = r.to_dict()["rotation_rms_deg"]
             value = f"{r.translation_rms_m:.4f} m, {angle:.3f} deg"
         table.add_row(f"RPE over {r.frames} frame{'' if r.frames == 1 else 's'}", value)
-    if recording is not None:
+    if found.consistency is not None:
         m = data["map_consistency"]
         value = "no two images overlap enough"
         if m["rms_m"] is not None:

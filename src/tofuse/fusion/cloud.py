@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.fusion.exchange import Shape
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
@@ -49,6 +51,27 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
+
+    def shape(self) -> Shape:
+        """Return it for other programs: `save`, `to_trimesh`, `to_open3d`."""
+        scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
+        points = self.points.astype(np.float64) + self.offset
+        return Shape(points, self.normals, self.color, scalars)
+
+    def save(self, path: str | Path) -> None:
+        """Write it as .ply, .pcd, .las or .e57, see `Shape.save`."""
+        self.shape().save(path)
+
+    def to_trimesh(self) -> Any:
+        """Return a `trimesh.PointCloud` in the world frame."""
+        return self.shape().to_trimesh()
+
+    def to_open3d(self) -> Any:
+        """Return an `open3d.geometry.PointCloud` in the world frame."""
+        return self.shape().to_open3d()
 
     @property
     def diagonal_m(self) -> float:

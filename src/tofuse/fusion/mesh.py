@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.exchange import Shape
 from tofuse.kernels.clustering import number_keys, plane_sums
 
 Float32 = NDArray[np.float32]
@@ -56,6 +59,27 @@ class Mesh:
 
     def __len__(self) -> int:
         return len(self.vertices)
+
+    def __repr__(self) -> str:
+        return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
+
+    def shape(self) -> Shape:
+        """Return it for other programs: `save`, `to_trimesh`, `to_open3d`."""
+        scalars = {"views": self.views, "sigma": self.sigma}
+        points = self.vertices.astype(np.float64) + self.offset
+        return Shape(points, self.normals, self.color, scalars, self.faces)
+
+    def save(self, path: str | Path) -> None:
+        """Write it as .glb, .gltf, .ply, .obj or .stl, see `Shape.save`."""
+        self.shape().save(path)
+
+    def to_trimesh(self) -> Any:
+        """Return a `trimesh.Trimesh` in the world frame."""
+        return self.shape().to_trimesh()
+
+    def to_open3d(self) -> Any:
+        """Return an `open3d.geometry.TriangleMesh` in the world frame."""
+        return self.shape().to_open3d()
 
     def cloud(self) -> Cloud:
         """Return the vertices as a cloud."""

@@ -150,7 +150,9 @@ def run(
         progress.stage("writing")
         # BLAS sums differ with its number of threads, and its threads wait by spinning.
         with threadpool_limits(1):
-            write_result(result, folder, lambda r, f: _report(recording, config, r, f), texture)
+            write_result(
+                result, folder, lambda r, f: write_report_files(recording, config, r, f), texture
+            )
     except BaseException as error:
         kept.give_up(error)
         raise
@@ -313,7 +315,10 @@ def exit_status(result: Reconstruction) -> int:
     return 0 if all(in_main_model(f, result.components) for f in readable) else 3
 
 
-def _report(recording: Recording, config: Config, result: Reconstruction, folder: Path) -> None:
+def write_report_files(
+    recording: Recording, config: Config, result: Reconstruction, folder: Path
+) -> None:
+    """Write what of a result is for people into a folder: `report.html`, and the viewer's data."""
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
     from tofuse.report.pictures import draw

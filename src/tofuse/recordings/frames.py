@@ -137,6 +137,10 @@ class RangeFrame:
     color_registered: bool = True
     shared_sigma_image: Float32 | None = None
 
+    def __repr__(self) -> str:
+        size = f"{self.camera.width} x {self.camera.height}"
+        return f"RangeFrame {self.index}: {size} at {self.timestamp:.3f} s, {len(self):,} valid"
+
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width)
         for name in (

@@ -102,6 +102,9 @@ class Recording:
         """Make a recording of all frames of a source."""
         return cls(source, str(path), format, np.arange(len(source.timestamps)))
 
+    def __repr__(self) -> str:
+        return f"Recording: {len(self)} frames of {self.path} ({self.format})"
+
     def __len__(self) -> int:
         return len(self.indices)
 

@@ -215,6 +215,15 @@ class Reconstruction:
     mesh: Mesh | None = None
     components: tuple[Component, ...] = ()
 
+    def __repr__(self) -> str:
+        a = self.diagnostics.accuracy
+        bound = f", ±{1e3 * a.position_m:.3g} mm (95 %)" if np.isfinite(a.position_m) else ""
+        return (
+            f"{type(self).__name__}: {self.diagnostics.verdict}{bound}, "
+            f"{int(self.has_pose.sum())} of {len(self.trajectory)} frames, "
+            f"{len(self.cloud):,} points"
+        )
+
     @property
     def has_pose(self) -> NDArray[np.bool_]:
         """(N,) mask of the frames with a pose in the main model."""

@@ -1,0 +1,1 @@
+"""What `import tofuse` offers that needs more than one room: results that know what to do."""

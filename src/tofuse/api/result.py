@@ -1,0 +1,267 @@
+"""A reconstruction with what one does with it: `tofuse.reconstruct` and `tofuse.load`."""
+
+from __future__ import annotations
+
+import html
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from tofuse.cli.progress import TerminalProgress
+from tofuse.errors import InputError
+from tofuse.pipeline.config import Config, changed, from_method
+from tofuse.pipeline.evaluating import Evaluation, evaluate
+from tofuse.pipeline.progress import Progress
+from tofuse.pipeline.reconstruct import reconstruct as reconstruct_recording
+from tofuse.pipeline.reconstruct import view_kind
+from tofuse.pipeline.run import write_report_files
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.recordings.recording import Recording
+from tofuse.results.card import SEPARATOR, card
+from tofuse.results.loading import load_result
+from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.types import Reconstruction
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+Float64 = NDArray[np.float64]
+
+_THUMBNAIL = (420, 262)  # pixels
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Reconstruction):
+    """A reconstruction: see `Reconstruction` for its fields.
+
+    Attributes
+    ----------
+    source
+        The recording that it was made of; None for one that was loaded.
+    """
+
+    source: Recording | None = None
+
+    @classmethod
+    def of(cls, found: Reconstruction, source: Recording | None = None) -> Self:
+        """Give a reconstruction, such as that of `Mapper.finish`, these methods."""
+        own = {f.name: getattr(found, f.name) for f in fields(Reconstruction)}
+        return cls(**own, source=source)
+
+    @property
+    def accuracy(self) -> str:
+        """The accuracy card, in one line."""
+        return SEPARATOR.join(card(self))
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the output folder of ``tofuse run``; returns it.
+
+        The report of a result that was loaded shows nothing of its recording.
+
+        Raises
+        ------
+        OutputError
+            If the folder holds something else, or a result and `overwrite` is not given.
+        """
+        out = OutputFolder(folder, overwrite=overwrite)
+        try:
+            with threadpool_limits(1):  # BLAS sums differ with its number of threads
+                write_result(self, out, self._write_report)
+        finally:
+            out.discard()
+        return Path(folder)
+
+    def _write_report(self, result: Reconstruction, folder: Path) -> None:
+        from tofuse.report.extras import ReportExtras
+        from tofuse.report.html import write_report
+        from tofuse.viewer.kept import NAME, write_kept
+
+        if self.source is not None:
+            write_report_files(self.source, self._configuration(self.source), result, folder)
+            return
+        title = Path(str(result.recording["path"])).name
+        write_report(result, folder / "report.html", ReportExtras(title))
+        write_kept(result, (), folder / NAME)
+
+    def _configuration(self, source: Recording) -> Config:
+        method = self.config["method"]
+        config = from_method(method, view_kind(source))
+        return changed(config, self.config, where="the result's configuration")
+
+    def evaluate(
+        self,
+        reference: str | Path | ArrayLike | None = None,
+        *,
+        reference_error_m: float | None = None,
+    ) -> Evaluation:
+        """Compare the trajectory with a reference.
+
+        Parameters
+        ----------
+        reference
+            A file, or (N, 4, 4) T_world_camera of the same frames, NaN where there is none. None:
+            the poses that came with the recording.
+        reference_error_m
+            By how much the reference may be off, rms.
+
+        Raises
+        ------
+        InputError
+            If there is no reference, or it is of something else.
+        """
+        known = reference
+        if known is None:
+            known = None if self.source is None else self.source.reference
+        if known is None:
+            raise InputError(
+                "came with no reference poses",
+                where="the recording" if self.source else "a result that was loaded",
+                remedy="give them as reference",
+            )
+        given = known if isinstance(known, str | Path) else np.asarray(known, float)
+        return evaluate(
+            self.trajectory, given, recording=self.source, reference_error_m=reference_error_m
+        )
+
+    def view(
+        self, *, port: int | None = None, open_browser: bool = True
+    ) -> AbstractContextManager[ViserServer]:
+        """Show the result in the browser, as ``tofuse view`` does, until the server is stopped.
+
+        The page is served by threads of this process: a script that ends, ends it. Needs viser.
+        """
+        from tofuse.viewer.app import ResultView
+        from tofuse.viewer.result import read_result
+        from tofuse.viewer.server import address, serve
+
+        with tempfile.TemporaryDirectory(prefix="tofuse-") as folder:
+            self.save(Path(folder) / "result")
+            shown = read_result(Path(folder) / "result")
+        server = serve(port)
+        ResultView(server, shown)
+        if open_browser:
+            webbrowser.open(address(server))
+        return server
+
+    def plot(self) -> Plot:
+        """Draw the model and the path of the camera from above and from the side."""
+        from tofuse.report import plots
+
+        points = self.cloud.points.astype(float) + self.cloud.offset
+        points = points[np.isfinite(points).all(1)]
+        path = self.trajectory[self.has_pose][:, :3, 3]
+        if not len(points):
+            raise InputError("has no points to draw", where="the model")
+        return Plot(
+            tuple(
+                plots.model(points, path, None, view, measured=None, label=f"Model, from {name}")
+                for view, name in (("above", "above"), ("side", "the side"))
+            )
+        )
+
+    def _repr_html_(self) -> str:
+        from tofuse.report import images
+        from tofuse.report.scene import make_scene, still
+
+        rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
+        scene = make_scene(self, rows)
+        said = html.escape(self.accuracy)
+        word = html.escape(self.diagnostics.verdict.capitalize())
+        picture = ""
+        if len(scene.points):
+            source = images.data_uri(still(scene, _THUMBNAIL))
+            picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
+        return f"<div>{picture}<b>{word}</b>: {said}</div>"
+
+
+@dataclass(frozen=True, repr=False)
+class Plot:
+    """Drawings, each an SVG element; a notebook shows them side by side."""
+
+    drawings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return f"Plot of {len(self.drawings)} drawings: save it, or show it in a notebook"
+
+    def _repr_html_(self) -> str:
+        style = "--ink:#1a1d21;--muted:#5c6470;--grid:#dfe3e8;--after:#0b67b8;--bad:#c01f3c"
+        boxes = "".join(f'<div style="width:440px">{svg}</div>' for svg in self.drawings)
+        return f'<div style="display:flex;flex-wrap:wrap;gap:16px;{style}">{boxes}</div>'
+
+    def save(self, path: str | Path) -> None:
+        """Write a page that shows them (.html)."""
+        from tofuse.files.atomic import write_text
+
+        write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
+
+
+def reconstruct(
+    recording: Recording,
+    config: Config | str = "default",
+    *,
+    seed: int = 0,
+    threads: int | None = None,
+    loops: Sequence[GivenLoop] = (),
+    progress: Progress | bool | None = None,
+) -> Result:
+    """Reconstruct a recording: trajectory, pose graph, fused cloud and surface, diagnostics.
+
+    Frames that can't be read are skipped and counted.
+
+    Parameters
+    ----------
+    recording
+        What `tofuse.open` or `tofuse.from_arrays` gives.
+    config
+        A configuration or the name of one ("default", "thesis").
+    seed
+        One seed, one result.
+    threads
+        How many threads to use; None: all cores. The result does not depend on it.
+    loops
+        Loops known beforehand, in frame indices.
+    progress
+        True: bars on the terminal.
+
+    Raises
+    ------
+    InputError
+        If no frame can be read, or none has enough valid points for a pose; or if a filter can't
+        learn what it has to.
+    """
+    shown: AbstractContextManager[Progress | None]
+    shown = TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
+    with shown as seen:
+        found = reconstruct_recording(
+            recording, config, seed=seed, threads=threads, loops=loops, progress=seen
+        )
+    return Result.of(found, recording)
+
+
+def load(folder: str | Path) -> Result:
+    """Read the output folder of ``tofuse run`` or of `Result.save`.
+
+    Raises
+    ------
+    InputError
+        If it is no such folder, or what it holds is damaged or of different runs.
+    """
+    from tofuse.viewer.kept import read_kept
+
+    found = load_result(folder)
+    kept = read_kept(Path(folder))
+    if kept is not None:
+        before = found.diagnostics.sequential
+        for k, frame in enumerate(found.diagnostics.frames):
+            before[k] = kept.before.get(frame.index, np.nan)
+        found = replace(found, diagnostics=replace(found.diagnostics, sequential=before))
+    return Result.of(found)

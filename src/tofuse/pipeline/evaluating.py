@@ -1,0 +1,134 @@
+"""The job of `tofuse evaluate`: a trajectory against a reference, and against its own images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.evaluation.consistency import Consistency, map_consistency, poses_of_frames
+from tofuse.evaluation.trajectory import TrajectoryError, evaluate_trajectory
+from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
+from tofuse.recordings.open import open_recording, read_reference
+from tofuse.recordings.recording import Recording
+from tofuse.results.output import clock_of
+
+Float64 = NDArray[np.float64]
+Poses = str | Path | Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """How far a trajectory is from a reference.
+
+    Attributes
+    ----------
+    error
+        Absolute and relative errors.
+    ate_interval_m
+        Bounds of the true ATE, where it is known how far off the reference may be.
+    consistency
+        How well the recording's images agree at these poses; None without a recording.
+    """
+
+    error: TrajectoryError
+    ate_interval_m: tuple[float, float] | None = None
+    consistency: Consistency | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures as plain data, angles in degrees."""
+        data: dict[str, Any] = self.error.to_dict()
+        if self.ate_interval_m is not None:
+            data["ate_interval_m"] = list(self.ate_interval_m)
+        if self.consistency is not None:
+            data["map_consistency"] = self.consistency.to_dict()
+        return data
+
+    def __repr__(self) -> str:
+        e = self.error
+        return (
+            f"Evaluation: ATE {e.ate_rms_m:.4f} m, {np.degrees(e.rotation_rms_rad):.3f} deg rms "
+            f"over {e.associated} poses"
+        )
+
+
+def evaluate(
+    estimate: Poses,
+    reference: Poses,
+    *,
+    recording: Recording | str | Path | None = None,
+    reference_error_m: float | None = None,
+) -> Evaluation:
+    """Compare a trajectory with a reference.
+
+    Parameters
+    ----------
+    estimate, reference
+        A file or folder of any format that is read (a result, a recording with a reference), or
+        (N, 4, 4) T_world_camera of the frames of the recording, NaN where there is none.
+    recording
+        Knows the times of frames where the files don't; with it the agreement of its images is
+        measured as well.
+    reference_error_m
+        By how much the reference may be off, rms.
+
+    Raises
+    ------
+    InputError
+        If a file can't be read, or nothing can be associated.
+    """
+    if isinstance(recording, str | Path):
+        recording = open_recording(recording)
+    names = [
+        str(p) if isinstance(p, str | Path) else n
+        for p, n in ((estimate, "estimate"), (reference, "reference"))
+    ]
+    clock = clock_of(Path(estimate)) if isinstance(estimate, str | Path) else None
+    if recording is not None:
+        clock = recording.timestamps, recording.indices
+    found, known = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
+    if clock is None and (found.timestamps is None) != (known.timestamps is None):
+        raise InputError(
+            "has poses by frame, the other file by time",
+            where=names[0] if found.timestamps is None else names[1],
+            remedy="give the recording, which knows the times: --recording",
+        )
+    times, poses = _timed(found, estimate, clock, names[0])
+    reference_times, reference_poses = _timed(known, reference, clock, names[1])
+    frame_times = None if recording is None else recording.timestamps
+    try:
+        error = evaluate_trajectory(times, poses, reference_times, reference_poses, frame_times)
+    except InputError as wrong:
+        raise InputError(wrong.problem, where=", ".join(names), remedy=wrong.remedy) from wrong
+    interval = None if reference_error_m is None else error.ate_within(reference_error_m)
+    consistency = None
+    if recording is not None:
+        here = poses_of_frames(recording.timestamps, times, poses)
+        consistency = map_consistency(recording, here)
+    return Evaluation(error, interval, consistency)
+
+
+def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:
+    if isinstance(given, str | Path):
+        return read_reference(given) if is_reference else read_poses(given)
+    poses = np.asarray(given, float)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise InputError(f"has shape {poses.shape}", where=name, remedy="give (N, 4, 4) poses")
+    return TimedPoses(poses, frames=np.arange(len(poses)))
+
+
+def _timed(
+    found: TimedPoses, given: Poses, clock: Clock | None, name: str
+) -> tuple[Float64, Float64]:
+    """Times and poses. Those of an array are of the recording's frames, in their order."""
+    if isinstance(given, str | Path) or clock is None:
+        return found.timed(clock, name)
+    if len(found.poses) != len(clock[0]):
+        raise InputError(
+            f"holds {len(found.poses)} poses, and the recording {len(clock[0])} frames", where=name
+        )
+    return clock[0], found.poses

@@ -1,0 +1,201 @@
+"""A recording made of arrays: `tofuse.from_arrays`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import Camera, Pinhole, RayTable
+from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
+from tofuse.recordings.recording import ArraySource, Recording
+
+# Of whole numbers of depth nearly all cameras mean millimetres.
+_MILLIMETRES = 1e-3
+# Depth in metres has its median below; beyond it, it must be in millimetres.
+_FARTHEST_M = 200.0
+
+
+def from_arrays(
+    depth: ArrayLike | Sequence[ArrayLike],
+    camera: Camera | ArrayLike,
+    *,
+    color: ArrayLike | Sequence[ArrayLike] | None = None,
+    amplitude: ArrayLike | Sequence[ArrayLike] | None = None,
+    confidence: ArrayLike | Sequence[ArrayLike] | None = None,
+    timestamps: ArrayLike | None = None,
+    reference: ArrayLike | None = None,
+    odometry: ArrayLike | None = None,
+    depth_kind: DepthKind = "z",
+    depth_unit_m: float | None = None,
+    amplitude_kind: AmplitudeKind = "raw",
+) -> Recording:
+    """Make a recording of images that are in memory.
+
+    Parameters
+    ----------
+    depth
+        (N, H, W), or N images (H, W); 0 or NaN where there is none. Floats are metres and whole
+        numbers millimetres, unless `depth_unit_m` says otherwise.
+    camera
+        A camera, or the matrix K (3, 3) of a pinhole camera without distortion, in pixels of the
+        depth images.
+    color
+        (N, H, W, 3) uint8 RGB at the pixels of depth.
+    amplitude
+        (N, H, W) counts; what they count says `amplitude_kind`, see `RangeFrame`.
+    confidence
+        (N, H, W) uint8, higher is better.
+    timestamps
+        (N,) s; 30 images a second unless given.
+    reference
+        (N, 4, 4) T_world_camera, NaN where there is none: only ever compared with.
+    odometry
+        (N, 4, 4) T_world_camera that may help, NaN where there is none.
+    depth_kind
+        "z", or "range" along the rays.
+    depth_unit_m
+        What a depth of 1 is, in m.
+
+    Raises
+    ------
+    InputError
+        If shapes or types do not fit, or the depth can't be in the unit that is assumed.
+    """
+    images = _images("depth", depth, None)
+    shape = images[0].shape
+    if len(shape) != 2:
+        raise InputError(f"has images of shape {shape}", where="depth", remedy="give (N, H, W)")
+    seen_by = _camera(camera, shape)
+    times = _times(timestamps, len(images))
+    colors = _optional("color", color, images, np.uint8, 3)
+    amplitudes = _optional("amplitude", amplitude, images, np.float32)
+    confidences = _optional("confidence", confidence, images, np.uint8)
+    to_metres = _to_metres(images, depth_unit_m)
+    frames = []
+    for k, image in enumerate(images):
+        metres = to_metres(image)
+        good = np.isfinite(metres) & (metres > 0)
+        frames.append(
+            RangeFrame(
+                k,
+                float(times[k]),
+                seen_by,
+                np.where(good, metres, 0).astype(np.float32),
+                depth_kind,
+                amplitude_image=None if amplitudes is None else amplitudes[k],
+                confidence_image=None if confidences is None else confidences[k],
+                color_image=None if colors is None else colors[k],
+                amplitude_kind=amplitude_kind,
+            )
+        )
+    source = ArraySource(
+        frames,
+        _poses("reference", reference, len(frames)),
+        _poses("odometry", odometry, len(frames)),
+    )
+    return Recording.of(source, "arrays", "arrays")
+
+
+def _images(name: str, given: Any, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
+    try:
+        images = [np.asarray(image) for image in given]
+    except TypeError as error:
+        raise InputError("is no array of images", where=name, remedy="give (N, H, W)") from error
+    if not images:
+        raise InputError("holds no image", where=name)
+    expected = images[0].shape if shape is None else shape
+    for k, image in enumerate(images):
+        if image.dtype.kind not in "iufb" or image.shape != expected:
+            raise InputError(
+                f"image {k} is {image.dtype} of shape {image.shape}, not {expected}", where=name
+            )
+    return images
+
+
+def _optional(
+    name: str,
+    given: Any,
+    images: list[NDArray[Any]],
+    dtype: type[np.generic],
+    channels: int | None = None,
+) -> list[NDArray[Any]] | None:
+    if given is None:
+        return None
+    shape = images[0].shape if channels is None else (*images[0].shape, channels)
+    found = _images(name, given, shape)
+    if len(found) != len(images):
+        raise InputError(f"holds {len(found)} images, and depth {len(images)}", where=name)
+    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in found):
+        raise InputError(f"is {found[0].dtype}", where=name, remedy="give uint8, from 0 to 255")
+    return [image.astype(dtype, copy=False) for image in found]
+
+
+def _to_metres(
+    images: list[NDArray[Any]], unit_m: float | None
+) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
+    whole = images[0].dtype.kind in "iub"
+    scale = unit_m if unit_m is not None else (_MILLIMETRES if whole else 1.0)
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"is {scale}", where="depth_unit_m", remedy="give metres, above 0")
+    if unit_m is None and not whole:
+        sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
+        sample = sample[np.isfinite(sample) & (sample > 0)]
+        if len(sample) and np.median(sample) > _FARTHEST_M:
+            raise InputError(
+                f"has a median of {np.median(sample):.4g}, which can't be metres",
+                where="depth",
+                remedy="give depth_unit_m=0.001 if it is in millimetres",
+            )
+    return lambda image: image.astype(np.float64) * scale
+
+
+def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
+    height, width = shape
+    if isinstance(given, Pinhole | RayTable):
+        if (given.height, given.width) != (height, width):
+            raise InputError(
+                f"has {given.width} x {given.height} pixels, and depth {width} x {height}",
+                where="camera",
+            )
+        return given
+    try:
+        K = np.asarray(given, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            "is neither a camera nor a matrix", where="camera", remedy="give K (3, 3)"
+        ) from error
+    if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
+        raise InputError(
+            f"is no matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
+            where="camera",
+            remedy="give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
+        )
+    return Pinhole(width, height, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+
+
+def _times(given: ArrayLike | None, count: int) -> NDArray[np.float64]:
+    if given is None:
+        return np.arange(count) / 30
+    times = np.asarray(given, float)
+    if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError(
+            "must be one finite number for each image, ascending",
+            where="timestamps",
+            remedy="give seconds",
+        )
+    return times
+
+
+def _poses(name: str, given: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+    if given is None:
+        return None
+    poses = np.asarray(given, float)
+    if poses.shape != (count, 4, 4):
+        raise InputError(
+            f"has shape {poses.shape}", where=name, remedy=f"give ({count}, 4, 4) T_world_camera"
+        )
+    return poses

@@ -1,0 +1,183 @@
+"""A result as its output folder has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.ply import read_ply
+from tofuse.files.trajectory import read_tum
+from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.mesh import Mesh
+from tofuse.posegraph.accuracy import Accuracy, WorstFrame
+from tofuse.posegraph.g2o import read_g2o
+from tofuse.posegraph.graph import GraphPart, LoopRecord
+from tofuse.posegraph.outside import OutsideRecord
+from tofuse.results.output import (
+    component_name,
+    frames_in_main_model,
+    is_result,
+    read_run_json,
+)
+from tofuse.results.types import (
+    Component,
+    Diagnostics,
+    FrameRecord,
+    Reason,
+    Reconstruction,
+    SelfCalibration,
+)
+
+Float64 = NDArray[np.float64]
+
+
+def load_result(folder: str | Path) -> Reconstruction:
+    """Read the output folder of a run.
+
+    What the folder does not hold is empty: poses before loops were closed (NaN), values of the
+    optimiser's objective, the refinement, sample images, and the model before optimisation.
+
+    Raises
+    ------
+    InputError
+        If it is no such folder, or what it holds is damaged or of different runs.
+    """
+    folder = Path(folder)
+    if not folder.is_dir() or not is_result(folder):
+        raise InputError(
+            "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"
+        )
+    run = read_run_json(folder / "run.json")
+    try:
+        return _reconstruction(folder, run)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise InputError(
+            f"can't be understood ({type(error).__name__}: {error})",
+            where=folder / "run.json",
+            remedy="copy the whole folder, or run again",
+        ) from error
+
+
+def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
+    frames = tuple(_frame(each) for each in run["frames"])
+    row = {frame.index: k for k, frame in enumerate(frames)}
+    trajectory = np.full((len(frames), 4, 4), np.nan)
+    _, poses = read_tum(folder / "trajectory.txt")
+    posed = [row[frame["index"]] for frame in frames_in_main_model(run)]
+    if len(posed) != len(poses):
+        raise InputError(
+            f"says that {len(posed)} frames have a pose, and trajectory.txt holds {len(poses)}",
+            where=folder / "run.json",
+            remedy="copy the whole folder, or run again",
+        )
+    trajectory[posed] = poses
+    diagnostics = Diagnostics(
+        run["verdict"],
+        tuple(
+            Reason(r["code"], tuple((a, b) for a, b in r["ranges"]), r["text"])
+            for r in run["reasons"]
+        ),
+        frames,
+        tuple(LoopRecord(**p) for p in run["loops"]),
+        np.full_like(trajectory, np.nan),
+        (),
+        {name: each["removed"] for name, each in run["filters"].items()},
+        run["seconds"],
+        parts=tuple(_part(each) for each in run["optimiser"]),
+        outside=tuple(OutsideRecord(**s) for s in run["outside"]),
+        accuracy=_accuracy(run["accuracy"]),
+        calibrated=_calibration(run.get("self_calibration")),
+    )
+    return Reconstruction(
+        trajectory,
+        np.array([frame.timestamp for frame in frames]),
+        read_g2o(folder / "pose_graph.g2o"),
+        _cloud(folder / "cloud.ply"),
+        diagnostics,
+        run["config"],
+        {**run["input"], "warnings": run["warnings"], "findings": run["findings"]},
+        run["seed"],
+        run["threads"],
+        _mesh(folder / "mesh.ply"),
+        tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
+    )
+
+
+def _frame(data: dict[str, Any]) -> FrameRecord:
+    C = data["covariance"]
+    unobservable = np.array(data["unobservable"], float).reshape(-1, 6)
+    known = {"covariance": None if C is None else np.array(C, float).reshape(6, 6)}
+    return FrameRecord(**{**data, **known, "unobservable": unobservable})
+
+
+def _part(data: dict[str, Any]) -> GraphPart:
+    names = ("first", "vertices", "edges", "before", "after", "converged")
+    return GraphPart(**{name: data[name] for name in names})
+
+
+def _accuracy(data: dict[str, Any]) -> Accuracy:
+    def bound(value: float | None) -> float:
+        return np.inf if value is None else float(value)
+
+    worst = data["worst"]
+    return Accuracy(
+        bound(data["position_m"]),
+        bound(data["rotation_rad"]),
+        bound(data["relative"]),
+        data["assessed"],
+        worst
+        and WorstFrame(worst["frame"], bound(worst["position_m"]), bound(worst["rotation_rad"])),
+        tuple(data["unbounded"]),
+    )
+
+
+def _calibration(data: dict[str, Any] | None) -> SelfCalibration | None:
+    if data is None:
+        return None
+    bounds = (data["stated_bound_m"], data["corrected_bound_m"])
+    before, after = (np.inf if b is None else float(b) for b in bounds)
+    return SelfCalibration(data["focal"], data["offset_m"], data["sigma"], (before, after))
+
+
+def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
+    T = data["T_main_component"]
+    own = folder / component_name(number)
+    return Component(
+        tuple((a, b) for a, b in data["frames"]),
+        None if T is None else np.array(T, float).reshape(4, 4),
+        data["joined"],
+        load_result(own) if T is None and is_result(own) else None,
+    )
+
+
+def _cloud(path: Path) -> Cloud:
+    ply = read_ply(path)
+    sigma = ply.vertex.get("sigma")
+    return Cloud(
+        ply.points,
+        ply.normals,
+        ply.color,
+        np.asarray(ply.vertex["views"], np.int32),
+        np.zeros(3),
+        None if sigma is None else np.asarray(sigma, np.float32),
+    )
+
+
+def _mesh(path: Path) -> Mesh | None:
+    if not path.is_file():
+        return None
+    ply = read_ply(path)
+    normals, faces = ply.normals, ply.faces
+    return Mesh(
+        ply.points,
+        np.zeros((0, 3), np.int32) if faces is None else faces,
+        np.zeros((len(ply), 3), np.float32) if normals is None else normals,
+        ply.color,
+        np.asarray(ply.vertex["sigma"], np.float32),
+        np.asarray(ply.vertex["views"], np.int32),
+        np.zeros(3),
+    )

@@ -1,0 +1,295 @@
+"""The Python interface: one line for each task."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import tofuse
+from tofuse.cli.progress import TerminalProgress
+from tofuse.geometry import se3
+from tofuse.recordings.frames import RangeFrame
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    """Depth images (N, H, W) in a corner with a box, K and the poses (N, 4, 4)."""
+    from tofuse.geometry.cameras import Pinhole
+
+    camera = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
+    rays = np.concatenate([camera.rays().astype(float), np.ones((60, 80, 1))], -1)
+    poses = se3.exp(np.linspace(0, 1, 6)[:, None] * [0.06, 0.02, 0.05, 0.02, 0.10, 0.03])
+    planes = [
+        ([0, 0, -1.0], -2.2),
+        ([0, -1.0, 0], -0.7),
+        ([1.0, 0, 0], -0.9),
+        ([-0.6, 0, -0.8], -1.9),
+    ]
+    depth = []
+    for T in poses:
+        z = np.full((60, 80), np.inf)
+        for normal, d in planes:
+            n = np.array(normal) / np.linalg.norm(normal)
+            world = rays @ T[:3, :3].T
+            with np.errstate(divide="ignore"):
+                hit = (d - n @ T[:3, 3]) / (world @ n)
+            z = np.minimum(z, np.where(hit > 0.05, hit, np.inf))
+        depth.append(z)
+    noise = np.random.default_rng(3).normal(0, 0.001, (6, 60, 80))
+    return (
+        (np.array(depth) + noise).astype(np.float32),
+        np.array([[70, 0, 39.5], [0, 70, 29.5], [0, 0, 1]]),
+        poses,
+    )
+
+
+@pytest.fixture(scope="module")
+def result(arrays):
+    depth, K, poses = arrays
+    return tofuse.reconstruct(tofuse.from_arrays(depth, K, reference=poses), threads=1)
+
+
+def test_arrays_become_a_model_and_a_trajectory(result):
+    assert result.has_pose.all()
+    found = result.evaluate()
+    assert found.error.associated == 6
+    assert found.error.ate_rms_m < 0.004
+    assert found.consistency.rms_m < 0.004
+    assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
+
+
+def test_a_saved_result_is_loaded_as_it_was(result, tmp_path):
+    assert result.save(tmp_path / "out") == tmp_path / "out"
+    again = tofuse.load(tmp_path / "out")
+    np.testing.assert_allclose(again.trajectory, result.trajectory, atol=1e-7)
+    np.testing.assert_allclose(again.timestamps, result.timestamps, atol=1e-6)
+    np.testing.assert_allclose(
+        again.diagnostics.sequential, result.diagnostics.sequential, atol=1e-7
+    )
+    np.testing.assert_array_equal(again.mesh.faces, result.mesh.faces)
+    np.testing.assert_allclose(again.cloud.points, result.cloud.points, atol=1e-6)
+    np.testing.assert_array_equal(again.graph.edges, result.graph.edges)
+    for name in ("verdict", "reasons", "accuracy", "loops", "calibrated"):
+        assert getattr(again.diagnostics, name) == getattr(result.diagnostics, name), name
+    for mine, theirs in zip(again.diagnostics.frames, result.diagnostics.frames, strict=True):
+        assert (mine.index, mine.status, mine.reason) == (
+            theirs.index,
+            theirs.status,
+            theirs.reason,
+        )
+        np.testing.assert_allclose(mine.covariance, theirs.covariance)
+    # What was loaded can be saved; but for the refinement, run.json says the same.
+    again.save(tmp_path / "copy")
+    first, second = (
+        json.loads((tmp_path / name / "run.json").read_text()) for name in ("out", "copy")
+    )
+    assert {k for k in first if first[k] != second[k]} <= {"refinement"}
+    assert again.accuracy == result.accuracy
+
+
+def test_saving_refuses_what_is_not_ours(result, tmp_path):
+    (tmp_path / "diary.txt").write_text("dear")
+    with pytest.raises(tofuse.OutputError, match="holds no earlier result"):
+        result.save(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["diary.txt"]
+
+
+@pytest.mark.parametrize("damage", ["no frames", "other poses", "no run.json", "not a folder"])
+def test_what_is_no_result_is_refused_in_one_line(result, tmp_path, damage):
+    folder = tmp_path / "out"
+    result.save(folder)
+    run = json.loads((folder / "run.json").read_text())
+    if damage == "no frames":
+        run["frames"] = 7
+    elif damage == "other poses":
+        run["frames"] = run["frames"][:-1]
+    (folder / "run.json").write_text(json.dumps(run))
+    if damage == "no run.json":
+        (folder / "run.json").unlink()
+    if damage == "not a folder":
+        folder = folder / "cloud.ply"
+    with pytest.raises(tofuse.InputError) as error:
+        tofuse.load(folder)
+    assert "\n" not in str(error.value)
+    assert error.value.remedy
+
+
+def test_evaluate_takes_files_and_arrays(result, arrays, tmp_path):
+    poses = arrays[2]
+    by_array = tofuse.evaluate(result.trajectory, poses).error.ate_rms_m
+    assert by_array == pytest.approx(result.evaluate().error.ate_rms_m)
+    result.save(tmp_path / "out")
+    by_file = tofuse.evaluate(tmp_path / "out", tmp_path / "out" / "trajectory.txt")
+    assert by_file.error.ate_rms_m < 1e-6
+    within = tofuse.evaluate(result.trajectory, poses, reference_error_m=0.01).ate_interval_m
+    assert within == (0.0, pytest.approx(by_array + 0.01))
+    with pytest.raises(tofuse.InputError, match="shape"):
+        tofuse.evaluate(result.trajectory[:, :3], poses)
+    with pytest.raises(tofuse.InputError, match="no reference"):
+        tofuse.load(tmp_path / "out").evaluate()
+
+
+def test_reprs_are_short(result, arrays):
+    recording = tofuse.from_arrays(arrays[0], arrays[1])
+    assert repr(recording) == "Recording: 6 frames of arrays (arrays)"
+    assert repr(recording[2]).startswith("RangeFrame 2: 80 x 60 at 0.067 s")
+    for thing in (result, result.mesh, result.cloud, result.plot()):
+        assert len(repr(thing)) < 120
+    assert repr(result).startswith(f"Result: {result.diagnostics.verdict}")
+    page = result._repr_html_()
+    assert "data:image/png;base64," in page
+    assert len(page) < 400_000
+    assert result.plot()._repr_html_().count("<svg") == 2
+
+
+def test_a_plot_is_saved_as_a_page(result, tmp_path):
+    result.plot().save(tmp_path / "plot.html")
+    assert (tmp_path / "plot.html").read_text().count("<svg") == 2
+
+
+def test_what_was_mapped_frame_by_frame_gets_the_same_methods(arrays):
+    recording = tofuse.from_arrays(arrays[0], arrays[1])
+    mapper = tofuse.Mapper(threads=1)
+    for frame in recording:
+        mapper.push(frame)
+    found = tofuse.Result.of(mapper.finish(), recording)
+    assert isinstance(found, tofuse.Reconstruction)
+    assert "of 6 frames" in found.accuracy
+
+
+def test_progress_is_shown_on_request(arrays, monkeypatch):
+    stages = []
+    monkeypatch.setattr(
+        TerminalProgress, "stage", lambda self, name, total=None: stages.append(name)
+    )
+    recording = tofuse.from_arrays(arrays[0][:2], arrays[1])
+    tofuse.reconstruct(recording, threads=1)
+    assert stages == []
+    tofuse.reconstruct(recording, threads=1, progress=True)
+    assert stages[0] == "tracking"
+
+
+@pytest.mark.parametrize("kind", ["millimetres", "unit", "list", "camera"])
+def test_depth_comes_in_any_form(arrays, kind):
+    depth, K, _ = arrays
+    camera = K
+    options = {}
+    if kind == "millimetres":
+        given = np.round(depth * 1000).astype(np.uint16)
+    elif kind == "unit":
+        given, options = depth * 5000, {"depth_unit_m": 1 / 5000}
+    elif kind == "list":
+        given = [image.tolist() for image in depth]
+    else:
+        given, camera = depth, tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)
+    recording = tofuse.from_arrays(given, camera, **options)
+    frame = recording[1]
+    assert isinstance(frame, RangeFrame)
+    np.testing.assert_allclose(frame.depth, depth[1], atol=6e-4)
+    assert frame.camera.fx == 70
+
+
+def test_images_beside_depth_are_kept(arrays):
+    depth, K, _ = arrays
+    color = np.full((*depth.shape, 3), 90, np.uint8)
+    amplitude = np.arange(depth.size).reshape(depth.shape)
+    hole = depth.copy()
+    hole[0, :2] = np.nan
+    hole[0, 2] = -1
+    recording = tofuse.from_arrays(
+        hole, K, color=color, amplitude=amplitude, timestamps=[0, 1, 2, 3, 4, 7.5]
+    )
+    np.testing.assert_array_equal(recording[3].amplitude_image, amplitude[3])
+    np.testing.assert_array_equal(recording[3].color_image, color[3])
+    assert recording.timestamps[-1] == 7.5
+    assert (recording[0].depth[:3] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"depth": np.ones((60, 80))}, "depth"),
+        ({"depth": []}, "depth"),
+        ({"depth": 3.0}, "depth"),
+        ({"depth": np.full((2, 60, 80), 1500.0)}, "depth_unit_m"),
+        ({"depth": [np.ones((60, 80)), np.ones((60, 81))]}, "depth"),
+        ({"depth": np.full((2, 60, 80), "x")}, "depth"),
+        ({"depth_unit_m": 0.0}, "depth_unit_m"),
+        ({"camera": np.eye(4)}, "camera"),
+        ({"camera": "phone"}, "camera"),
+        ({"camera": [[70, 0, 40], [0, -70, 30], [0, 0, 1]]}, "fy"),
+        ({"camera": tofuse.Pinhole(64, 48, 70, 70, 32, 24)}, "camera"),
+        ({"color": np.ones((6, 60, 80, 3))}, "color"),
+        ({"color": np.ones((5, 60, 80, 3), np.uint8)}, "color"),
+        ({"amplitude": np.ones((6, 30, 40))}, "amplitude"),
+        ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps"),
+        ({"timestamps": [0, 1]}, "timestamps"),
+        ({"reference": np.eye(4)}, "reference"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(arrays, change, named):
+    given = {"depth": arrays[0], "camera": arrays[1], **change}
+    with pytest.raises(tofuse.InputError) as error:
+        tofuse.from_arrays(given.pop("depth"), given.pop("camera"), **given)
+    assert named in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf", "ply", "obj", "stl"])
+def test_a_mesh_is_saved_as_other_programs_read_it(result, tmp_path, suffix):
+    trimesh = pytest.importorskip("trimesh")
+    path = tmp_path / f"model.{suffix}"
+    result.mesh.save(path)
+    read = trimesh.load(path, force="mesh", process=False)
+    flip = 1 if suffix == "ply" else -1  # the others stand with y up
+    mine = result.mesh.vertices + result.mesh.offset
+    np.testing.assert_allclose(
+        np.sort(read.bounds * [1, flip, flip], axis=0), [mine.min(0), mine.max(0)], atol=1e-5
+    )
+    assert len(read.faces) == len(result.mesh.faces)
+    theirs = result.mesh.to_trimesh()
+    assert read.area == pytest.approx(theirs.area, rel=1e-4)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "las", "e57"])
+def test_a_cloud_is_saved_by_its_suffix(result, tmp_path, suffix):
+    if suffix == "e57":
+        pytest.importorskip("pye57")
+    path = tmp_path / f"cloud.{suffix}"
+    result.cloud.save(path)
+    frame = tofuse.open(path)[0]
+    assert len(frame) == len(result.cloud)
+    np.testing.assert_allclose(
+        np.median(frame.points, 0), np.median(result.cloud.points, 0), atol=2e-3
+    )
+
+
+def test_an_unknown_suffix_names_the_known_ones(result, tmp_path):
+    with pytest.raises(tofuse.InputError, match=r"\.glb, \.gltf, \.ply, \.obj, \.stl"):
+        result.mesh.save(tmp_path / "model.docx")
+    with pytest.raises(tofuse.InputError, match=r"\.ply, \.pcd"):
+        result.cloud.save(tmp_path / "model.glb")
+
+
+def test_a_library_that_is_missing_is_named(result, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(tofuse.InputError, match="pip install open3d"):
+        result.mesh.to_open3d()
+
+
+def test_viewing_serves_the_page_until_it_is_stopped(result):
+    pytest.importorskip("viser")
+    from urllib.request import urlopen
+
+    from tofuse.viewer.server import address, stop
+
+    server = result.view(open_browser=False)
+    try:
+        with urlopen(address(server)) as page:
+            assert page.status == 200
+    finally:
+        stop(server)
