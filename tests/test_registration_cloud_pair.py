@@ -15,11 +15,14 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.odometry.pairwise import Pairwise
 from tofuse.recordings.frames import CloudFrame
+from tofuse.registration import cloud_pair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
+from tofuse.registration.cloud_pair import register_clouds
 from tofuse.registration.reduce import averaged
 from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
 from tofuse.simulation import scene as scenes
+from tofuse.simulation.peaks import peaks_views
 from tofuse.simulation.record import plan
 
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
@@ -371,3 +374,18 @@ def test_a_folder_of_scans_becomes_one_model(tmp_path):
         true = se3.inverse(taken[0][0]) @ T
         assert off(result.trajectory[k], true, points)[0] < 0.02
         assert off(result.trajectory[k], true, points)[1] < 0.3
+
+
+def test_what_leads_to_the_same_pose_is_no_rival():
+    """Large noise stops a few iterations far apart; an answer elsewhere stays a rival."""
+    views, truth = peaks_views(0.1, 101)
+    source, target, T = views[1], views[0], se3.inverse(truth[0]) @ truth[1]
+    both = cloud_pair._Views.of(source, target, np.random.default_rng(0))
+    best = both.judged(T)
+    beside = both.judged(T @ se3.exp([0.3, 0, 0, 0, 0.05, 0]))
+    elsewhere = both.judged(T @ se3.exp([0, 0, 0, 0, 0, 2.5]))
+    assert both.differ(beside.T_target_source, T)
+    assert cloud_pair._rival(both, [best, beside, elsewhere], best, T) is elsewhere
+    assert cloud_pair._rival(both, [best, beside], best, T) is cloud_pair._NOWHERE
+    found = register_clouds(source, target, None, np.random.default_rng(0))
+    assert found.probability > 0.5

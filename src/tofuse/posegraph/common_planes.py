@@ -71,7 +71,8 @@ class PlaneOptions:
     divisions
         Ways of cutting the points into the last cells, each shifted; their mean counts.
     robust
-        Residuals beyond so many standard deviations count nothing (Tukey's biweight).
+        Residuals beyond so many standard deviations count nothing (Tukey's biweight; with 4.685 an
+        estimate from normal errors has 95 % of the efficiency of least squares).
     settled
         Iterations end when points move by less, as a share of the size of the cells.
     """
@@ -82,7 +83,7 @@ class PlaneOptions:
     least: int = 10
     flatness: float = 0.6
     divisions: int = 4
-    robust: float = 3.5
+    robust: float = 4.685
     settled: float = 0.002
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ its lead over its rivals.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -185,8 +186,7 @@ def _registered(
     if guess is not None:
         alike = [p for p in poses if p.agreement.score >= best.agreement.score - _LEAD]
         best = min(alike, key=lambda p: _apart(p.T_target_source, guess))
-    others = (p for p in poses if views.differ(p.T_target_source, best.T_target_source))
-    found = _registration(views, best, next(others, _NOWHERE))
+    found = _registration(views, best, poses)
     if guess is None or best.guess is not None or not len(found.unobservable):
         return found
     # What differs along degenerate directions alone stays as in the guess.
@@ -194,7 +194,7 @@ def _registered(
     across = hold.across(se3.inverse(near.T_target_source) @ found.T_target_source)
     if views.differ(near.T_target_source, near.T_target_source @ across):
         return found
-    return _registration(views, near, best)
+    return _registration(views, near, [best])
 
 
 def _power_of_scale(source: Frame, target: Frame) -> int:
@@ -280,10 +280,29 @@ def _polish(size: float) -> tuple[Icp, ...]:
     return plain, replace(plain, rejectors=(MaxDistance(2.0),), stopping=SmallStep(1e-3, 8))
 
 
-def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Registration:
+def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
+    """The first of some poses that is another answer than the best one, which became T (4, 4).
+
+    Where noise is large, poses end far apart that all points would lead to the same one.
+    """
+    averaged = views.there.view, views.here.view
+    for pose in poses:
+        start = pose.T_target_source
+        if not views.differ(start, best.T_target_source):
+            continue
+        try:
+            end = CoarseToFine().at(views.size, *averaged, start, start).T_target_source
+        except RegistrationError:
+            end = start
+        if views.differ(end, T):
+            return pose
+    return _NOWHERE
+
+
+def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = None) -> Registration:
     """Align all points from the best pose, and say what is believed of it.
 
-    Without a rival nothing was compared with it.
+    Its rival is one of the others, best first. Without any nothing was compared with it.
     """
     T = best.T_target_source
     averaged = views.there.view, views.here.view
@@ -293,6 +312,7 @@ def _registration(views: _Views, best: _Pose, rival: _Pose | None = None) -> Reg
         found = replace(found, T_target_source=T)
         after = best
     said = after.agreement
+    rival = None if poses is None else _rival(views, poses, best, after.T_target_source)
     lead = None if rival is None else said.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(found.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well
