@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.experiments.bound import mean_distance, pose_covariances
-from tofuse.experiments.peaks import PoseErrors, peaks_bound, run_peaks
+from tofuse.experiments.bound import mean_distance, mean_distances, pose_covariances
+from tofuse.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_of_one, run_peaks
 from tofuse.geometry import se3
 from tofuse.kernels import planes as kernels
 from tofuse.kernels.threads import threads
@@ -237,6 +237,15 @@ def test_the_bound_of_a_cube_seen_twice():
 def test_the_bound_of_the_peaks_grows_with_the_noise():
     assert peaks_bound(0.1) == pytest.approx(0.046, abs=0.001)
     assert peaks_bound(0.02) == pytest.approx(peaks_bound(0.1) / 5)
+
+
+def test_single_recordings_differ_as_the_first_view_moves_all_others():
+    low, high = peaks_bound_of_one(0.1, (0.05, 0.95))
+    assert low < peaks_bound(0.1) < high
+    assert high > 2 * low
+    # Two views: the distance of the second one alone, halved.
+    C = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+    assert mean_distances(C).mean() == pytest.approx(np.sqrt(8 / np.pi) / 2, rel=0.02)
 
 
 @pytest.mark.parametrize(

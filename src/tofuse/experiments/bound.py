@@ -13,7 +13,7 @@ Bool = NDArray[np.bool_]
 _DRAWS = 20_000
 
 
-def pose_covariances(
+def joint_covariance(
     points: Float64, normals: Float64, seen: Bool, poses: Float64, sigma: float
 ) -> Float64:
     """Cramer-Rao bound of poses from the distances of their points from a surface.
@@ -35,7 +35,7 @@ def pose_covariances(
 
     Returns
     -------
-    (N, 6, 6) covariances of the right perturbations of the poses (m, rad); 0 for the first.
+    (6 N - 6, 6 N - 6) covariance of the right perturbations of all poses but the first (m, rad).
     """
     samples, views = seen.shape
     J = np.zeros((samples, views, 6))
@@ -49,10 +49,29 @@ def pose_covariances(
     J /= np.sqrt(np.maximum(seen.sum(1), 1))[:, None, None]
     rows = J.reshape(samples, -1)
     information = H.reshape(6 * views, 6 * views) - rows.T @ rows
+    return np.asarray(sigma**2 * np.linalg.inv(information[6:, 6:]), np.float64)
+
+
+def pose_covariances(
+    points: Float64, normals: Float64, seen: Bool, poses: Float64, sigma: float
+) -> Float64:
+    """(N, 6, 6) covariances of single poses in `joint_covariance`; 0 for the first."""
+    views = len(poses)
+    joint = joint_covariance(points, normals, seen, poses, sigma)
     C = np.zeros((views, 6, views, 6))
-    inverse = sigma**2 * np.linalg.inv(information[6:, 6:])
-    C[1:, :, 1:] = inverse.reshape(views - 1, 6, views - 1, 6)
+    C[1:, :, 1:] = joint.reshape(views - 1, 6, views - 1, 6)
     return C[np.arange(views), :, np.arange(views)]
+
+
+def mean_distances(joint: Float64) -> Float64:
+    """(D,) mean distances of all positions from the truth, the first's 0, of drawn recordings.
+
+    `joint` is as from `joint_covariance`. What is wrong with the first view moves all the others,
+    so that single recordings differ much.
+    """
+    draws = np.random.default_rng([0]).normal(size=(len(joint), _DRAWS))
+    errors = (np.linalg.cholesky(joint) @ draws).reshape(-1, 6, _DRAWS)[:, :3]
+    return np.asarray(np.linalg.norm(errors, axis=1).sum(0) / (len(errors) + 1), np.float64)
 
 
 def mean_distance(covariances: Float64) -> float:

@@ -8,14 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.experiments.bound import mean_distance, pose_covariances
+from tofuse.experiments.bound import (
+    joint_covariance,
+    mean_distance,
+    mean_distances,
+    pose_covariances,
+)
 from tofuse.geometry import se3
 from tofuse.odometry.sequential import Sequential
+from tofuse.pipeline.methods import default
+from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.build import Measured, chain
 from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.planes import Planes
 from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.icp import algorithm_1
 from tofuse.simulation.peaks import (
@@ -130,13 +138,37 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
     return PoseErrors.of(start, truth), PoseErrors.of(refined, truth)
 
 
+def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
+    """Errors of what `tofuse run` makes of a folder of the views, and how many have a pose.
+
+    Beside the first of these, whose pose is taken to be the true one.
+    """
+    views, truth = peaks_views(sigma, seed)
+    recording = Recording.of(ArraySource(views, truth), "peaks", "simulated")
+    found = reconstruct(recording, default("cloud"), seed=seed)
+    has = found.has_pose
+    first = truth[has][0] @ se3.inverse(found.trajectory[has][0])
+    return PoseErrors.of(first @ found.trajectory[has], truth[has]), int(has.sum())
+
+
 def peaks_bound(sigma: float) -> float:
     """Lowest mean error (m) of the 20 positions that the surface alone allows; see `bound`."""
+    C = pose_covariances(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
+    return mean_distance(C[:, :3, :3])
+
+
+def peaks_bound_of_one(sigma: float, shares: Sequence[float]) -> Float64:
+    """Quantiles (m) of the mean error of a single recording by a method that is at the bound."""
+    C = joint_covariance(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
+    return np.asarray(np.quantile(mean_distances(C), shares), np.float64)
+
+
+def _seen() -> NDArray[np.bool_]:
+    """(points, cameras) what each camera sees."""
     seen = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
     for k, rows in enumerate(peaks_seen()):
         seen[rows, k] = True
-    C = pose_covariances(peaks_points(), peaks_normals(), seen, peaks_cameras(), sigma)
-    return mean_distance(C[:, :3, :3])
+    return seen
 
 
 @dataclass(frozen=True, eq=False)

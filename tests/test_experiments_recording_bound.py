@@ -1,0 +1,59 @@
+"""The bound of a recording: the noise that it rests on, and how it changes with what is seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.experiments.recording_bound import phase_noise, seen_by, trajectory_bounds
+from tofuse.sensor.models import camera_model
+from tofuse.simulation import sensor
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import plan
+
+NOISE = Effects.none(shot_noise=True, ambient=1.0)
+
+
+def test_the_noise_is_that_of_the_simulated_camera():
+    """Range and log amplitude of one light, measured many times."""
+    model = replace(camera_model("sr4000"))
+    light, albedo, turn, ambient = 0.15, 0.6, 1.1, 0.4
+    shape = (model.camera.height, model.camera.width)
+    signal = light * model.transmission
+    taps = np.arange(sensor.TAPS)[:, None, None]
+    exposure = sensor.Exposure(
+        (signal * np.cos(turn - taps * np.pi / 2))[None],
+        np.broadcast_to(signal, (1, sensor.TAPS, *shape)),
+        ambient * albedo * np.sqrt(model.transmission),
+    )
+    rng = np.random.default_rng(0)
+    many = [sensor.expose(model, NOISE, exposure, rng) for _ in range(40)]
+    expected = phase_noise(model, np.full(shape, light), np.full(shape, albedo), NOISE, ambient)
+    per_m = 2 * np.pi / model.period_m
+    ranges = np.std([m.range_m for m in many], axis=0, ddof=1) * per_m
+    levels = np.std([np.log(m.amplitude) for m in many], axis=0, ddof=1)
+    assert np.mean(ranges / expected) == pytest.approx(1, abs=0.02)
+    assert np.mean(levels / expected) == pytest.approx(1, abs=0.02)
+
+
+def test_normals_and_slopes_are_of_what_is_seen():
+    made = plan("empty-room", effects=NOISE, frames=1)
+    view = seen_by(made, int(made.raw[0]))
+    np.testing.assert_allclose(np.linalg.norm(view.normals, axis=1), 1, atol=1e-5)
+    assert ((view.points * view.normals).sum(1) < 0).all()
+    plain = plan("empty-room", effects=NOISE, frames=1, texture=False)
+    # One albedo: no slope of it anywhere.
+    assert np.abs(seen_by(plain, int(plain.raw[0])).slopes).max() < 1e-6
+
+
+def test_albedo_and_light_make_the_bound_lower():
+    made = plan("room", effects=NOISE, frames=4)
+    distances, both = trajectory_bounds(made, share=4)
+    assert 0 < both.mean < distances.mean
+    assert both.low < both.mean < both.high
+    brighter = replace(
+        made, model=replace(made.model, signal_electrons=4 * made.model.signal_electrons)
+    )
+    assert trajectory_bounds(brighter, share=4)[0].mean < 0.55 * distances.mean
