@@ -199,8 +199,8 @@ class _Cells:
         mixed = [np.bincount(at, weight * J[:, q], len(found)) for q in range(_UNKNOWNS)]
         self._cells.append(found)
         self._view.append(np.full(len(found), k, np.int64))
-        self._mixed.append(np.stack(mixed, 1))
-        self._own.append(np.bincount(at, weight, len(found)))
+        self._mixed.append(np.stack(mixed, 1).astype(np.float64))
+        self._own.append(np.bincount(at, weight, len(found)).astype(np.float64))
 
     def information(self) -> Float64:
         """(N UNKNOWNS, N UNKNOWNS) of the views, the surface eliminated."""
