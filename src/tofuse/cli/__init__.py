@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 
 def console() -> int:
@@ -23,14 +23,24 @@ def console() -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    from tofuse.cli.parser import make_parser
-    from tofuse.errors import TofuseError
 
-    try:
+    def command() -> int:
+        from tofuse.cli.parser import make_parser
+
         arguments = make_parser().parse_args(argv)
         status: int = arguments.command(arguments)
         sys.stdout.flush()
         return status
+
+    return told(command)
+
+
+def told(command: Callable[[], int]) -> int:
+    """Return the exit status of a command; what stops it is said in a line."""
+    from tofuse.errors import TofuseError
+
+    try:
+        return command()
     except TofuseError as error:
         print(f"tofuse: {error}", file=sys.stderr)
         return 2

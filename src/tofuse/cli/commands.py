@@ -24,23 +24,40 @@ if TYPE_CHECKING:
 
 _SEVERITIES = {"severe": "red", "warning": "yellow", "note": "cyan"}
 _BELIEFS = {True: "green", False: "red", None: "yellow"}
-_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
+COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
-class _Output(Console):
+class Output(Console):
     """Standard output; a reader that goes away is for `main` to deal with."""
 
     def on_broken_pipe(self) -> None:
+        """See `Console`."""
         raise BrokenPipeError
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``tofuse run``."""
     from tofuse.errors import InputError
-    from tofuse.pipeline.run import Options, exit_status
+    from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
 
-    options = Options(
+    options = run_options(arguments)
+    if arguments.view:
+        return _run_in_view(arguments, options)
+    for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
+        if given:
+            raise InputError("is only for --view", where=name, remedy="give --view as well")
+    with progress_for(as_json=arguments.json) as progress:
+        result = run_pipeline(arguments.inputs, options, progress)
+    tell(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
+def run_options(arguments: argparse.Namespace) -> Options:
+    """What the words of ``tofuse run`` ask for."""
+    from tofuse.pipeline.run import Options
+
+    return Options(
         out=arguments.out,
         method=arguments.method,
         config=arguments.config,
@@ -66,15 +83,6 @@ def run(arguments: argparse.Namespace) -> int:
         voxel=arguments.voxel,
         overwrite=arguments.overwrite,
     )
-    if arguments.view:
-        return _run_in_view(arguments, options)
-    for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
-        if given:
-            raise InputError("is only for --view", where=name, remedy="give --view as well")
-    with progress_for(as_json=arguments.json) as progress:
-        result = run_pipeline(arguments.inputs, options, progress)
-    _tell(result, arguments.out, as_json=arguments.json)
-    return exit_status(result)
 
 
 def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
@@ -88,7 +96,7 @@ def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
         live = LiveView(server)
         with progress_for(as_json=arguments.json) as progress:
             result = run_pipeline(arguments.inputs, options, Both(progress, live))
-        _tell(result, arguments.out, as_json=arguments.json)
+        tell(result, arguments.out, as_json=arguments.json)
         live.finish(arguments.out)
         _wait()
     return exit_status(result)
@@ -131,6 +139,13 @@ def _wait() -> None:
             pass
 
 
+def batch(arguments: argparse.Namespace) -> int:
+    """``tofuse batch``."""
+    from tofuse.cli.batching import batch as run_jobs
+
+    return run_jobs(arguments)
+
+
 def register(arguments: argparse.Namespace) -> int:
     """``tofuse register``."""
     from tofuse.cli import registering
@@ -154,7 +169,7 @@ def register(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
         return exit_status(result)
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     head, tail = belief(result)
     color = _BELIEFS[result.found.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
@@ -192,8 +207,8 @@ def judge(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**plain(found.to_dict()), "out": None if options.out is None else str(options.out)})
         return status
-    console = _Output(highlight=False, soft_wrap=True)
-    console.print(f"[bold {_COLORS[found.verdict]}]{found.verdict}[/]")
+    console = Output(highlight=False, soft_wrap=True)
+    console.print(f"[bold {COLORS[found.verdict]}]{found.verdict}[/]")
     _print_reasons(console, found.reasons)
     console.print(sentence(found, arguments.trajectory.name), markup=False)
     pairs = (("given", found.consistency), ("refined", found.refined_consistency))
@@ -233,11 +248,11 @@ def demo(arguments: argparse.Namespace) -> int:
             overwrite=arguments.overwrite,
             progress=progress,
         )
-    _tell(result, arguments.out, as_json=arguments.json)
+    tell(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
 
 
-def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
+def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Say in a few lines what came out."""
     from tofuse.results.card import SEPARATOR, card
     from tofuse.results.output import accuracy_json, component_name, plain, reasons_json
@@ -261,8 +276,8 @@ def _tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
             }
         )
         return
-    console = _Output(highlight=False, soft_wrap=True)
-    console.print(f"[bold {_COLORS[d.verdict]}]{d.verdict}[/]")
+    console = Output(highlight=False, soft_wrap=True)
+    console.print(f"[bold {COLORS[d.verdict]}]{d.verdict}[/]")
     _print_reasons(console, d.reasons)
     console.print(SEPARATOR.join(card(result)), markup=False)
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
@@ -284,7 +299,7 @@ def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
 
     for reason in ranked(reasons):
         level = REASONS[reason.code][0]
-        console.print(f"  [{_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
+        console.print(f"  [{COLORS[level]}]{level}:[/] {_escape(reason.text)}")
         if reason.code in ADVICE:
             console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
 
@@ -333,7 +348,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit(found.to_dict())
         return 0
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     width = max(map(len, found.facts))
     for name, value in found.facts.items():
         console.print(f"[bold]{name:<{width}}[/]  {_escape(value)}")
@@ -361,7 +376,7 @@ def convert(arguments: argparse.Namespace) -> int:
         done = convert_recording(recording, arguments.out)
     else:
         done = convert_to(recording, arguments.out, arguments.to)
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
     for warning in (*recording.warnings, *done.warnings):
         console.print(f"[yellow]warning:[/] {_escape(warning)}")
@@ -374,7 +389,7 @@ def record(arguments: argparse.Namespace) -> int:
     from tofuse.live.device import device, devices, is_installed
     from tofuse.live.recorder import record as record_stream
 
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     if arguments.device is None:
         table = Table("camera", "needs", "")
         for name, kind in devices().items():
@@ -430,7 +445,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     subjects = {
         "lens": calibrating.lens,
         "depth": calibrating.depth,
@@ -471,7 +486,7 @@ def noise(arguments: argparse.Namespace) -> int:
         label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
         measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
         table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     console.print(table)
     console.print(
         f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} still "
@@ -516,7 +531,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         if m["rms_m"] is not None:
             value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
-    _Output(highlight=False, soft_wrap=True).print(table)
+    Output(highlight=False, soft_wrap=True).print(table)
     return 0
 
 

@@ -23,7 +23,16 @@ exit status:
   2  nothing was written: one line on stderr says why
 """
 
+_EXIT_BATCH = """\
+LIST is a text of one path or glob a line, or a table (.csv, .toml) with a column `recording`
+and options of `tofuse run` as further ones; see docs/batch.md. The same command goes on where
+an earlier one was stopped.
 
+exit status:
+  0  every recording has a result, and every readable frame of them a pose
+  3  there are results, but some recording has none, or some readable frame no pose
+  2  there is no result: one line on stderr says why
+"""
 _VIEWS = """\
 A view is a file with one view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
 a recording, counted from 0.
@@ -71,9 +80,9 @@ class _Help(argparse.HelpFormatter):
         self._action_max_length = 15
 
 
-def make_parser() -> Parser:
-    """Return the parser of the whole command line."""
-    parser = Parser(
+def make_parser(kind: type[Parser] = Parser) -> Parser:
+    """Return the parser of the whole command line, of a kind that may deal with errors its way."""
+    parser = kind(
         prog="tofuse",
         description="Turn recordings of Time-of-Flight cameras into one 3D model and the "
         "camera's trajectory, and say how far the result can be trusted.",
@@ -83,6 +92,7 @@ def make_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"tofuse {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _run(commands)
+    _batch(commands)
     _register(commands)
     _judge(commands)
     _demo(commands)
@@ -212,6 +222,47 @@ def _processing(p: argparse.ArgumentParser) -> None:
 
 def _seed(p: Any) -> None:
     p.add_argument("--seed", type=_seed_number, metavar="N", help="seed of all randomness (0)")
+
+
+def _batch(commands: Any) -> None:
+    p = _command(
+        commands, "batch", "reconstruct many recordings, as jobs of their own", epilog=_EXIT_BATCH
+    )
+    p.add_argument("list", type=Path, metavar="LIST", help="which recordings, and their options")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the results")
+    p.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace results of other options; those of the same are kept all the same",
+    )
+    p.add_argument("--json", action="store_true", help="jobs and outcome as JSON lines")
+    p.add_argument("--only", action="append", metavar="NAME", help="this job; may be repeated")
+    p.add_argument(
+        "--print-jobs", action="store_true", help="do nothing but print a command for each job"
+    )
+    g = p.add_argument_group("who works")
+    who = g.add_mutually_exclusive_group()
+    who.add_argument(
+        "--workers", type=_count, metavar="N", help="jobs at a time, on this machine (1)"
+    )
+    who.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster: tcp://HOST:8786, or its file"
+    )
+    g.add_argument(
+        "--threads",
+        type=_count,
+        metavar="N",
+        help="threads of each job (this machine: all cores, shared by the jobs; Dask: 1)",
+    )
+    g.add_argument(
+        "--memory", type=_bytes, metavar="SIZE", help="what a job needs, as 4GB (not limited)"
+    )
+    g.add_argument(
+        "--retries",
+        type=_seed_number,
+        metavar="N",
+        help="begin a job again so often whose process was killed (3)",
+    )
 
 
 def _register(commands: Any) -> None:
@@ -482,6 +533,15 @@ def _port(text: str) -> int:
     if not 1 <= value <= 65535:
         raise argparse.ArgumentTypeError(f"{text} is not a port from 1 to 65535")
     return value
+
+
+def _bytes(text: str) -> int:
+    from tofuse.batch.jobs import parse_bytes
+
+    try:
+        return parse_bytes(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _whole(text: str) -> int:

@@ -22,6 +22,7 @@ from time import perf_counter
 from typing import Any, BinaryIO, Protocol
 
 from tofuse.errors import OutputError
+from tofuse.files.stamps import Stamp, stamp, stamps_in
 from tofuse.results.output import CHECKPOINT
 
 # While frames are tracked a state is kept this often, and so seldom that it costs little.
@@ -223,21 +224,15 @@ def digest(facts: Mapping[str, Any], files: Iterable[Path], *, without: Path) ->
     """
     stats = []
     for path in files:
-        stats += _stats(path.absolute(), without.absolute())
+        stats += _stamps(path.absolute(), without.absolute())
     text = json.dumps({"facts": facts, "files": stats, "program": _program()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _stats(path: Path, without: Path) -> list[tuple[str, int, int]]:
-    out = []
-    top = path if path.is_dir() else path.parent
-    for folder, folders, names in os.walk(top):
-        here = Path(folder)
-        folders[:] = sorted(f for f in folders if here / f != without) if top == path else []
-        for name in sorted(names):
-            status = (here / name).stat()
-            out.append((str(here / name), status.st_size, status.st_mtime_ns))
-    return out
+def _stamps(path: Path, without: Path) -> list[Stamp]:
+    if path.is_dir():
+        return stamps_in(path, without)
+    return [stamp(each) for each in sorted(path.parent.iterdir()) if each.is_file()]
 
 
 @cache

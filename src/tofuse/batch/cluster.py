@@ -1,0 +1,160 @@
+"""Workers of a Dask cluster, by its scheduler."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from pathlib import Path
+from time import monotonic
+from typing import Any
+from uuid import uuid4
+
+from tofuse.batch.folder import Record
+from tofuse.batch.jobs import Job
+from tofuse.batch.work import Task, work
+from tofuse.batch.workers import Workers
+from tofuse.errors import InputError
+
+_ANSWERS_S = 10.0  # what a scheduler may take for its answer
+_LOOK_S = 1.0  # how often the workers are counted
+
+
+class DaskWorkers(Workers):
+    """Workers of a cluster: each of their threads does one job at a time.
+
+    All of them see the recordings and the output folder at the same paths, and have this version.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Find the scheduler by its address, or by the file that it wrote.
+
+        Raises
+        ------
+        InputError
+            If Dask is not installed, or no scheduler answers.
+        """
+        self._address = address
+        self._client: Any = _connected(address)
+        self._running: set[Future[Record]] = set()
+        self._slots, self._looked = 0, -_LOOK_S
+
+    def check(self, job: Job) -> None:
+        """See `Workers`. A cluster without workers may yet get some."""
+        if job.memory is None:
+            return
+        declared = [w["resources"].get("memory", 0) for w in self._workers()]
+        if declared and max(declared) < job.memory:
+            raise InputError(
+                f"{job.name} asks for {job.memory} bytes, and of the {len(declared)} workers none "
+                f"declares more than {max(declared):.0f}",
+                where=self._address,
+                remedy=f'start them with --resources "memory={job.memory}"',
+            )
+
+    def accepts(self, task: Task) -> bool:
+        """See `Workers`. No more tasks are handed over than there are threads.
+
+        What lies at a worker counts as lost with it each time, though it had not begun.
+        """
+        self._running = {f for f in self._running if not f.done()}
+        if monotonic() - self._looked >= _LOOK_S:
+            self._slots = sum(w["nthreads"] for w in self._workers())
+            self._looked = monotonic()
+        return len(self._running) < self._slots
+
+    def start(self, task: Task) -> Future[Record]:
+        """See `Workers`."""
+        memory = task.job.memory
+        remote = self._client.submit(
+            work,
+            task,
+            key=f"{task.job.name}-{uuid4().hex}",
+            pure=False,
+            resources={} if memory is None else {"memory": memory},
+        )
+        future: Future[Record] = Future()
+        remote.add_done_callback(lambda done: self._hand_over(done, future))
+        self._running.add(future)
+        return future
+
+    def lost(self) -> InputError | None:
+        """See `Workers`."""
+        if self._client.status == "running":
+            return None
+        return InputError(
+            "the scheduler went away",
+            where=self._address,
+            remedy="start it again, and give the same command: it goes on",
+        )
+
+    def close(self) -> None:
+        """See `Workers`. Jobs that workers have begun they end, and their records stay."""
+        self._client.close(timeout=_ANSWERS_S)
+
+    def _workers(self) -> list[dict[str, Any]]:
+        try:
+            return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
+        except OSError:  # `lost` tells
+            return []
+
+    def _hand_over(self, remote: Any, future: Future[Record]) -> None:
+        """Give what a remote future holds to a local one."""
+        try:
+            self._outcome(remote, future)
+        except Exception:  # the scheduler went away between two questions
+            future.cancel()
+            future.set_running_or_notify_cancel()
+
+    def _outcome(self, remote: Any, future: Future[Record]) -> None:
+        from distributed.scheduler import KilledWorker
+
+        if remote.status == "finished":
+            future.set_result(remote.result())
+        elif remote.status == "error":
+            error = remote.exception()
+            if isinstance(error, KilledWorker):
+                future.set_result(Record("", "killed", reason="its workers were killed"))
+            elif isinstance(error, ImportError | AttributeError):
+                future.set_exception(
+                    InputError(
+                        f"can't do jobs of tofuse ({error})",
+                        where=self._address,
+                        remedy="install this version of tofuse for its scheduler and its workers",
+                    )
+                )
+            else:
+                future.set_exception(error)
+        else:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+
+
+def _connected(address: str) -> Any:
+    try:
+        import dask
+    except ImportError as error:
+        raise _not_installed() from error
+    # It would log what is told here in one line. Read when distributed is imported.
+    levels = {"distributed": "critical", "distributed.client": "critical"}
+    with dask.config.set({"logging": levels}):
+        try:
+            import distributed
+        except ImportError as error:
+            raise _not_installed() from error
+    client: Any = distributed.Client
+    where = {"scheduler_file" if Path(address).is_file() else "address": address}
+    try:
+        return client(**where, timeout=_ANSWERS_S, set_as_default=False, name="tofuse")
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(
+            "no Dask scheduler answers there",
+            where=address,
+            remedy="start one by `dask scheduler`, and give the address that it prints",
+        ) from error
+
+
+def _not_installed() -> InputError:
+    return InputError(
+        "needs Dask distributed",
+        where="--scheduler",
+        remedy="pip install 'tofuse[dask]', or give --workers to stay on this machine",
+    )

@@ -1,0 +1,156 @@
+"""`batch.csv` and `batch.html`: what became of the jobs that ended, made anew when one ends."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from urllib.parse import quote
+
+from tofuse._version import __version__
+from tofuse.batch.folder import BatchFolder, Record
+from tofuse.batch.jobs import Job
+from tofuse.files.atomic import write_text
+from tofuse.files.locking import locked
+
+COLUMNS = (
+    "name",
+    "recording",
+    "options",
+    "state",
+    "verdict",
+    "position_m",
+    "relative",
+    "frames",
+    "posed",
+    "seconds",
+    "starts",
+    "peak_bytes",
+    "host",
+    "status",
+    "reason",
+)
+_REFRESH_S = 5  # how often the page looks for new rows
+
+
+@dataclass(frozen=True)
+class Row:
+    """A job that ended, in words.
+
+    Attributes
+    ----------
+    report, picture
+        Addresses of files, from the folder of the page; empty where there are none.
+    tone
+        How it is to be coloured: good, degraded or failed.
+    """
+
+    name: str
+    recording: str
+    options: str
+    report: str
+    picture: str
+    verdict: str
+    tone: str
+    accuracy: str
+    frames: str
+    seconds: str
+    memory: str
+    starts: int
+    reason: str
+
+
+def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
+    """Write both tables from the records in the folder, one process after the other.
+
+    Raises
+    ------
+    OutputError
+        If they can't be written; earlier ones stay.
+    """
+    with locked(folder.lock("")):
+        known = [(job, folder.record(job)) for job in jobs]
+        ended = [(job, record) for job, record in known if record is not None and record.ended]
+        write_text(folder.csv, _csv(ended))
+        running = sum(record is not None and record.state == "running" for _, record in known)
+        write_text(folder.html, _html(ended, len(jobs), running, folder))
+
+
+def _csv(ended: Sequence[tuple[Job, Record]]) -> str:
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(COLUMNS)
+    for job, record in ended:
+        facts = {**vars(record), "name": job.name, "recording": job.recording}
+        facts["options"] = " ".join(job.words)
+        out.writerow(["" if facts[c] is None else facts[c] for c in COLUMNS])
+    return text.getvalue()
+
+
+def _html(
+    ended: Sequence[tuple[Job, Record]], total: int, running: int, folder: BatchFolder
+) -> str:
+    from tofuse.report.html import asset, template
+
+    rows = [_row(job, record, folder) for job, record in ended]
+    counts = Counter(row.tone for row in rows)
+    failed = sum(record.state == "failed" for _, record in ended)
+    facts = [
+        ("recordings", f"{total}"),
+        ("good", f"{counts['good']}"),
+        ("degraded", f"{counts['degraded']}"),
+        ("failed", f"{counts['failed'] - failed}"),
+        ("no result", f"{failed}"),
+    ]
+    if len(ended) < total:
+        facts.append(("to come", f"{total - len(ended)}"))
+    seconds = sum(record.seconds or 0 for _, record in ended)
+    facts.append(("time of all runs", duration(seconds)))
+    return template("batch.html.j2").render(
+        title=folder.path.name,
+        version=__version__,
+        style=asset("style.css"),
+        facts=facts,
+        rows=rows,
+        running=running,
+        refresh=_REFRESH_S if len(ended) < total else None,
+    )
+
+
+def _row(job: Job, record: Record, folder: BatchFolder) -> Row:
+    from tofuse.results.card import length
+
+    done = record.state == "done"
+    accuracy = ""
+    if record.position_m is not None:
+        accuracy = f"±{length(record.position_m)}"
+        accuracy += "" if record.relative is None else f" ({100 * record.relative:.2g} %)"
+    elif done:
+        accuracy = "not bounded"
+    picture = folder.picture(job)
+    return Row(
+        job.name,
+        job.recording,
+        " ".join(job.words),
+        f"{quote(job.name)}/report.html" if done else "",
+        quote(f"{picture.parent.name}/{picture.name}") if done and picture.is_file() else "",
+        record.verdict if done else "no result",
+        record.verdict if done else "failed",
+        accuracy,
+        "" if record.frames is None else f"{record.posed} of {record.frames}",
+        "" if record.seconds is None else duration(record.seconds),
+        "" if record.peak_bytes is None else f"{record.peak_bytes / 1e6:.0f} MB",
+        record.starts,
+        record.reason,
+    )
+
+
+def duration(seconds: float) -> str:
+    """Say a time: "4.2 s", "3 min 20 s", "2 h 5 min"."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"

@@ -1,0 +1,150 @@
+"""One job, where it is to be done: `tofuse run` in a process of its own.
+
+Imports nothing heavy, as workers of a cluster and their scheduler load it.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tofuse._version import __version__
+from tofuse.batch.folder import BatchFolder, Record
+from tofuse.batch.jobs import Job
+from tofuse.files.locking import locked
+
+# It runs the command and ends when its parent does.
+_PROGRAM = "tofuse.cli.job"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A job, and how it is to be done.
+
+    Attributes
+    ----------
+    out
+        Absolute path of the batch's folder.
+    threads
+        That its run may use.
+    version
+        Of the program that asks for it.
+    """
+
+    job: Job
+    out: str
+    threads: int
+    version: str = __version__
+
+
+def work(task: Task, began: Callable[[subprocess.Popen[bytes]], None] | None = None) -> Record:
+    """Do a job, and leave its record; `began` hears of its process.
+
+    Two that are asked for the same job do it one after the other, and the second finds it done.
+
+    Raises
+    ------
+    OutputError
+        If the record can't be written.
+    """
+    job, folder = task.job, BatchFolder(Path(task.out))
+    if not folder.csv.is_file():
+        return _refused(f"{platform.node()} does not see {task.out}: let all share one file system")
+    if task.version != __version__:
+        return _refused(
+            f"{platform.node()} has tofuse {__version__}, not {task.version}: install that there"
+        )
+    with locked(folder.lock(job.name)) as handle:
+        before = folder.record(job)
+        if before is not None and folder.finished(job):
+            return before
+        record = Record(job.key(folder.path), "running", _starts(before), platform.node())
+        folder.write(job, record)
+        words = [job.recording, f"--out={folder.result(job)}", "--overwrite", *job.words]
+        words.append(f"--threads={task.threads}")
+        with folder.log(job).open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", _PROGRAM, str(folder.picture(job)), *words],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C is for us: what it has so far stays
+                pass_fds=() if sys.platform == "win32" else (handle,),
+            )
+        with process:
+            if began is not None:
+                began(process)
+            assert process.stdout is not None
+            told = process.stdout.read()
+            status = process.wait()
+        record = _ended(record, status, told, folder, job)
+        folder.write(job, record)
+        return record
+
+
+def _refused(reason: str) -> Record:
+    return Record("", "failed", host=platform.node(), reason=reason)
+
+
+def _starts(before: Record | None) -> int:
+    """How often a job was begun since it ended last."""
+    on_its_way = before is not None and before.state in ("running", "killed")
+    return before.starts + 1 if before is not None and on_its_way else 1
+
+
+def _ended(record: Record, status: int, told: bytes, folder: BatchFolder, job: Job) -> Record:
+    """Tell what became of it by what its process said and how it ended."""
+    result: dict[str, Any] = {}
+    for line in told.splitlines():
+        try:
+            result |= json.loads(line)
+        except ValueError:  # cut off
+            continue
+    if status in (0, 3) and "verdict" in result:
+        return _done(replace(record, state="done", status=status), result, folder.digest(job))
+    if status == 2:
+        return replace(record, state="failed", status=status, reason=_last_line(folder.log(job)))
+    if status < 0 or status > 128:
+        reason = f"its process was killed ({_signal(status)})"
+        return replace(record, state="killed", status=status, reason=reason)
+    reason = f"ended with status {status}: {_last_line(folder.log(job))}; see {folder.log(job)}"
+    return replace(record, state="failed", status=status, reason=reason)
+
+
+def _done(record: Record, result: dict[str, Any], run: str) -> Record:
+    accuracy, counts = result["accuracy"], result["frames"]
+    known = accuracy["assessed"] and accuracy["position_m"] is not None
+    return replace(
+        record,
+        run=run,
+        verdict=result["verdict"],
+        reason=result["reasons"][0]["text"] if result["reasons"] else "",
+        position_m=accuracy["position_m"] if known else None,
+        relative=accuracy["relative"] if known else None,
+        frames=sum(counts.values()) - counts["skipped"],
+        posed=result["posed"],
+        seconds=result["seconds"],
+        peak_bytes=result.get("peak_bytes"),
+    )
+
+
+def _last_line(log: Path) -> str:
+    """What a process said last, without the program's name."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    last = next((line for line in reversed(lines) if line.strip()), "nothing was said")
+    return last.strip().removeprefix("tofuse: ")
+
+
+def _signal(status: int) -> str:
+    number = -status if status < 0 else status - 128
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"status {status}"

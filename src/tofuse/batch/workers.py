@@ -1,0 +1,113 @@
+"""Who does the jobs: one small protocol, and processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Protocol
+
+from tofuse.batch.folder import Record
+from tofuse.batch.jobs import Job
+from tofuse.batch.work import Task, work
+from tofuse.errors import InputError
+
+
+class Workers(Protocol):
+    """Do tasks, several at a time."""
+
+    def check(self, job: Job) -> None:
+        """Raise an `InputError` if no worker could ever do this job."""
+        ...
+
+    def accepts(self, task: Task) -> bool:
+        """Whether the task would be begun at once."""
+        ...
+
+    def start(self, task: Task) -> Future[Record]:
+        """Begin a task.
+
+        The future is cancelled where the workers are lost, and else gives what became of the job:
+        `killed` where its worker was.
+        """
+        ...
+
+    def lost(self) -> InputError | None:
+        """Why no worker can be reached any more; None as long as they can."""
+        ...
+
+    def close(self) -> None:
+        """Begin nothing more, and stop what would otherwise go on without anybody to ask for it."""
+        ...
+
+
+class LocalWorkers(Workers):
+    """Processes of this machine."""
+
+    def __init__(self, count: int) -> None:
+        """Let `count` jobs go on at a time, as long as the memory that they ask for is there."""
+        self._count = count
+        self._memory = machine_memory()
+        self._pool = ThreadPoolExecutor(count, thread_name_prefix="tofuse-batch")
+        self._running: dict[Future[Record], int] = {}
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._closed = False
+
+    def check(self, job: Job) -> None:
+        """See `Workers`."""
+        if self._memory is not None and (job.memory or 0) > self._memory:
+            raise InputError(
+                f"{job.name} asks for {job.memory} bytes, and this machine has {self._memory}",
+                where="--memory",
+                remedy="ask for less, or use a larger machine",
+            )
+
+    def accepts(self, task: Task) -> bool:
+        """See `Workers`."""
+        self._running = {f: m for f, m in self._running.items() if not f.done()}
+        held = sum(self._running.values()) + (task.job.memory or 0)
+        room = self._memory is None or held <= self._memory
+        return len(self._running) < self._count and room
+
+    def start(self, task: Task) -> Future[Record]:
+        """See `Workers`."""
+        future = self._pool.submit(work, task, self._began)
+        self._running[future] = task.job.memory or 0
+        return future
+
+    def lost(self) -> None:
+        """See `Workers`."""
+        return
+
+    def close(self) -> None:
+        """See `Workers`. What killed processes have so far stays for the next time."""
+        self._closed = True
+        for process in self._processes:
+            process.kill()
+        self._pool.shutdown(cancel_futures=True)
+
+    def _began(self, process: subprocess.Popen[bytes]) -> None:
+        self._processes = [p for p in self._processes if p.returncode is None]
+        self._processes.append(process)
+        if self._closed:
+            process.kill()
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def machine_memory() -> int | None:
+    """Bytes of memory that this process may use at most; None where that is not known."""
+    if sys.platform == "win32":
+        return None
+    found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:  # of a container
+        return min(found, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    except (OSError, ValueError):
+        return found
