@@ -14,6 +14,8 @@ from tofuse.files.atomic import make_folder, write_text
 
 _UNFINISHED = ".tofuse-"  # what a run that goes on or was killed leaves; see `results.output`
 
+_TEXTS = ("key", "state", "host", "run", "verdict", "reason")
+
 State = Literal["waiting", "running", "done", "failed", "killed"]
 
 
@@ -181,8 +183,14 @@ class BatchFolder:
 
 
 def _record_of(data: Any) -> Record:
+    if not isinstance(data, dict):
+        raise ValueError("it is no table")
     known = {f.name for f in fields(Record)}
     record = Record(**{name: value for name, value in data.items() if name in known})
     if record.state not in get_args(State):
         raise ValueError("its state is not known")
+    for name, value in vars(record).items():
+        kinds = str if name in _TEXTS else int if name == "starts" else int | float | None
+        if not isinstance(value, kinds):
+            raise ValueError(f"its {name} is {value!r}")
     return record

@@ -6,11 +6,12 @@ import csv
 import hashlib
 import io
 import json
+import os
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from glob import glob, has_magic
+from glob import escape, glob, has_magic
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +64,9 @@ class Job:
 
 def _stamps(path: Path, out: Path) -> list[Stamp]:
     """Of a folder, all in it; of a file, itself and what belongs to it, but no other recording."""
-    if path.is_dir():
+    if os.path.isdir(path):
         return stamps_in(path, out)
-    if not path.is_file():
+    if not os.path.isfile(path):
         return []
     own = path.name.split(".")[0]
     beside = sorted(p for p in path.parent.iterdir() if p.name.split(".")[0] == own)
@@ -193,10 +194,12 @@ def _matches(row: _Row, base: Path) -> list[str]:
     """The path itself, be it there or not, or all that a glob finds, in the order of names."""
     if "\0" in row.pattern:
         raise InputError("holds a NUL", where=row.where, remedy="check the file")
-    path = base / Path(row.pattern).expanduser()
-    if not has_magic(row.pattern) or path.exists():
-        return [str(path)]
-    found = sorted((Path(p) for p in glob(str(path), recursive=True)), key=_path_order)
+    pattern = os.path.expanduser(row.pattern)
+    path = os.path.join(base, pattern)
+    if not has_magic(pattern) or os.path.exists(path):
+        return [str(Path(path))]
+    every = glob(os.path.join(escape(str(base)), pattern), recursive=True)
+    found = sorted(map(Path, every), key=_path_order)
     if not found:
         raise InputError(
             f"nothing matches {row.pattern}",
@@ -260,10 +263,10 @@ def parse_bytes(text: str) -> int:
     """
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([kmgt]?i?)b?", text.strip().lower())
     unit = {**_UNITS, **_BINARY}.get(match[2]) if match else None
-    size = 0 if match is None or unit is None else int(float(match[1]) * unit)
-    if not 0 < size < 1 << 60:
+    size = 0.0 if match is None or unit is None else float(match[1]) * unit
+    if not 1 <= size < 1 << 60:
         raise ValueError(f"{text!r} is no amount of memory, such as 4GB")
-    return size
+    return int(size)
 
 
 def _bytes_of(text: str, where: str) -> int:

@@ -34,9 +34,9 @@ def batch(arguments: argparse.Namespace) -> int:
         for job in left:
             print(_command_line(arguments, job))
         return 0
-    folder.prepare()
-    write_table(jobs, folder)
-    if left:
+    if not left:
+        write_table(jobs, folder)  # the list may have changed
+    else:
         try:
             _work(arguments, jobs, left, folder)
         except KeyboardInterrupt:
@@ -82,6 +82,7 @@ def _work(
 ) -> None:
     workers, threads = _workers(arguments, len(left))
     try:
+        folder.prepare()
         with progress_for(as_json=arguments.json) as progress:
             progress.stage("jobs", len(left))
 

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Sequence
 
 _PICTURE = (336, 210)  # pixels
+_NEAR = 0.8  # of the size of the model: so far it is looked at from
 
 
 def main(words: Sequence[str]) -> int:
@@ -47,7 +48,8 @@ def _job(picture: str, words: Sequence[str]) -> int:
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    image = still(make_scene(result, rows), _PICTURE, least=2)
+    scene = make_scene(result, rows)
+    image = still(scene, _PICTURE, eye_at=(scene.center, _NEAR * scene.size), least=2)
     write_bytes(picture, encoded(image, jpeg=True))
     tell(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})

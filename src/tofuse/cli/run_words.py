@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cache
@@ -57,7 +58,9 @@ def run_words(cells: Mapping[str, str], base: Path, where: str) -> tuple[str, ..
             words += [f"--{name}"] * (value.lower() in _YES)
         else:
             path = action.type is Path
-            words.append(f"--{name}={base / Path(value).expanduser() if path else value}")
+            words.append(
+                f"--{name}={os.path.join(base, os.path.expanduser(value)) if path else value}"
+            )
     _check(tuple(words), where)
     return tuple(words)
 

@@ -1,0 +1,169 @@
+"""Lists of jobs: text and tables, names, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tofuse.batch.jobs import Job, parse_bytes, read_jobs
+from tofuse.cli.run_words import run_words
+from tofuse.errors import InputError
+
+
+def jobs_of(folder: Path, text: str, name: str = "list.txt") -> tuple[Job, ...]:
+    path = folder / name
+    path.write_text(text)
+    return read_jobs(path, run_words)
+
+
+@pytest.fixture
+def recordings(tmp_path: Path) -> Path:
+    for name in ("a/frames9", "a/frames10", "b/frames9", "c#1/recording"):
+        (tmp_path / name).mkdir(parents=True)
+    return tmp_path
+
+
+def test_lines_are_paths_and_globs_from_the_folder_of_the_list(recordings: Path) -> None:
+    found = jobs_of(
+        recordings, "# two\na/frames*   # of a\n\nb/frames9\n/x/y z.bag\nc#1/recording\n"
+    )
+    paths = [recordings / name for name in ("a/frames9", "a/frames10", "b/frames9")]
+    assert [job.recording for job in found] == [
+        *map(str, paths),
+        "/x/y z.bag",
+        f"{recordings}/c#1/recording",
+    ]
+    assert [job.name for job in found] == ["frames9", "frames10", "b-frames9", "y_z.bag", "c_1"]
+    assert all(job.words == () for job in found)
+
+
+def test_a_recording_of_two_patterns_is_taken_once(recordings: Path) -> None:
+    found = jobs_of(recordings, "a/*\n*/frames9\n")
+    assert [job.name for job in found] == ["frames9", "frames10", "b-frames9"]
+
+
+def test_names_stay_when_a_list_grows(recordings: Path) -> None:
+    before = jobs_of(recordings, "a/frames9\n")
+    assert jobs_of(recordings, "a/frames9\nb/frames9\n")[0] == before[0]
+
+
+def test_names_are_told_apart_in_any_case(tmp_path: Path) -> None:
+    found = jobs_of(tmp_path, "/One\n/one\n/jobs\n/batch.csv\n/..hidden\n/con:x\n")
+    names = [job.name for job in found]
+    assert len({name.lower() for name in names}) == len(names)
+    assert names == ["One", "one-2", "jobs-2", "batch.csv-2", "_hidden", "con_x"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (
+            "list.csv",
+            "recording,name,every,max-depth,object,config,memory\n"
+            "a/frames9,,2,,yes,c.toml,\na/frames9,far,,4.5,no,,2GB\n",
+        ),
+        (
+            "list.toml",
+            '[[job]]\nrecording = "a/frames9"\nevery = 2\nobject = true\nconfig = "c.toml"\n'
+            '[[job]]\nrecording = "a/frames9"\nname = "far"\nmax_depth = 4.5\nmemory = "2GB"\n',
+        ),
+    ],
+)
+def test_tables_have_options(name: str, text: str, recordings: Path) -> None:
+    one, other = jobs_of(recordings, text, name)
+    assert set(one.words) == {"--every=2", "--object", f"--config={recordings / 'c.toml'}"}
+    assert (one.name, one.memory) == ("frames9", None)
+    assert other == Job("far", one.recording, ("--max-depth=4.5",), 2_000_000_000)
+
+
+def test_all_jobs_of_a_toml_can_share_options(recordings: Path) -> None:
+    text = '[all]\nevery = 2\nseed = 1\n[[job]]\nrecording = "a/*"\nseed = 3\n'
+    found = jobs_of(recordings, text, "list.toml")
+    assert [job.words for job in found] == [("--every=2", "--seed=3")] * 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("list.txt", "# nothing\n", "names no recording"),
+        ("list.txt", "a/nothing*\n", "line 1: nothing matches a/nothing*"),
+        ("list.txt", "a\0b\n", "line 1: holds a NUL"),
+        ("list.csv", "", "names no recording"),
+        ("list.csv", "path\na\n", "row 1: names no recording"),
+        ("list.csv", "recording,recording\na,b\n", "name each once"),
+        ("list.csv", "recording,every\na\n", "row 1: has 1 cells, and there are 2 columns"),
+        ("list.csv", 'recording\n"a\n', "is no table"),
+        ("list.csv", "recording,evry\na,2\n", "for a table; did you mean every?"),
+        ("list.csv", "recording,out\na,b\n", "row 1: out is no option"),
+        ("list.csv", "recording,threads\na,1\n", "row 1: threads is no option"),
+        ("list.csv", "recording,every\na,none\n", "row 1: argument --every: 'none' is not"),
+        ("list.csv", "recording,object\na,perhaps\n", "row 1: object is 'perhaps'; give yes or no"),
+        ("list.csv", "recording,memory\na,much\n", "row 1: memory: 'much' is no amount of memory"),
+        ("list.csv", "recording,name\na,../b\n", "row 1: '../b' can't be the name"),
+        ("list.csv", "recording,name\na,jobs\n", "row 1: 'jobs' can't be the name"),
+        ("list.csv", "recording,name\na,x\nb,X\n", "row 2: the name X comes twice"),
+        ("list.csv", "recording,name\na/*,x\n", "row 1: a/* gives 2 recordings the one name x"),
+        ("list.toml", "recording = 1\n", "has recording where only [all] and [[job]] may be"),
+        ("list.toml", "[[job]]\nrecording = [1]\n", "job 1: recording is [1]"),
+        ("list.toml", "job = [1]\n", "job 1: is no table"),
+        ("list.toml", "[[job\n", "is not TOML"),
+    ],
+)  # fmt: skip
+def test_bad_lists_are_refused(name: str, text: str, said: str, recordings: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        jobs_of(recordings, text, name)
+    assert said in str(caught.value)
+    assert str(caught.value).startswith(str(recordings / name))
+
+
+def test_unreadable_lists_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="doesn't exist"):
+        read_jobs(tmp_path / "none.txt", run_words)
+    with pytest.raises(InputError, match="is a folder"):
+        read_jobs(tmp_path, run_words)
+    (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="is not text"):
+        read_jobs(tmp_path / "list.txt", run_words)
+
+
+def test_a_key_tells_recordings_and_options_apart(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    bag, other = tmp_path / "one.bag", tmp_path / "two.bag"
+    for path in (bag, other):
+        path.write_bytes(b"1")
+    job = Job("one", str(bag))
+    key = job.key(out)
+    assert Job("other", str(bag)).key(out) == key
+    assert Job("one", str(bag), ("--seed=1",)).key(out) != key
+    assert Job("one", str(other)).key(out) != key
+    other.write_bytes(b"another recording")
+    (tmp_path / "three.bag").write_bytes(b"2")
+    assert job.key(out) == key
+    (tmp_path / "camera.json").write_text("{}")
+    assert job.key(out) != key
+    config = tmp_path / "c.toml"
+    config.write_text("")
+    configured = Job("one", str(bag), (f"--config={config}",))
+    before = configured.key(out)
+    config.write_text("seed = 1")
+    assert configured.key(out) != before
+    folder = Job("all", str(tmp_path))
+    before = folder.key(out)
+    out.mkdir()
+    (out / "batch.csv").write_text("")
+    assert folder.key(out) == before
+    assert Job("none", "/nothing").key(out)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("4GB", 4_000_000_000), ("1.5 mb", 1_500_000), ("2GiB", 2 << 30), ("7", 7)]
+)
+def test_amounts_of_memory(text: str, size: int) -> None:
+    assert parse_bytes(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1GB", "4 PB", "nan", "1e3", "9" * 400 + "GB"])
+def test_no_amounts_of_memory(text: str) -> None:
+    with pytest.raises(ValueError, match="no amount of memory"):
+        parse_bytes(text)

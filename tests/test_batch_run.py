@@ -1,0 +1,325 @@
+"""The loop of a batch, its records and its tables, with workers that do as they are told."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, Future
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tofuse.batch import batch as loop
+from tofuse.batch.batch import pending, run_batch, status_of
+from tofuse.batch.folder import BatchFolder, Record
+from tofuse.batch.jobs import Job
+from tofuse.batch.table import COLUMNS, duration, write_table
+from tofuse.batch.work import Task
+from tofuse.batch.workers import LocalWorkers, Workers
+from tofuse.cli import main
+from tofuse.errors import InputError, OutputError
+
+Outcome = Callable[[Task], Record]
+JOBS = tuple(Job(name, f"/{name}") for name in ("a", "b", "c"))
+
+
+def done(task: Task, verdict: str = "good", status: int = 0, **more: object) -> Record:
+    """Leave a result as a process would."""
+    folder = BatchFolder(Path(task.out))
+    folder.result(task.job).mkdir(exist_ok=True)
+    (folder.result(task.job) / "run.json").write_text(json.dumps({"job": task.job.name}))
+    record = Record(
+        task.job.key(folder.path), "done", status=status, run=folder.digest(task.job),
+        verdict=verdict, frames=8, posed=8, seconds=1.5, **more,
+    )  # fmt: skip
+    folder.write(task.job, record)
+    return record
+
+
+def killed(task: Task) -> Record:
+    return Record(task.job.key(Path(task.out)), "killed", reason="its process was killed (SIGKILL)")
+
+
+def failed(task: Task) -> Record:
+    return Record(task.job.key(Path(task.out)), "failed", status=2, reason="is broken")
+
+
+def cancelled(task: Task) -> Record:
+    raise CancelledError
+
+
+class Scripted(Workers):
+    """Do at once what the script says of the next start of a job, else finish it; one at a time."""
+
+    def __init__(self, script: dict[str, Sequence[Outcome]] | None = None) -> None:
+        self.script = {name: list(steps) for name, steps in (script or {}).items()}
+        self.started: list[str] = []
+        self.gone: InputError | None = None
+        self.busy = False
+
+    def check(self, job: Job) -> None:
+        pass
+
+    def accepts(self, task: Task) -> bool:
+        return not self.busy
+
+    def start(self, task: Task) -> Future[Record]:
+        self.started.append(task.job.name)
+        self.busy = True
+        steps = self.script.get(task.job.name) or [done]
+        future: Future[Record] = Future()
+        try:
+            future.set_result(steps.pop(0)(task))
+        except CancelledError:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+        return future
+
+    def lost(self) -> InputError | None:
+        self.busy = False  # the loop has heard of it when it asks this
+        return self.gone
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> BatchFolder:
+    made = BatchFolder(tmp_path / "out")
+    made.prepare()
+    return made
+
+
+def run(folder: BatchFolder, workers: Workers, jobs: Sequence[Job] = JOBS, **more) -> list[str]:
+    notes: list[str] = []
+    left = pending(jobs, folder, overwrite=more.pop("overwrite", False))
+    words = {"threads": 1, "retries": 2, "ended": lambda *_: None, "note": notes.append} | more
+    run_batch(jobs, left, folder, workers, **words)
+    return notes
+
+
+def table(folder: BatchFolder) -> list[dict[str, str]]:
+    with folder.csv.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_what_was_killed_is_begun_again(folder: BatchFolder) -> None:
+    workers = Scripted({"a": [killed, killed, done]})
+    notes = run(folder, workers)
+    assert sorted(workers.started) == ["a", "a", "a", "b", "c"]
+    assert [row["state"] for row in table(folder)] == ["done"] * 3
+    assert notes == ["a: its process was killed (SIGKILL); it is begun again"] * 2
+    assert status_of(JOBS, folder) == 0
+
+
+def test_what_is_killed_each_time_is_given_up(folder: BatchFolder) -> None:
+    workers = Scripted({"a": [killed] * 9})
+    run(folder, workers)
+    assert workers.started.count("a") == 3
+    assert table(folder)[0]["state"] == "failed"
+    assert "(SIGKILL), 3 times; was there enough memory?" in table(folder)[0]["reason"]
+    assert status_of(JOBS, folder) == 3
+
+
+def test_what_fails_costs_nobody_else(folder: BatchFolder) -> None:
+    workers = Scripted({"b": [failed]})
+    run(folder, workers)
+    assert workers.started.count("b") == 1
+    assert [row["state"] for row in table(folder)] == ["done", "failed", "done"]
+    assert table(folder)[1]["reason"] == "is broken"
+    assert status_of(JOBS, folder) == 3
+    assert status_of(JOBS[1:2], folder) == 2
+    again = Scripted()
+    run(folder, again)
+    assert again.started == ["b"]
+    assert status_of(JOBS, folder) == 0
+
+
+def test_frames_without_a_pose_are_told(folder: BatchFolder) -> None:
+    run(folder, Scripted({"c": [lambda task: done(task, "degraded", status=3)]}))
+    assert status_of(JOBS, folder) == 3
+
+
+def test_workers_that_go_away_lose_nothing(folder: BatchFolder, monkeypatch) -> None:
+    workers = Scripted({"b": [cancelled], "c": [cancelled]})
+    monkeypatch.setattr(workers, "accepts", lambda _: True)  # all at once
+    workers.gone = InputError("the scheduler went away")
+    with pytest.raises(InputError, match="went away"):
+        run(folder, workers)
+    assert [row["name"] for row in table(folder)] == ["a"]
+    again = Scripted()
+    run(folder, again)
+    assert again.started == ["b", "c"]
+
+
+def test_a_task_that_was_cancelled_is_handed_over_again(folder: BatchFolder) -> None:
+    workers = Scripted({"b": [cancelled]})
+    run(folder, workers)
+    assert workers.started == ["a", "b", "c", "b"]
+
+
+def test_a_worker_that_could_not_write_leaves_a_row(folder: BatchFolder) -> None:
+    run(folder, Scripted({"a": [lambda _: Record("", "failed", reason="it does not see /out")]}))
+    assert table(folder)[0]["reason"] == "it does not see /out"
+
+
+def test_the_table_grows(folder: BatchFolder) -> None:
+    seen: list[int] = []
+    run(folder, Scripted(), ended=lambda *_: seen.append(len(table(folder))))
+    assert seen == [1, 2, 3]
+    assert 'http-equiv="refresh"' not in folder.html.read_text()
+    (row, *_) = table(folder)
+    assert tuple(row) == COLUMNS
+    assert (row["recording"], row["verdict"], row["seconds"]) == ("/a", "good", "1.5")
+
+
+def test_the_page_is_made_anew_while_jobs_are_to_come(folder: BatchFolder) -> None:
+    pages: list[str] = []
+    run(folder, Scripted(), ended=lambda *_: pages.append(folder.html.read_text()))
+    assert ['http-equiv="refresh"' in page for page in pages] == [True, True, False]
+
+
+def test_waiting_for_workers_is_told_once(folder: BatchFolder, monkeypatch) -> None:
+    monkeypatch.setattr(loop, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(loop, "_LOOK_S", 0.001)
+    workers = Scripted()
+    asked: list[Task] = []
+
+    def late(task: Task) -> bool:
+        asked.append(task)
+        return len(asked) > 20
+
+    monkeypatch.setattr(workers, "accepts", late)
+    assert run(folder, workers) == ["there is no worker yet: waiting for one"]
+
+
+def test_other_options_need_overwrite(folder: BatchFolder) -> None:
+    run(folder, Scripted())
+    changed = (replace(JOBS[0], words=("--every=2",)), *JOBS[1:])
+    with pytest.raises(OutputError, match="of another recording, or of other options"):
+        run(folder, Scripted(), changed)
+    workers = Scripted()
+    run(folder, workers, changed, overwrite=True)
+    assert workers.started == ["a"]
+
+
+def test_a_result_of_somebody_else_is_not_replaced(folder: BatchFolder) -> None:
+    strange = folder.result(JOBS[0])
+    strange.mkdir()
+    (strange / ".tofuse-unfinished").mkdir()  # of a run that was killed
+    assert pending(JOBS, folder, overwrite=False) == list(JOBS)
+    (strange / "run.json").write_text("{}")
+    with pytest.raises(OutputError, match="give --overwrite"):
+        pending(JOBS, folder, overwrite=False)
+
+
+@pytest.mark.parametrize(
+    "damage", ["{", "[]", "null", '{"key": "", "state": "odd"}', '{"key": 1, "state": "done"}']
+)
+def test_a_damaged_record_counts_for_nothing(damage: str, folder: BatchFolder) -> None:
+    run(folder, Scripted())
+    (folder.jobs / "a.json").write_text(damage)
+    assert folder.record(JOBS[0]) is None
+    assert pending(JOBS, folder, overwrite=True) == [JOBS[0]]
+
+
+def test_a_result_that_was_changed_is_made_anew(folder: BatchFolder) -> None:
+    run(folder, Scripted())
+    (folder.result(JOBS[0]) / "run.json").write_text("{}")
+    (folder.result(JOBS[1]) / "run.json").unlink()
+    assert pending(JOBS, folder, overwrite=False) == list(JOBS[:2])
+
+
+def test_a_folder_that_is_none_of_ours_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(OutputError, match="holds no earlier batch"):
+        BatchFolder(tmp_path).prepare()
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+    with pytest.raises(OutputError, match="is a file"):
+        BatchFolder(tmp_path / "note.txt").prepare()
+
+
+def test_what_others_say_can_not_break_the_page(folder: BatchFolder) -> None:
+    job = Job("a", "/<script>alert(1)</script>", ("--topic=<b>",))
+    record = Record("", "failed", reason='<img src=x onerror="alert(1)">, "x"\n=1')
+    folder.write(job, record)
+    write_table([job], folder)
+    page = folder.html.read_text()
+    assert "<script" not in page
+    assert "<img" not in page
+    assert "&lt;script&gt;" in page
+    (row,) = table(folder)
+    assert (row["recording"], row["reason"]) == (job.recording, record.reason)
+
+
+def test_a_full_disk_is_told_in_a_line(folder: BatchFolder, monkeypatch) -> None:
+    def full(*_args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tofuse.files.atomic.os.replace", full)
+    with pytest.raises(OutputError, match="no space left on device"):
+        run(folder, Scripted())
+
+
+def test_memory_limits_how_many_go_on(monkeypatch) -> None:
+    monkeypatch.setattr("tofuse.batch.workers.machine_memory", lambda: 100)
+    workers = LocalWorkers(4)
+    try:
+        with pytest.raises(InputError, match="asks for 101 bytes, and this machine has 100"):
+            workers.check(replace(JOBS[0], memory=101))
+        tasks = [Task(replace(job, memory=50), "/out", 1) for job in JOBS]
+        for held in (0, 50, 100):
+            assert workers.accepts(tasks[0]) == (held < 100)
+            workers._running[Future()] = 50
+        assert workers.accepts(replace(tasks[0], job=JOBS[0])) == (150 <= 100)
+        workers._running.clear()
+        workers._running.update({Future(): 0 for _ in range(4)})
+        assert not workers.accepts(tasks[0])
+    finally:
+        workers.close()
+
+
+def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "dask", None)
+    (tmp_path / "list.txt").write_text("/a\n")
+    words = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out")]
+    assert main([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'tofuse[dask]'" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--workers", "0"], "0 is not 1 or more"),
+        (["--workers", "1", "--scheduler", "x"], "not allowed with"),
+        (["--memory", "much"], "no amount of memory"),
+        (["--only", "b"], "there is no job b"),
+        (["--wrkers=2"], "--wrkers is not known, --workers is"),
+    ],
+)
+def test_bad_words_are_told_in_a_line(words, said, tmp_path: Path, capsys) -> None:
+    (tmp_path / "list.txt").write_text("/a\n")
+    line = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"), *words]
+    try:
+        status = main(line)
+    except SystemExit as end:
+        status = end.code
+    assert status == 2
+    found = capsys.readouterr().err
+    assert said in found
+    assert found.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(4.21, "4.2 s"), (59.97, "1 min 0 s"), (200, "3 min 20 s"), (7500, "2 h 5 min")],
+)
+def test_durations(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
