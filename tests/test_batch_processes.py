@@ -8,7 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from time import monotonic, sleep
@@ -21,7 +21,6 @@ from tofuse.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
 JOBS = [f"seed-{k}" for k in range(6)]
-# A recording that takes a while, as its process must be met at work.
 WORDS = ("--every", "4", "--threads", "1")
 
 
@@ -151,29 +150,22 @@ def test_an_interrupted_batch_says_what_is_done(
 Started = AbstractContextManager[tuple[str, Callable[[], list[int]]]]
 
 
-@pytest.fixture(params=["LocalCluster", "own processes"])
-def start_cluster(
-    request: pytest.FixtureRequest, measured: ModuleType, tmp_path: Path
-) -> Iterator[Callable[[], Started]]:
-    """Starts a Dask cluster of two workers."""
-    pytest.importorskip("distributed", reason="Dask is not installed")
-    if request.param == "LocalCluster":
-        yield lambda: measured.local_cluster(2)
-    else:
-        yield lambda: measured.own_processes(2, tmp_path / "dask")
+def begun(measured: ModuleType, kind: str, folder: Path) -> Started:
+    """A Dask cluster of two workers."""
+    if kind == "LocalCluster":
+        return measured.local_cluster(2)
+    return measured.own_processes(2, folder)
 
 
+@pytest.mark.parametrize(("kind", "kills"), [("LocalCluster", 2), ("own processes", 10)])
 def test_workers_of_dask_that_are_killed_lose_nothing(
-    start_cluster: Callable[[], Started],
-    measured: ModuleType,
-    listed: Path,
-    alone: Path,
-    tmp_path: Path,
+    kind: str, kills: int, measured: ModuleType, listed: Path, alone: Path, tmp_path: Path
 ) -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
     out = tmp_path / "out"
-    with start_cluster() as (address, pids):
+    with begun(measured, kind, tmp_path / "dask") as (address, pids):
         batch = measured.start_batch(listed, out, "--scheduler", address, "--retries", 10)
-        assert measured.kill_often(batch, pids, 10, 0.5, seed=4) == 10
+        assert measured.kill_often(batch, pids, kills, 0.5, seed=4) == kills
         measured.finish(batch)
     assert same(measured, alone, out)
 
@@ -208,12 +200,15 @@ def test_a_scheduler_that_is_not_there_is_told(
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     monkeypatch.setattr(cluster, "_ANSWERS_S", 1.0)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999", str(listed)):
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
         words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
         assert main(words) == 2
         said = capsys.readouterr().err
         assert said.startswith(f"tofuse: {address}: no Dask scheduler answers there; start one")
         assert said.count("\n") == 1
+    words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
+    assert main(words) == 2
+    assert "is no file that a Dask scheduler wrote" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -228,7 +223,7 @@ def test_workers_without_tofuse_are_told(
         monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
         batch = measured.start_batch(listed, tmp_path / "out", "--scheduler", address)
         _, said = batch.communicate(timeout=120)
-    assert batch.returncode == 2
+    assert batch.returncode == 2, said
     assert "install this version of tofuse for its scheduler and its workers" in said
     assert said.count("\n") == 1
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import os
 from concurrent.futures import Future
-from pathlib import Path
 from time import monotonic
 from typing import Any
 from uuid import uuid4
@@ -13,6 +14,7 @@ from tofuse.batch.jobs import Job
 from tofuse.batch.work import Task, work
 from tofuse.batch.workers import Workers
 from tofuse.errors import InputError
+from tofuse.files.reading import read_text
 
 _ANSWERS_S = 10.0  # what a scheduler may take for its answer
 _LOOK_S = 1.0  # how often the workers are counted
@@ -113,10 +115,10 @@ class DaskWorkers(Workers):
             error = remote.exception()
             if isinstance(error, KilledWorker):
                 future.set_result(Record("", "killed", reason="its workers were killed"))
-            elif isinstance(error, ImportError | AttributeError):
+            elif _unknown_there(error):
                 future.set_exception(
                     InputError(
-                        f"can't do jobs of tofuse ({error})",
+                        f"does not know the jobs of this tofuse ({_first_line(error)})",
                         where=self._address,
                         remedy="install this version of tofuse for its scheduler and its workers",
                     )
@@ -126,6 +128,15 @@ class DaskWorkers(Workers):
         else:
             future.cancel()
             future.set_running_or_notify_cancel()
+
+
+def _unknown_there(error: BaseException) -> bool:
+    """Whether a scheduler or worker could not load what a task is made of."""
+    return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
+
+
+def _first_line(error: BaseException) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _connected(address: str) -> Any:
@@ -141,14 +152,26 @@ def _connected(address: str) -> Any:
         except ImportError as error:
             raise _not_installed() from error
     client: Any = distributed.Client
-    where = {"scheduler_file" if Path(address).is_file() else "address": address}
+    wanted = _from_file(address) if os.path.isfile(address) else address
     try:
-        return client(**where, timeout=_ANSWERS_S, set_as_default=False, name="tofuse")
+        return client(wanted, timeout=_ANSWERS_S, set_as_default=False, name="tofuse")
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             "no Dask scheduler answers there",
             where=address,
             remedy="start one by `dask scheduler`, and give the address that it prints",
+        ) from error
+
+
+def _from_file(path: str) -> str:
+    """The address in a file that a scheduler wrote."""
+    try:
+        return str(json.loads(read_text(path))["address"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            "is no file that a Dask scheduler wrote",
+            where=path,
+            remedy="give the address that it prints",
         ) from error
 
 

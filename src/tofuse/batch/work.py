@@ -18,6 +18,7 @@ from typing import Any
 from tofuse._version import __version__
 from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job
+from tofuse.files.atomic import output_error
 from tofuse.files.locking import locked
 
 # It runs the command and ends when its parent does.
@@ -67,17 +68,7 @@ def work(task: Task, began: Callable[[subprocess.Popen[bytes]], None] | None = N
             return before
         record = Record(job.key(folder.path), "running", _starts(before), platform.node())
         folder.write(job, record)
-        words = [job.recording, f"--out={folder.result(job)}", "--overwrite", *job.words]
-        words.append(f"--threads={task.threads}")
-        with folder.log(job).open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", _PROGRAM, str(folder.picture(job)), *words],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                start_new_session=True,  # Ctrl-C is for us: what it has so far stays
-                pass_fds=() if sys.platform == "win32" else (handle,),
-            )
+        process = _begun(task, folder, handle)
         with process:
             if began is not None:
                 began(process)
@@ -87,6 +78,25 @@ def work(task: Task, began: Callable[[subprocess.Popen[bytes]], None] | None = N
         record = _ended(record, status, told, folder, job)
         folder.write(job, record)
         return record
+
+
+def _begun(task: Task, folder: BatchFolder, lock: int) -> subprocess.Popen[bytes]:
+    """Begin the process of a job, which holds the lock as well."""
+    job = task.job
+    words = [job.recording, f"--out={folder.result(job)}", "--overwrite", *job.words]
+    words.append(f"--threads={task.threads}")
+    try:
+        with folder.log(job).open("wb") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", _PROGRAM, str(folder.picture(job)), *words],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C is for us: what it has so far stays
+                pass_fds=() if sys.platform == "win32" else (lock,),
+            )
+    except OSError as error:
+        raise output_error(error, folder.log(job)) from error
 
 
 def _refused(reason: str) -> Record:

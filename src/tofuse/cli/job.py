@@ -16,7 +16,6 @@ import threading
 from collections.abc import Sequence
 
 _PICTURE = (336, 210)  # pixels
-_NEAR = 0.8  # of the size of the model: so far it is looked at from
 
 
 def main(words: Sequence[str]) -> int:
@@ -42,15 +41,13 @@ def _job(picture: str, words: Sequence[str]) -> int:
     from tofuse.files.atomic import write_bytes
     from tofuse.pipeline.run import exit_status, run
     from tofuse.report.images import encoded
-    from tofuse.report.scene import make_scene, still
+    from tofuse.report.scene import make_scene, small
 
     arguments = make_parser().parse_args(["run", *words])
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
-    scene = make_scene(result, rows)
-    image = still(scene, _PICTURE, eye_at=(scene.center, _NEAR * scene.size), least=2)
-    write_bytes(picture, encoded(image, jpeg=True))
+    write_bytes(picture, encoded(small(make_scene(result, rows), _PICTURE), jpeg=True))
     tell(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})
     return exit_status(result)

@@ -272,6 +272,18 @@ def still(
     return out
 
 
+def small(scene: Scene, size: tuple[int, int]) -> UInt8:
+    """Draw the view of `still` so that the model fills a small picture: (H, W, 3)."""
+    if len(scene.points) == 0:
+        return still(scene, size)
+    framing = images.Framing.around(scene.points, size, yaw=YAW, pitch=PITCH)
+    R, t = framing.T_view_world[:3, :3], framing.T_view_world[:3, 3]
+    # From so far that what is nearest, and looks largest, fits as well.
+    depth = np.ptp(np.percentile(scene.points @ R[2], [0.2, 99.8]))
+    distance = size[1] / (2 * np.tan(0.35) * framing.scale) + 0.5 * float(depth)
+    return still(scene, size, eye_at=(-R.T @ t, distance), least=2)
+
+
 def _sampled(lines: Float64, number: int = 24) -> Float64:
     ends = lines.reshape(-1, 2, 3)
     t = np.linspace(0, 1, number)[None, :, None]
