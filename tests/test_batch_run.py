@@ -14,6 +14,7 @@ import pytest
 
 from tofuse.batch import batch as loop
 from tofuse.batch.batch import pending, run_batch, status_of
+from tofuse.batch.cluster import DaskWorkers
 from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job
 from tofuse.batch.table import COLUMNS, duration, write_table
@@ -193,7 +194,7 @@ def test_waiting_for_workers_is_told_once(folder: BatchFolder, monkeypatch) -> N
         return len(asked) > 20
 
     monkeypatch.setattr(workers, "accepts", late)
-    assert run(folder, workers) == ["there is no worker yet: waiting for one"]
+    assert run(folder, workers) == ["no worker can take a yet: waiting for one"]
 
 
 def test_other_options_need_overwrite(folder: BatchFolder) -> None:
@@ -280,6 +281,26 @@ def test_memory_limits_how_many_go_on(monkeypatch) -> None:
         assert not workers.accepts(tasks[0])
     finally:
         workers.close()
+
+
+def test_memory_is_a_resource_of_dask(monkeypatch) -> None:
+    there = [{"nthreads": 4, "resources": {"memory": 200.0}}, {"nthreads": 2, "resources": {}}]
+    workers = object.__new__(DaskWorkers)
+    workers._address, workers._running, workers._looked = "tcp://there", set(), -10.0
+    monkeypatch.setattr(workers, "_workers", lambda: there)
+    small, large = (replace(JOBS[0], memory=memory) for memory in (100, 201))
+    workers.check(small)
+    with pytest.raises(InputError, match="of the 2 workers none declares more than 200"):
+        workers.check(large)
+    at_a_time = {}
+    for job in (JOBS[0], small, large):
+        workers._running = set()
+        while workers.accepts(Task(job, "/out", 1)):
+            workers._running.add(Future())
+        at_a_time[job.memory] = len(workers._running)
+    assert at_a_time == {None: 6, 100: 2, 201: 0}
+    there.clear()
+    workers.check(large)  # some may come
 
 
 def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys) -> None:

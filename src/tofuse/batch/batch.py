@@ -95,7 +95,7 @@ def run_batch(
             done, _ = wait(running, _LOOK_S, FIRST_COMPLETED)
         else:
             if monotonic() - idle_since > _PATIENCE_S:
-                note("there is no worker yet: waiting for one")
+                note(f"no worker can take {waiting[0].job.name} yet: waiting for one")
                 idle_since = inf
             sleep(_LOOK_S)
             done = set()

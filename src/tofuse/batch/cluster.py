@@ -37,7 +37,8 @@ class DaskWorkers(Workers):
         self._address = address
         self._client: Any = _connected(address)
         self._running: set[Future[Record]] = set()
-        self._slots, self._looked = 0, -_LOOK_S
+        self._seen: list[dict[str, Any]] = []
+        self._looked = -_LOOK_S
 
     def check(self, job: Job) -> None:
         """See `Workers`. A cluster without workers may yet get some."""
@@ -53,15 +54,14 @@ class DaskWorkers(Workers):
             )
 
     def accepts(self, task: Task) -> bool:
-        """See `Workers`. No more tasks are handed over than there are threads.
+        """See `Workers`. No more tasks are handed over than workers can do at a time.
 
         What lies at a worker counts as lost with it each time, though it had not begun.
         """
         self._running = {f for f in self._running if not f.done()}
         if monotonic() - self._looked >= _LOOK_S:
-            self._slots = sum(w["nthreads"] for w in self._workers())
-            self._looked = monotonic()
-        return len(self._running) < self._slots
+            self._seen, self._looked = self._workers(), monotonic()
+        return len(self._running) < sum(_slots(worker, task.job) for worker in self._seen)
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
@@ -128,6 +128,14 @@ class DaskWorkers(Workers):
         else:
             future.cancel()
             future.set_running_or_notify_cancel()
+
+
+def _slots(worker: dict[str, Any], job: Job) -> int:
+    """How many jobs like this a worker can do at a time."""
+    threads = int(worker["nthreads"])
+    if job.memory is None:
+        return threads
+    return min(threads, int(worker["resources"].get("memory", 0) // job.memory))
 
 
 def _unknown_there(error: BaseException) -> bool:

@@ -45,7 +45,7 @@ class Record:
     frames, posed
         Readable frames, and those with a pose.
     seconds
-        What the run took, all its starts together.
+        What the run took, with what it went on from after a kill.
     peak_bytes
         Most memory that its process held.
     """
@@ -88,8 +88,9 @@ class BatchFolder:
         if self.path.exists() and not self.path.is_dir():
             raise OutputError("is a file", where=self.path, remedy="give --out a folder")
         make_folder(self.path)
-        ours = self.jobs.is_dir() and self.csv.is_file()
-        if not ours and any(p != self.jobs for p in self.path.iterdir()):
+        # Hidden files may be of another that prepares it just now.
+        there = {p.name for p in self.path.iterdir() if not p.name.startswith(".")}
+        if there - {self.jobs.name} and not {self.jobs.name, self.csv.name} <= there:
             raise OutputError(
                 "is not empty and holds no earlier batch",
                 where=self.path,
@@ -125,7 +126,7 @@ class BatchFolder:
         return self.jobs / f"{job.name}.jpg"
 
     def lock(self, name: str) -> Path:
-        """A file for `locked`."""
+        """A file for `locked`, by the name of a job."""
         return self.jobs / f".{name}.lock"
 
     def record(self, job: Job) -> Record | None:

@@ -70,7 +70,7 @@ def write_table(jobs: Sequence[Job], folder: BatchFolder) -> None:
     OutputError
         If they can't be written; earlier ones stay.
     """
-    with locked(folder.lock("")):
+    with locked(folder.lock("-table")):
         known = [(job, folder.record(job)) for job in jobs]
         ended = [(job, record) for job, record in known if record is not None and record.ended]
         write_text(folder.csv, _csv(ended))
