@@ -1,0 +1,70 @@
+"""Locks on files, and stamps of files."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from tofuse.errors import OutputError
+from tofuse.files.locking import locked
+from tofuse.files.stamps import stamp, stamps_in
+
+
+def test_one_at_a_time(tmp_path: Path) -> None:
+    inside, most = 0, 0
+
+    def work() -> None:
+        nonlocal inside, most
+        for _ in range(20):
+            with locked(tmp_path / "lock"):
+                inside += 1
+                most = max(most, inside)
+                inside -= 1
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (inside, most) == (0, 1)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="locks of other systems")
+def test_a_process_that_inherits_a_lock_holds_it(tmp_path: Path) -> None:
+    with locked(tmp_path / "lock") as handle:
+        child = subprocess.Popen(
+            [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=(handle,)
+        )
+    taken = threading.Event()
+
+    def take() -> None:
+        with locked(tmp_path / "lock"):
+            taken.set()
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    assert not taken.wait(0.3)
+    child.communicate(b"\n")
+    assert taken.wait(30)
+    thread.join()
+
+
+def test_a_lock_that_can_not_be_made_is_told(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="create its folder first"), locked(tmp_path / "a" / "b"):
+        pass
+
+
+def test_stamps_tell_files_apart(tmp_path: Path) -> None:
+    for name in ("b/2", "b/1", "a", "out/c"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    found = stamps_in(tmp_path, tmp_path / "out")
+    assert [Path(path).name for path, _, _ in found] == ["a", "1", "2"]
+    before = stamp(tmp_path / "a")
+    assert before[1] == 1
+    (tmp_path / "a").write_text("longer")
+    assert stamp(tmp_path / "a") != before
