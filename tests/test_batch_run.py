@@ -303,6 +303,51 @@ def test_memory_is_a_resource_of_dask(monkeypatch) -> None:
     workers.check(large)  # some may come
 
 
+class Remote:
+    """A future of Dask."""
+
+    def __init__(self, status: str, outcome: object = None) -> None:
+        self.status, self.outcome = status, outcome
+
+    def result(self) -> object:
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return self.outcome
+
+    def exception(self) -> object:
+        return self.outcome
+
+
+def test_what_dask_says_is_understood() -> None:
+    scheduler = pytest.importorskip("distributed.scheduler", reason="Dask is not installed")
+    workers = object.__new__(DaskWorkers)
+    workers._address = "tcp://there"
+
+    def handed(status: str, outcome: object = None) -> Future[Record]:
+        future: Future[Record] = Future()
+        workers._hand_over(Remote(status, outcome), future)
+        assert future.done()
+        return future
+
+    record = Record("key", "done")
+    assert handed("finished", record).result() is record
+    killed = handed("error", scheduler.KilledWorker("a", None, 3)).result()
+    assert (killed.state, killed.reason) == ("killed", "its workers were killed")
+    for unknown in (
+        ModuleNotFoundError("No module named 'tofuse'"),
+        RuntimeError("Error during deserialization of the task graph.\nMore of it"),
+    ):
+        error = handed("error", unknown).exception()
+        assert isinstance(error, InputError)
+        assert str(error).startswith("tcp://there: does not know the jobs of this tofuse (")
+        assert "\n" not in str(error)
+    bug = ZeroDivisionError()
+    assert handed("error", bug).exception() is bug
+    assert handed("cancelled").cancelled()
+    # The scheduler went away between two questions.
+    assert handed("finished", OSError("gone")).cancelled()
+
+
 def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setitem(__import__("sys").modules, "dask", None)
     (tmp_path / "list.txt").write_text("/a\n")
