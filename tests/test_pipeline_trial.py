@@ -1,12 +1,14 @@
-"""Corrections that are on trial stay where what they take off is there, and only there."""
+"""Corrections that are on trial are applied where what they take off is there, and only there."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import tofuse
 from tofuse.filters.multipath import Multipath
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.learn import learnt
@@ -33,42 +35,69 @@ def straight() -> Recording:
     return simulate_recording("empty-room", every=6, frames=40, effects=effects)
 
 
-def multipath_of(config: Config) -> list[Multipath]:
-    return [c for c in config.corrections if isinstance(c, Multipath)]
+def multipath_of(config: Config) -> Multipath:
+    (found,) = (c for c in config.corrections if isinstance(c, Multipath))
+    return found
 
 
 def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Recording) -> None:
     listener = Listener()
     config = learnt(from_method("default"), straight, 1, listener)
-    assert not multipath_of(config)
-    assert len(config.corrections) == len(from_method("default").corrections) - 1
+    part = multipath_of(config)
+    assert part.left_out
+    assert not part.trial
+    assert part.seen is not None
+    assert abs(part.seen[0]) < 0.15
     assert [n for n in listener.notes if "multipath is left out" in n]
+    # Views pass as they are.
+    corrector, frame = part.start(), straight[0]
+    assert corrector.apply(frame) is frame
+    assert corrector.alone(frame)
+    # What has been decided is not tried again.
+    assert learnt(config, straight, 1) == config
 
 
 def test_compensation_stays_where_there_is_indirect_light() -> None:
     effects = Effects.none(shot_noise=True, multipath=True)
-    recording = simulate_recording("empty-room", every=6, frames=24, effects=effects)
+    recording = simulate_recording("empty-room", every=6, frames=40, effects=effects)
     listener = Listener()
     config = learnt(from_method("default"), recording, 1, listener)
-    assert multipath_of(config) == [Multipath(trial=False)]
+    part = multipath_of(config)
+    assert part.applied
+    assert part.seen is not None
+    strength, error = part.seen
+    assert 0.2 < strength < 1
+    # What is not known of the strength is in the error of each pixel.
+    assert part.doubt == pytest.approx(math.hypot(Multipath().doubt, error / strength))
     assert not listener.notes
-    # What has passed is not tried again.
     assert learnt(config, recording, 1) == config
 
 
+def test_too_little_to_tell_leaves_the_data_as_they_are(straight: Recording) -> None:
+    listener = Listener()
+    few = straight.select(end=5)
+    config = learnt(from_method("default"), few, 1, listener)
+    assert multipath_of(config) == Multipath(trial=False, applied=False)
+    assert [n for n in listener.notes if "too few views" in n]
+    result = tofuse.reconstruct(few, config)
+    said = [r for r in result.diagnostics.reasons if r.code == "correction_left_out"]
+    assert len(said) == 1
+    assert "multipath" in said[0].text
+
+
 def test_what_is_given_or_asked_for_is_not_tried(straight: Recording) -> None:
-    for part in (Multipath(gain=3000.0), Multipath(trial=False)):
+    for part in (Multipath(gain=3000.0), Multipath(trial=False), Multipath(applied=False)):
         config = replace(from_method("default"), corrections=(part,))
         assert learnt(config, straight, 1).corrections == config.corrections
 
 
-def bent(by: float) -> object:
+def bent(by: float, at: float = 8.0) -> object:
     """Bends images by a bump that is fixed to the camera."""
 
     def made(frame: Frame) -> Frame:
         assert isinstance(frame, RangeFrame)
         rays = frame.camera.rays()
-        bump = 1 + by * np.cos(8 * rays[..., 0]) * np.cos(8 * rays[..., 1])
+        bump = 1 + by * np.cos(at * rays[..., 0]) * np.cos(at * rays[..., 1])
         return replace(frame, depth=(frame.depth * bump).astype(np.float32))
 
     return made
@@ -78,22 +107,41 @@ def plain(frame: Frame) -> Frame:
     return frame
 
 
-def test_bending_harms_and_straightening_does_not(straight: Recording) -> None:
-    harmful = trial(straight, plain, bent(0.02))
-    assert harmful.harms
-    assert harmful.mean > 0.5
-    helpful = trial(straight, bent(0.02), plain)
-    assert not helpful.harms
-    assert helpful.mean < -0.5
-    assert trial(straight, plain, plain).mean == 0
+@pytest.mark.parametrize("there", [0.0, 0.5, 1.0])
+def test_the_strength_is_the_share_of_the_error_that_is_there(
+    straight: Recording, there: float
+) -> None:
+    """A correction takes off a bump of 2 %; so much of it is in the data, or nothing."""
+    spoil, correct = bent(0.02 * there), bent(-0.02)
+    found = trial(straight, spoil, lambda frame: correct(spoil(frame)))
+    assert found.strength == pytest.approx(there, abs=max(3 * found.error, 0.1))
+    assert found.helps == (there > 0)
+
+
+def test_a_correction_of_another_error_does_not_help(straight: Recording) -> None:
+    spoil, correct = bent(0.02, 8.0), bent(-0.02, 21.0)
+    assert not trial(straight, spoil, lambda frame: correct(spoil(frame))).helps
+    worse = bent(0.02)  # the right shape, with the wrong sign
+    assert not trial(straight, spoil, lambda frame: worse(spoil(frame))).helps
+    nothing = trial(straight, plain, plain)
+    assert not nothing.helps
+    assert not nothing.predicted
 
 
 def test_a_trial_needs_several_runs_that_agree() -> None:
-    assert not Trial(()).harms
-    assert not Trial((1.0, 1.1, 1.2)).harms
-    assert Trial((1.0, 1.1, 1.2, 0.9)).harms
-    assert not Trial((1.0, -0.9, 1.4, 0.2)).harms
-    assert not Trial((0.05, 0.05, 0.06, 0.05)).harms  # sure, but too little
+    def of(*strengths: float) -> Trial:
+        return Trial(strengths, (1.0,) * len(strengths))
+
+    assert not Trial((), ()).helps
+    assert not of(0.5, 0.5, 0.5).helps
+    assert of(0.5, 0.6, 0.4, 0.5).helps
+    assert not of(1.5, -0.9, 1.4, -0.2).helps
+    assert not of(0.05, 0.05, 0.06, 0.05).helps  # sure, but too little
+    found = of(0.5, 0.6, 0.4, 0.5)
+    assert found.strength == pytest.approx(0.5)
+    assert found.error == pytest.approx(np.std([0.5, 0.6, 0.4, 0.5], ddof=1) / 2)
+    # Runs in which more is predicted tell more.
+    assert Trial((0.0, 2.0), (1.0, 3.0)).strength == pytest.approx(0.5)
 
 
 def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:
@@ -113,4 +161,4 @@ def test_views_without_amplitude_are_not_tried(straight: Recording) -> None:
             return replace(frame, amplitude_image=None)
 
     config = learnt(from_method("default"), replace(straight, source=Dark()), 1)
-    assert multipath_of(config) == [Multipath(trial=False)]
+    assert multipath_of(config) == Multipath(trial=False)

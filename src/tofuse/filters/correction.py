@@ -64,7 +64,9 @@ class Correction(Protocol):
         Whether it can learn from frames of the whole recording first.
     on_trial
         Whether it may bend what is straight where the error that it takes off is not there, so
-        that it stays only if views do not fit together worse for it.
+        that it stays only where views show this error.
+    left_out
+        Whether a trial has found that it is better left out.
     """
 
     part_kind: ClassVar[str] = "correction"
@@ -80,8 +82,24 @@ class Correction(Protocol):
         """Whether a trial on the recording (`pipeline.trial`) is to decide if it stays."""
         return False
 
-    def tried(self) -> Correction:
-        """Return the correction as it is after a trial that it passed."""
+    @property
+    def left_out(self) -> bool:
+        """Whether it changes nothing, as views did not show in a trial what it corrects."""
+        return False
+
+    def tried(
+        self, helps: bool, strength: float = float("nan"), error: float = float("inf")
+    ) -> Correction:
+        """Return the correction as it is after a trial.
+
+        Parameters
+        ----------
+        helps
+            Whether it is to be applied.
+        strength, error
+            Share of the predicted error that views show, and its standard error; NaN or inf where
+            too little could be compared.
+        """
         return self
 
     def learnt(self, frames: Sequence[Frame]) -> Correction:

@@ -52,8 +52,13 @@ class Multipath(Correction):
         Standard deviation of the correction, as a share of it; neighbouring pixels share its
         error.
     trial
-        Leave it out where neighbouring views of the recording clearly fit together worse with it:
+        Apply it only where overlapping views of the recording clearly disagree as it predicts:
         where there is no such light, it bends what is straight. A gain that is given is trusted.
+    applied
+        Whether anything is corrected: what a trial decides.
+    seen
+        What a trial found: the share of the predicted disagreement that is there, and its standard
+        error; None where there was none, or too little to compare.
     """
 
     gain: float | None = None
@@ -64,6 +69,8 @@ class Multipath(Correction):
     lamp: float = 1.2
     doubt: float = 0.2
     trial: bool = True
+    applied: bool = True
+    seen: tuple[float, ...] | None = None
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
@@ -76,15 +83,33 @@ class Multipath(Correction):
         whole("columns", self.columns, 8, 200)
         at_least("lamp", self.lamp, 1)
         within("doubt", self.doubt, 0, 10)
+        if self.seen is not None and not (len(self.seen) == 2 and np.isfinite(self.seen).all()):
+            raise ValueError(f"seen is {self.seen}, not a strength and its standard error")
 
     @property
     def on_trial(self) -> bool:
         """See `Correction.on_trial`."""
-        return self.trial and self.gain is None
+        return self.trial and self.applied and self.gain is None
 
-    def tried(self) -> Multipath:
-        """See `Correction.tried`."""
-        return replace(self, trial=False)
+    @property
+    def left_out(self) -> bool:
+        """See `Correction.left_out`."""
+        return not self.applied
+
+    def tried(
+        self, helps: bool, strength: float = float("nan"), error: float = float("inf")
+    ) -> Multipath:
+        """See `Correction.tried`.
+
+        The strength itself is not scaled by: what is seen of it is diluted (`pipeline.trial`), and
+        the gain has been found from the recording already. But as far as it is not known, all
+        pixels are wrong by the same share of the correction; and so each of them is by more.
+        """
+        if not np.isfinite([strength, error]).all():
+            return replace(self, trial=False, applied=helps)
+        doubt = float(np.hypot(self.doubt, error / strength)) if helps else self.doubt
+        seen = (float(strength), float(error))
+        return replace(self, trial=False, applied=helps, seen=seen, doubt=doubt)
 
     def start(self) -> MultipathCorrector:
         """See `Correction.start`."""
@@ -115,13 +140,13 @@ class MultipathCorrector(Corrector):
 
     def alone(self, frame: Frame) -> bool:
         """See `Corrector.alone`: so are views that are passed on."""
-        if not isinstance(frame, RangeFrame):
+        if not isinstance(frame, RangeFrame) or not self._options.applied:
             return True
         return _period(frame, self._options.period_m) is None or frame.amplitude_image is None
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. The amplitude loses its indirect share as well."""
-        if not isinstance(frame, RangeFrame):
+        if not isinstance(frame, RangeFrame) or not self._options.applied:
             return frame
         image = light_image(frame, self._options.period_m)
         if image is None:

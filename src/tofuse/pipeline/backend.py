@@ -17,6 +17,7 @@ from tofuse.fusion.pose_errors import with_pose_errors
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.prediction import Prediction, runs, with_prediction
+from tofuse.parts import name_of
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.checks import Evidence, judge
 from tofuse.pipeline.config import Config
@@ -268,7 +269,7 @@ class BackEnd:
             mesh=model.mesh,
             diagnostics=Diagnostics(
                 verdict,
-                ranked([*reasons, *self._about_surface(model)]),
+                ranked([*reasons, *self._about_corrections(), *self._about_surface(model)]),
                 records,
                 loops,
                 self._scatter(closed.sequential),
@@ -428,6 +429,22 @@ class BackEnd:
         out[[e.record.index in self._poses for e in self._log.entries]] = poses
         return out
 
+    def _about_corrections(self) -> tuple[Reason, ...]:
+        """What is to be said where a correction was left out."""
+        names = [name_of(c) for c in self._config.corrections if c.left_out]
+        if not names:
+            return ()
+        text = (
+            f"Left out: the correction {' and '.join(names)}. Overlapping views do not clearly show "
+            "the error that it takes off."
+        )
+        return (Reason("correction_left_out", self._everything, text),)
+
+    @property
+    def _everything(self) -> tuple[tuple[int, int], ...]:
+        entries = self._log.entries
+        return ((entries[0].record.index, entries[-1].record.index),)
+
     def _about_surface(self, model: Model) -> tuple[Reason, ...]:
         """What is to be said where there is no surface."""
         if model.mesh is not None and len(model.mesh):
@@ -435,9 +452,7 @@ class BackEnd:
         text = "The views show no surface of any size: mesh.ply and mesh.glb are empty."
         if model.mesh is None:
             text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
-        entries = self._log.entries
-        everything = ((entries[0].record.index, entries[-1].record.index),)
-        return (Reason("no_surface", everything, text),)
+        return (Reason("no_surface", self._everything, text),)
 
 
 def with_joins(loops: Sequence[ClosedLoop], joins: Sequence[Join]) -> list[ClosedLoop]:

@@ -34,8 +34,8 @@ def learnt(
     """Return the configuration with what its corrections and filters learn from the recording.
 
     Reads up to 30 frames, and only if a part learns at all; and some more for the falloff of the
-    amplitude towards the corners. Corrections that are on trial are left
-    out if views fit together worse with them (`trial`); that reads some tens more.
+    amplitude towards the corners. Corrections that are on trial are applied only where views
+    show what they correct (`trial`); that reads some tens more.
 
     Parameters
     ----------
@@ -83,14 +83,17 @@ def _taught(config: Config, recording: Recording) -> Config:
 
 
 def _tried(config: Config, item: Correction, recording: Recording, progress: Progress) -> Config:
-    """Return the configuration with a correction that has passed its trial, or without it."""
+    """Return the configuration with a correction as it is after its trial."""
     without = replace(config, corrections=tuple(c for c in config.corrections if c is not item))
     ways = _prepared(without), _prepared(config)
-    if _changes(config, recording, *ways) and trial(recording, *ways).harms:
-        words = "neighbouring views fit together worse with it"
-        progress.note(f"the correction {name_of(item)} is left out: {words}")
-        return without
-    kept = tuple(c.tried() if c is item else c for c in config.corrections)
+    if _changes(config, recording, *ways):
+        found = trial(recording, *ways)
+        after = item.tried(found.helps, found.strength, found.error)
+        if after.left_out:
+            progress.note(f"the correction {name_of(item)} is left out: {found.in_words()}")
+    else:
+        after = item.tried(helps=True)
+    kept = tuple(after if c is item else c for c in config.corrections)
     return replace(config, corrections=kept)
 
 
