@@ -1,7 +1,8 @@
 """Errors of range before and after the compensation of multipath, and when it stays.
 
     python benchmarks/multipath.py errors [--corridor folder of sr4000_corridor]
-    python benchmarks/multipath.py trial [--scenes room rail] [--seeds 1] [--no-runs]
+    python benchmarks/multipath.py trial [--scenes room rail] [--first-seed 5] [--frames 40]
+        [--no-runs] [--recordings folder ...]
 
 `errors`. Simulated scenes: |error| against the truth over the pixels that no other gross error
 hits (mixed, wrapped, saturated, smeared), median and 90th percentile, and the median of the signed
@@ -12,10 +13,11 @@ planes through its surfaces, whose truth is 90 degrees.
 The recording has no truth. Its corridor has flat walls that stand at right angles: printed is how
 far the pixels lie from the planes of its large surfaces, and the angles between them.
 
-`trial`. Simulated recordings with all effects, and with all but multipath: whether the trial lets
-the compensation stay, in the whole recording and in five parts of it (halves, the middle half, and
-either every second frame), and the final error of whole runs (ATE rms) that keep it and that leave
-it out.
+`trial`. Simulated recordings with all effects, and with all but multipath: the strength of indirect
+light that the trial sees, with its standard error, and what it decides; the same in five parts of
+the recording (halves, the middle half, and either every second frame), and the final error of whole
+runs (ATE rms) that apply the compensation and that leave it out. `--recordings` are real ones, of
+which only the first is printed.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ from tofuse.simulation.render import render
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
 SCENES = ("corner", "room", "empty-room", "corridor", "box", "torso")
-TRIED = ("room", "empty-room", "corridor", "rail", "box", "torso")
+TRIED = ("room", "empty-room", "one-albedo", "corridor", "rail", "box", "torso")
+PLAIN: dict[str, tuple[str, dict[str, bool]]] = {"one-albedo": ("empty-room", {"texture": False})}
 OBJECTS = ("box", "torso")
 ALBEDOS = (0.2, 0.35, 0.6, 0.9)
 FRAMES = 8
@@ -222,10 +225,18 @@ def surfaces_of(frame: RangeFrame, trusted: NDArray[np.bool_]) -> list[NDArray[n
     return [mask for mask in grouped(normals, points, free, 0.94, 0.06) if mask.sum() > 700]
 
 
-def stays(config: Config, recording: Recording) -> bool:
-    """Whether the compensation is still there after its trial."""
-    tried = learnt(fitted(config, recording), recording, 1)
-    return any(isinstance(item, Multipath) for item in tried.corrections)
+def decided(config: Config, recording: Recording) -> Multipath | None:
+    """The compensation as it is after its trial; None where the configuration has none."""
+    config = learnt(fitted(config, recording), recording, 1)
+    return next((item for item in config.corrections if isinstance(item, Multipath)), None)
+
+
+def in_words(part: Multipath | None) -> tuple[str, str]:
+    """Strength and decision."""
+    if part is None:
+        return "", "none"
+    seen = "too little" if part.seen is None else f"{part.seen[0]:.2f} ± {part.seen[1]:.2f}"
+    return seen, "applied" if part.applied else "left out"
 
 
 def parts(recording: Recording) -> list[Recording]:
@@ -238,9 +249,8 @@ def parts(recording: Recording) -> list[Recording]:
 def final_error(config: Config, recording: Recording, keep: bool) -> str:
     """ATE rms in mm of a whole run that keeps the compensation or leaves it out."""
     chosen = [
-        replace(item, trial=False) if isinstance(item, Multipath) else item
+        replace(item, trial=False, applied=keep) if isinstance(item, Multipath) else item
         for item in config.corrections
-        if keep or not isinstance(item, Multipath)
     ]
     result = reconstruct(recording, replace(config, corrections=tuple(chosen)))
     truth, has = recording.reference, result.has_pose
@@ -253,27 +263,44 @@ def final_error(config: Config, recording: Recording, keep: bool) -> str:
     return f"{ate * 1e3:.1f}{lost}"
 
 
-def tried(scene: str, seed: int, multipath: bool, runs: bool) -> str:
+def tried(scene: str, seed: int, multipath: bool, runs: bool, frames: int | None) -> str:
     """One row of the trial's table."""
     effects = Effects() if multipath else Effects().without("multipath")
-    recording = record.simulate_recording(scene, seed=seed, effects=effects)
+    name, options = PLAIN.get(scene, (scene, {}))
+    every = None
+    if frames is not None:
+        made = record.plan(name, seed=seed, **options)
+        every = made.sequence.stride * max(1, round(len(made.raw) / frames))
+    recording = record.simulate_recording(name, seed=seed, every=every, effects=effects, **options)
     config = resolve(Options(Path("unused"), object=scene in OBJECTS))
-    outcome = "stays" if stays(config, recording) else "left out"
-    pieces = parts(recording)
-    kept = sum(stays(config, piece) for piece in pieces)
-    errors = [final_error(config, recording, keep) if runs else "" for keep in (True, False)]
-    name = f"{scene}, seed {seed}" if seed else scene
-    cells = [name, "yes" if multipath else "no", outcome, f"{kept} of {len(pieces)}", *errors]
+    strength, outcome = in_words(decided(config, recording))
+    cells = [f"{scene}, seed {seed}", "yes" if multipath else "no", strength, outcome]
+    if runs:
+        pieces = parts(recording)
+        found = [decided(config, piece) for piece in pieces]
+        applied = sum(part is not None and part.applied for part in found)
+        errors = [final_error(config, recording, keep) for keep in (True, False)]
+        cells += [f"{applied} of {len(pieces)}", *errors]
     return f"| {' | '.join(cells)} |"
 
 
-def print_trial(scenes: list[str], seeds: int, multipath: list[bool], runs: bool) -> None:
-    print("| recording | multipath | compensation | stays in parts | final, kept | left out |")
-    print("|---|---|---|---|---|---|")
-    for there in multipath:
-        for scene in scenes:
-            for seed in range(seeds):
-                print(tried(scene, seed, there, runs), flush=True)
+def tried_real(path: Path) -> str:
+    """The same of a real recording, of which nobody knows."""
+    config = resolve(Options(Path("unused")))
+    return f"| {path.name} | ? | {' | '.join(in_words(decided(config, open_recording(path))))} |"
+
+
+def print_trial(given: argparse.Namespace) -> None:
+    runs = not given.no_runs
+    more = "| applied in parts | final, applied | left out |" if runs else "|"
+    print(f"| recording | multipath | strength | compensation {more}")
+    print("|---" * (7 if runs else 4) + "|")
+    for there in {"with": [True], "without": [False], "both": [False, True]}[given.effect]:
+        for scene in given.scenes:
+            for seed in range(given.first_seed, given.first_seed + given.seeds):
+                print(tried(scene, seed, there, runs, given.frames), flush=True)
+    for path in given.recordings:
+        print(tried_real(path), flush=True)
 
 
 def main() -> None:
@@ -282,14 +309,16 @@ def main() -> None:
     parser.add_argument("--corridor", type=Path, default=DATA, help="a real recording, in 'errors'")
     parser.add_argument("--scenes", nargs="*", default=TRIED, help="in 'trial'")
     parser.add_argument("--seeds", type=int, default=1, help="in 'trial'")
+    parser.add_argument("--first-seed", type=int, default=0, help="in 'trial'")
+    parser.add_argument("--frames", type=int, help="in 'trial': about so many, spread evenly")
+    parser.add_argument("--recordings", nargs="*", type=Path, default=[], help="in 'trial'")
     parser.add_argument("--effect", choices=["with", "without", "both"], default="both")
     parser.add_argument("--no-runs", action="store_true", help="'trial' without the final errors")
     given = parser.parse_args()
     if given.what == "errors":
         print_errors(given.corridor)
         return
-    there = {"with": [True], "without": [False], "both": [False, True]}[given.effect]
-    print_trial(list(given.scenes), given.seeds, there, not given.no_runs)
+    print_trial(given)
 
 
 def print_errors(folder: Path) -> None:

@@ -19,7 +19,13 @@ from tofuse.kernels.unwrap import STEPS, pass_messages
 from tofuse.recordings.frames import RangeFrame
 from tofuse.sensor.frequencies import combined
 from tofuse.sensor.models import SPEED_OF_LIGHT
-from tofuse.sensor.unwrap import UnwrapOptions, _Blocks, _with_surfaces_moved, count_periods
+from tofuse.sensor.unwrap import (
+    UnwrapOptions,
+    _Blocks,
+    _with_surfaces_moved,
+    count_periods,
+    on_surface,
+)
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import plan
 
@@ -158,6 +164,52 @@ def test_dark_surfaces_alone_prove_nothing() -> None:
     r[15:30, 20:40], light[15:30, 20:40] = 2.0, 0.03 * 3000 / 4
     assert not count_periods(r, light, PERIOD, 3000.0, 0.02).any()
     assert not count_periods(r, light, PERIOD, 0.0, 0.02).any()
+
+
+def with_weak_pixels(r: np.ndarray, weak: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges and light of a grey scene at r, and of pixels that measure nothing: anywhere, dark."""
+    rng = np.random.default_rng(seed)
+    light = 0.5 * 3000 / r**2
+    measured = np.mod(r + rng.normal(0, 0.02, r.shape), PERIOD)
+    measured = np.where(weak, rng.uniform(0, PERIOD, r.shape), measured)
+    light = np.where(weak, rng.exponential(3.0, r.shape), light)
+    return measured.astype(np.float32), light.astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_weak_pixels_at_random_ranges_are_no_wraps(seed: int) -> None:
+    """Alone or side by side: a wrap is a surface."""
+    u = np.arange(176)
+    r = np.where(u < 88, 2.5 + 0.005 * u, 3.2 + 0.002 * u) * np.ones((144, 1))
+    patch = np.zeros(r.shape, bool)
+    patch[30:90, 40:110] = True
+    for weak in (patch, patch & (np.random.default_rng(seed).random(r.shape) < 0.3)):
+        measured, light = with_weak_pixels(r, weak, seed)
+        moved = count_periods(measured, light, PERIOD, 3000.0, 0.02) > 0
+        assert moved[weak].mean() < 0.01
+        assert not moved[~weak].any()
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_surfaces_come_back_from_beyond_the_period_around_weak_pixels(seed: int) -> None:
+    r = 2 + 0.05 * np.arange(144)[:, None] * np.ones((1, 176))
+    weak = np.zeros(r.shape, bool)
+    weak[30:90, 40:110] = True
+    measured, light = with_weak_pixels(r, weak, seed)
+    periods = count_periods(measured, light, PERIOD, 3000.0, 0.02)
+    surface = on_surface(measured, PERIOD)
+    assert surface[~weak].mean() > 0.99
+    assert surface[weak].mean() < 0.05
+    assert (periods == r // PERIOD)[~weak].mean() > 0.99
+    assert (periods > 0)[weak].mean() < 0.05
+
+
+def test_a_surface_that_crosses_the_period_is_one() -> None:
+    r = np.mod(np.linspace(4.0, 6.0, 40)[:, None] * np.ones((1, 30)), PERIOD).astype(np.float32)
+    assert on_surface(r, PERIOD).all()
+    lonely = np.zeros((9, 9), np.float32)
+    lonely[4, 4] = 2.0
+    assert not on_surface(lonely, PERIOD).any()
 
 
 def test_two_frequencies_agree_on_one_range() -> None:

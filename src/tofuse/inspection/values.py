@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.sample import Sample
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.sensor.unwrap import on_surface
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -166,7 +167,8 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
 
     A surface that goes on beyond the camera's period comes back at range 0, so far and near touch;
     and what is that far returns less light than its false range would make it (its apparent
-    albedo, amplitude times the squared range, is small).
+    albedo, amplitude times the squared range, is small). Pixels too weak to be measured come at any
+    range and are dark as well: only those count that make a surface with their neighbours.
     """
     period = sample.period_m
     if period is None:
@@ -174,10 +176,8 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
     seams = dark = valid = lit = 0
     for frame in sample.images:
         r = frame.radial_range
-        late, early = (
-            frame.valid & (r > _LATE * period),
-            frame.valid & (r < _EARLY * period),
-        )
+        surface = on_surface(np.where(frame.valid, r, np.float32(0)), period)
+        late, early = surface & (r > _LATE * period), surface & (r < _EARLY * period)
         for a, b in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
             seams += int(np.count_nonzero((late[a] & early[b]) | (early[a] & late[b])))
         valid += len(frame)
@@ -189,7 +189,8 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
         if not known.any():
             continue
         typical = float(np.median(albedo[known]))
-        dark += int(np.count_nonzero(known & (r < _NEAR * period) & (albedo < _DARK * typical)))
+        near = known & surface & (r < _NEAR * period)
+        dark += int(np.count_nonzero(near & (albedo < _DARK * typical)))
     seam_share, dark_share = seams / max(valid, 1), dark / max(lit, 1)
     if seam_share > _SEAM_SHARE or dark_share > _DARK_SHARE:
         yield Finding(

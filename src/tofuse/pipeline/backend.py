@@ -435,8 +435,8 @@ class BackEnd:
         if not names:
             return ()
         text = (
-            f"Left out: the correction {' and '.join(names)}. Overlapping views do not clearly show "
-            "the error that it takes off."
+            f"Left out: the correction {' and '.join(names)}. Overlapping views do not clearly "
+            "show the error that it takes off."
         )
         return (Reason("correction_left_out", self._everything, text),)
 

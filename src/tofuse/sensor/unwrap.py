@@ -5,6 +5,9 @@ that of a far surface: raw amplitude falls with the squared range, so that the a
 amplitude means at r is too small by (r / (r + P))^2, a factor of thirty at r = 1 m and P = 5 m.
 And it goes on in its neighbours: a floor that leaves one period enters the next.
 
+What is too weak to be measured comes at any range, and would have any number of periods. A surface
+is what pixels measure together (`on_surface`); nothing else is moved, or tells of wraps.
+
 Both are costs of a random field over the image, whose most likely state is found by belief
 propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude). Several frequencies need
 none of that: see `tofuse.sensor.frequencies`.
@@ -36,6 +39,11 @@ _GLOSSY = 0.01
 # are noisy. Less than the last cosine of incidence is not believed.
 _REACH, _WIDE, _STEEPEST = 2, 5, 0.25
 _MOVES = 100
+# Neighbours on one surface differ by less than this share of the period, more than so many of the
+# eight: at random a pixel has so many once in a hundred times (binomial, chance 0.2 each).
+_BESIDE, _TOGETHER = 0.1, 0.5
+# Fewer neighbours than this prove nothing.
+_LEAST_BESIDE = 3
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,34 @@ def white_light(light: Float32, radial_range: Float32, valid: Bool) -> float:
     return float(np.quantile(at_1_m, 1 - _GLOSSY))
 
 
+def on_surface(radial_range: Float32, period_m: float) -> Bool:
+    """Tell which pixels (H, W) measure a surface together with their neighbours.
+
+    Whole periods between them don't count. Pixels without light to speak of are at random ranges,
+    and are on none.
+
+    Parameters
+    ----------
+    radial_range
+        (H, W) in m, 0 where invalid.
+    """
+    seen = radial_range > 0
+    ranges, known = np.pad(radial_range, 1), np.pad(seen, 1)
+    height, width = seen.shape
+    alike = np.zeros(seen.shape, np.int32)
+    beside = np.zeros(seen.shape, np.int32)
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            if not (down or right):
+                continue
+            at = np.s_[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+            away = ranges[at] - radial_range
+            away -= period_m * np.rint(away / period_m)
+            beside += known[at]
+            alike += known[at] & (np.abs(away) < _BESIDE * period_m)
+    return np.asarray(seen & (beside >= _LEAST_BESIDE) & (alike > _TOGETHER * beside), np.bool_)
+
+
 def count_periods(
     radial_range: Float32,
     light: Float32,
@@ -124,7 +160,8 @@ def count_periods(
     if white <= 0 or not (radial_range > 0).any():
         return out
     side = max(1, round(radial_range.shape[1] / options.columns))
-    blocks = _Blocks.of(radial_range, light, period_m, side)
+    surfaces = np.where(on_surface(radial_range, period_m), radial_range, np.float32(0))
+    blocks = _Blocks.of(surfaces, light, period_m, side)
     unary = _unlikely(blocks, period_m, white, pitch * side, options)
     messages = np.zeros((4, *unary.shape), np.float32)
 
@@ -139,7 +176,7 @@ def count_periods(
     best = np.argmin(unary + messages.sum(0), axis=2)
     best = _with_surfaces_moved(blocks, unary, best, period_m, options)
     best = _entered(blocks, best, period_m, options)
-    return _of_pixels(radial_range, blocks, best, period_m, side, options.periods)
+    return _of_pixels(surfaces, blocks, best, period_m, side, options.periods)
 
 
 @dataclass(frozen=True, eq=False)
