@@ -233,8 +233,8 @@ def decided(config: Config, recording: Recording) -> Multipath | None:
 
 def in_words(part: Multipath | None) -> tuple[str, str]:
     """Strength and decision."""
-    if part is None:
-        return "", "none"
+    if part is None or (part.applied and part.seen is None):
+        return "", "nothing that it works on"
     seen = "too little" if part.seen is None else f"{part.seen[0]:.2f} ± {part.seen[1]:.2f}"
     return seen, "applied" if part.applied else "left out"
 

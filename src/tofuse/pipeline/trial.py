@@ -52,7 +52,7 @@ _FARTHEST = 64
 # holds fewer directions is none.
 _FITS, _LEAST_HELD = 0.3, 3
 # Fewest runs that can tell, and the chance that they do by luck.
-_LEAST_RUNS, _LUCK = 4, 0.02
+_LEAST_RUNS, _LUCK = 4, 0.05
 # Strength that other errors fake: what lens and smoothing do to corners looks like indirect light.
 # In simulated rooms without any it is up to 0.12, with it 0.2 and more.
 _FAKED = 0.15
