@@ -80,7 +80,7 @@ class Unwrap(Correction):
         if known is None:
             return 0.0
         radial, light, period = known
-        pitch = _pitch(frame)
+        pitch = pixel_pitch(frame)
         periods = count_periods(radial, light, period, white, pitch, self.options)
         return white_light(light, (radial + periods * period).astype(np.float32), radial > 0)
 
@@ -102,7 +102,7 @@ class UnwrapCorrector(Corrector):
             return frame
         radial, light, period = known
         white = self.part.white or 0.0
-        periods = count_periods(radial, light, period, white, _pitch(frame), self.part.options)
+        periods = count_periods(radial, light, period, white, pixel_pitch(frame), self.part.options)
         if not periods.any():
             return frame
         factor = np.where(periods > 0, 1 + periods * period / np.where(radial > 0, radial, 1), 1)
@@ -132,7 +132,7 @@ def wrapped_light(frame: Frame, period_m: float | None) -> tuple[Float32, Float3
     return radial, light.astype(np.float32), image.period_m
 
 
-def _pitch(frame: Frame) -> float:
+def pixel_pitch(frame: Frame) -> float:
     """Angle between neighbouring pixels in the middle of the image, rad."""
     assert isinstance(frame, RangeFrame)
     rays = frame.camera.rays()

@@ -26,6 +26,7 @@ from tofuse.kernels.blocks import (
 from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import integrate, near_cubes, open_view, settle_free
+from tofuse.kernels.visibility import count_witnesses, mark_covered
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -171,6 +172,7 @@ class Volume:
         cells = np.empty((count, *grid, 3), np.float32)
         coarse = np.empty((count, *-(-grid // 4), 3), np.float32)
         channels = self.color.shape[2]
+        backs = _backs(self.reach_m)
         light = np.zeros((count, rows * columns, channels), np.float32)
 
         def open_views(a: int, b: int) -> None:
@@ -185,6 +187,7 @@ class Volume:
                     projection.rays,
                     projection.frame,
                     self.reach_m,
+                    backs,
                     heights[s],
                     codes[s],
                     cells[s],
@@ -212,6 +215,7 @@ class Volume:
                 heights,
                 codes,
                 DECODED,
+                backs,
                 near,
                 self.added,
                 self.turns,
@@ -236,10 +240,13 @@ class Volume:
         )
         self.added += count
 
-    def surface(self, min_views: int = 1) -> Mesh:
+    def surface(
+        self, min_views: int = 1, views: Sequence[RangeView] = (), poses: Float64 | None = None
+    ) -> Mesh:
         """Return where the distances change sign, between voxels that views saw.
 
-        What is not known to within a few voxels is left out: there noise makes the surface.
+        What is not known to within a few voxels is left out: there noise makes the surface. With
+        the views and their poses (N, 4, 4) so is what they could not have seen, see `_refuted`.
         """
         blocks = len(self.keys)
         run_chunks(
@@ -274,7 +281,7 @@ class Volume:
         normals = np.empty((total, 3), np.float32)
         tints = np.empty((total, channels), np.float32)
         sigma = np.empty(total, np.float32)
-        views = np.empty(total, np.int32)
+        seen_by = np.empty(total, np.int32)
         run_chunks(
             lambda a, b: make_vertices(
                 self.keys,
@@ -290,7 +297,7 @@ class Volume:
                 normals,
                 tints,
                 sigma,
-                views,
+                seen_by,
                 a,
                 b,
             ),
@@ -298,12 +305,83 @@ class Volume:
             _CHUNKS,
         )
         faces = self._faces(neighbours, cells, starts, points)
+        if poses is not None and total:
+            rows = np.repeat(np.arange(blocks, dtype=np.int32), counts)
+            refuted = self._refuted(views, poses, points, normals, rows, neighbours)
+            faces = faces[~refuted[faces].any(1)]
         color = None
         if channels == 3:
             color = np.round(tints).clip(0, 255).astype(np.uint8)
         elif channels:
             color = grey_of(tints[:, 0].astype(float) ** 2)
-        return Mesh(points.astype(np.float32), faces, normals, color, sigma, views, np.zeros(3))
+        return Mesh(points.astype(np.float32), faces, normals, color, sigma, seen_by, np.zeros(3))
+
+    def _refuted(
+        self,
+        views: Sequence[RangeView],
+        poses: Float64,
+        points: Float64,
+        normals: Float32,
+        blocks: NDArray[np.int32],
+        neighbours: NDArray[np.int32],
+    ) -> NDArray[np.bool_]:
+        """Which vertices (N,) the views that measured them would have seen through a surface.
+
+        What lies behind a surface is contradicted by nobody, as no view sees it: what a wrong pixel
+        puts there would stay. But there are no witnesses either. Where most of the weight of those
+        who measured a vertex comes through the back of another surface, they were wrong.
+        """
+        covered = np.zeros(len(points), bool)
+        run_chunks(
+            lambda a, b: mark_covered(
+                self.keys,
+                neighbours,
+                blocks,
+                self.voxel_m,
+                self.distance,
+                self.weight,
+                points,
+                normals,
+                covered,
+                a,
+                b,
+            ),
+            len(points),
+            _CHUNKS,
+        )
+        chosen = np.flatnonzero(covered)
+        asked, facing = points[chosen], normals[chosen]
+        votes = np.zeros((len(chosen), 2))
+        T_camera_world = np.array([se3.inverse(T) for T in poses])
+
+        def ask(a: int, b: int) -> None:
+            for view, T, T_inverse in zip(views, poses, T_camera_world, strict=True):
+                count_witnesses(
+                    asked,
+                    facing,
+                    T,
+                    T_inverse,
+                    view.z,
+                    view.unit,
+                    view.normals,
+                    view.strength,
+                    DECODED,
+                    view.projection.rays,
+                    view.projection.lookup,
+                    view.projection.frame,
+                    self.reach_m,
+                    self.voxel_m,
+                    *self.index,
+                    self.distance,
+                    self.weight,
+                    votes,
+                    a,
+                    b,
+                )
+
+        run_chunks(ask, len(chosen), _CHUNKS)
+        covered[chosen] = votes[:, 1] >= votes[:, 0]
+        return covered
 
     def _faces(
         self,
@@ -338,6 +416,16 @@ class Volume:
         run(counts, np.empty((0, 3), np.int32), fill=False)
         found = np.empty((int(counts.sum()), 3), np.int32)
         return run(np.cumsum(counts) - counts, found, fill=True)
+
+
+def _backs(reach: float) -> Float32:
+    """(256,) how far behind its surface a pixel matters, m, by the code of its weight.
+
+    It has to be surely behind. If a noisy pixel were not heard there, any other one that errs to
+    the back would make a surface of its own.
+    """
+    sigma = 1 / np.sqrt(np.maximum(DECODED, np.float32(1e-12)))
+    return np.where(DECODED > 0, np.maximum(_REACH_SIGMAS * sigma, reach), reach).astype(np.float32)
 
 
 def _straight_nodes(lookup: Float32) -> float:
@@ -425,4 +513,4 @@ def fuse_surface(
     options = options or Fusion()
     volume = Volume.around(views, poses, options.voxel_m or fitting_voxel(views), options)
     volume.add(views, poses, advance)
-    return volume.surface(options.min_views).without_islands(options.island)
+    return volume.surface(options.min_views, views, poses).without_islands(options.island)

@@ -101,7 +101,7 @@ class RangeView:
         )  # fmt: skip
         mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
         valid = _reduced(frame.valid.astype(np.float32), shape) >= 0.5
-        valid |= measured & _widened(valid.view(np.uint8), 1)
+        valid |= measured & _widened(valid.view(np.uint8), 1) & (jump == 0)
         z = np.where(valid, smoothed, np.float32(0))
         good = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
         normals = np.empty((*shape, 3), np.int8)

@@ -222,6 +222,7 @@ def open_view(
     rays: Float32,
     lookup_frame: Float64,
     reach: float,
+    backs: Float32,
     heights: Float32,
     codes: Int32,
     cells: Float32,
@@ -238,6 +239,8 @@ def open_view(
         `weights` (256,) has; 0 where nothing is to be believed.
     rays, lookup_frame
         Of the view's `Projection`.
+    reach, backs
+        How far before a surface it matters, and (256,) how far behind it, by the code of the weight.
     heights, codes
         (H W + 1,) get h of the pixel's plane n . p = h, and n and the code of its weight in four
         bytes. The last one stands for all that is not in the image.
@@ -274,7 +277,7 @@ def open_view(
             cells[j, i, 2] = min(cells[j, i, 2], w)
             if w > 0:
                 cells[j, i, 0] = min(cells[j, i, 0], depth - reach / along)
-                cells[j, i, 1] = max(cells[j, i, 1], depth + reach / along)
+                cells[j, i, 1] = max(cells[j, i, 1], depth + backs[code] / along)
     coarse[..., 0] = np.inf
     coarse[..., 1] = -np.inf
     coarse[..., 2] = np.inf
@@ -396,6 +399,7 @@ def integrate(
     heights: Float32,
     codes: Int32,
     weights: Float32,
+    backs: Float32,
     near: NDArray[np.uint8],
     first: int,
     turns: int,
@@ -418,8 +422,9 @@ def integrate(
     """Add views of one camera, in order, to blocks start..stop.
 
     Voxel (i, j, k) of a block lies at its corner plus (i, j, k) `voxel_m`. Its distance is that to
-    the plane of the pixel that it lands on, cut at `reach`; behind `reach` nothing is known. Blocks
-    come first and views second, so that a block is fetched once for all of them.
+    the plane of the pixel that it lands on, cut at `reach`. Behind the surface a view knows nothing,
+    from where on it is sure to be behind: `reach`, or more where the pixel is noisy. Blocks come
+    first and views second, so that a block is fetched once for all of them.
 
     Of what is not near to what it saw, a view tells at most that it is free. There only every
     so-many-th view is looked at, in turn, and counts so many times.
@@ -428,7 +433,7 @@ def integrate(
     ----------
     T_camera_world
         (V, 4, 4) of the views.
-    heights, codes, weights, cells, coarse
+    heights, codes, weights, backs, cells, coarse
         Of `open_view`, one row for each view.
     near
         (V, B) bits of the eighths of a block that are near to what a view saw.
@@ -472,6 +477,7 @@ def integrate(
     code = np.empty(64, np.int32)
     d = np.empty(64, np.float32)
     w = np.empty(64, np.float32)
+    back = np.empty(64, np.float32)
     centre = np.empty(3, np.float32)
     # The voxels of an eighth as each camera sees them, from its middle.
     offsets = np.empty((len(T_camera_world), 3, 64), np.float32)
@@ -544,9 +550,9 @@ def integrate(
                         centre, offsets[s], lookup, lookup_frame, rows, columns, place, points
                     )
                 voxels = slice(64 * part, 64 * part + 64)
-                _fetch(place, heights[s], codes[s], weights, times, code, d, w)
+                _fetch(place, heights[s], codes[s], weights, backs, times, code, d, w, back)
                 _measure(code, points, d)
-                _average(d, w, reach, distance[b, voxels], weight[b, voxels])
+                _average(d, w, back, reach, distance[b, voxels], weight[b, voxels])
                 _count(d, reach, seen[b, voxels])
                 if light.shape[2]:
                     _tint(place, d, reach, light[s], seen[b, voxels], color[b, voxels])
@@ -558,21 +564,25 @@ def _fetch(
     heights: Float32,
     codes: Int32,
     weights: Float32,
+    backs: Float32,
     times: float,
     code: Int32,
     distance: Float32,
     weight: Float32,
+    back: Float32,
 ) -> None:
     """Fetch the pixels of `place` (64,): `distance` gets their heights.
 
-    Weights are taken so many `times`.
+    Weights are taken so many `times`, and `back` gets how far behind its surface a pixel matters.
     """
     many = np.float32(times)
     for q in range(64):
         at = np.uintp(place[q])
         code[q] = codes[at]
         distance[q] = heights[at]
-        weight[q] = many * weights[np.uintp((codes[at] >> 24) & 0xFF)]
+        known = np.uintp((codes[at] >> 24) & 0xFF)
+        weight[q] = many * weights[known]
+        back[q] = backs[known]
 
 
 @kernel
@@ -589,19 +599,21 @@ def _measure(code: Int32, points: Float32, distance: Float32) -> None:
 def _average(
     new_distance: Float32,
     new_weight: Float32,
+    back: Float32,
     limit: float,
     distance: Float32,
     weight: Float32,
 ) -> None:
     """Add distances to means, without a branch: for several voxels at a time in the processor.
 
-    The new distances are cut at the `limit`, and get it where nothing is known.
+    The new distances are cut at the `limit`, on either side, and get it where nothing is known.
     """
     cut = np.float32(limit)
     for q in range(64):
         d = new_distance[q]
-        new = new_weight[q] if d >= -cut else np.float32(0)
+        new = new_weight[q] if d >= -back[q] else np.float32(0)
         d = d if d < cut and new > 0 else cut
+        d = d if d > -cut else -cut
         total = weight[q] + new
         distance[q] += (d - distance[q]) * (new / max(total, _LEAST_WEIGHT))
         weight[q] = total

@@ -9,6 +9,7 @@ from tofuse.filters.confidence import Confidence
 from tofuse.filters.multipath import Multipath
 from tofuse.filters.neighbours import NeighbourShare
 from tofuse.filters.noise import Noise
+from tofuse.filters.wrapped import Wrapped
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.odometry.pairwise import Pairwise
@@ -79,7 +80,7 @@ def default(kind: ViewKind) -> Config:
         corrections=(Noise(), Multipath()),
         # What the camera itself takes for no measurement is none: phones fill gaps in with guesses.
         filters=(Confidence(minimum=1),),
-        model_filters=(Confidence(minimum=3), NeighbourhoodAngle()),
+        model_filters=(Wrapped(), Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),
         loops=Revisits(),
         # Not for clouds: it believes what a registration says of its errors, and ICP's is too good.

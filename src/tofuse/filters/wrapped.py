@@ -1,0 +1,70 @@
+"""Leave out surfaces beyond the camera's period, which it measures as near ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.filters._options import within
+from tofuse.filters.base import Bool, Filter
+from tofuse.filters.unwrap import pixel_pitch, wrapped_light
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
+
+# So many pixels of a view show how bright white is, and whether any are too dark.
+_ASKED = 10_000
+
+
+@part("filter", "wrapped")
+@dataclass(frozen=True)
+class Wrapped(Filter):
+    """Remove pixels whose phase wrapped, see `tofuse.sensor.unwrap`.
+
+    A view sees them where nothing is, and as the camera moves the same way as what it looks at
+    comes nearer, the next views see them at the same place: they are no outliers. What tells them
+    is their light, which is that of a far surface. Only views with pixels that are darker than any
+    matter would be at the range that was measured are looked at closely; there all goes that
+    `count_periods` puts beyond the period, with the white of the view itself.
+
+    Works on cameras of one modulation frequency that record amplitude; others' views are kept
+    whole.
+
+    Attributes
+    ----------
+    darkest
+        Least albedo that there is.
+    share
+        Fraction of the valid pixels that have to be darker than that.
+    options
+        How periods are counted.
+    """
+
+    darkest: float = 0.02
+    share: float = 0.001
+    options: UnwrapOptions = field(default_factory=lambda: UnwrapOptions(iterations=20))
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        within("darkest", self.darkest, 0, 1)
+        within("share", self.share, 0, 1)
+
+    def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
+        """See `Filter.mask`."""
+        keep = np.ones(frame.valid.shape, bool)
+        known = wrapped_light(frame, None)
+        if known is None or not isinstance(frame, RangeFrame):
+            return keep
+        radial, light, period = known
+        step = max(1, round(np.sqrt(radial.size / _ASKED)))
+        some, lit = radial[::step, ::step], light[::step, ::step]
+        white = white_light(lit, some, some > 0)
+        seen = (some > 0) & (lit > 0)
+        dark = seen & (lit * np.square(some) < self.darkest * white)
+        if dark.sum() <= self.share * seen.sum():
+            return keep
+        return count_periods(radial, light, period, white, pixel_pitch(frame), self.options) == 0
