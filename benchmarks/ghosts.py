@@ -1,21 +1,18 @@
 """Ghost surfaces: how much of the model of a flat is where nothing is, and how much is missing.
 
-Walks through simulated flats of four rooms, by several cameras with every error that the simulator
-knows and their factory correction, are reconstructed by the default method. Its trajectory is
-aligned with the truth, rigidly. Printed of each walk are
+Walks through simulated flats of four rooms, taken with every error of the camera that the simulator
+knows (`direct`: without indirect light) and its factory correction, are fused at the true poses,
+corrected and filtered by the default method; with `--estimated` they are reconstructed by it as
+well, and the result is aligned with the truth by its trajectory. Printed of each are
 
-- the rms error of the poses after that, as far as errors of the poses displace the model;
-- the shares of the mesh's vertices and of the cloud's points that are farther than 5 cm from the
-  nearest true surface, and for `--true-poses` of the mesh that is made at the true poses;
-- completeness: the share of the true surface that was measured, by places of 2 cm, that the mesh
-  has within 5 cm: of all, of floors, and of what is dark (albedo below 0.3). A place was measured if
+- the rms error of the poses after that: it displaces what is no ghost;
+- the shares of the mesh's vertices (the points of the cloud are the same) that are farther than 5,
+  10 and 20 cm from the nearest true surface;
+- completeness: the share of the true surface that was measured that the mesh has within 5 cm, by
+  places of 2 cm: of all, of floors, and of what is dark (albedo below 0.3). A place was measured if
   at least 3 valid pixels hit it, and at least half of them are right to 5 cm.
 
-With `--causes`, vertices at true poses that are ghosts are traced to the pixels that made them:
-those of all views that lie within 5 cm of the vertex, by their weight, and the flags that the
-simulator gave them.
-
-    python benchmarks/ghosts.py [--walks flat/sr4000/31/6] [--true-poses] [--causes]
+    python benchmarks/ghosts.py [--walks flat/sr4000/31/6 flat/sr4000/54/10/direct] [--estimated]
 """
 
 from __future__ import annotations
@@ -23,33 +20,48 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 import sequences
 from tofuse.evaluation.surface import Shape, distances
-from tofuse.evaluation.trajectory import displacement
-from tofuse.files.images import read_image
+from tofuse.evaluation.trajectory import align
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.tsdf import fuse_surface
+from tofuse.fusion.views import RangeView
 from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.learn import learnt
+from tofuse.pipeline.preparation import Preparation
+from tofuse.pipeline.reconstruct import fitted, reconstruct
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-from tofuse.simulation.record import Plan, plan, simulate
+from tofuse.simulation.effects import Effects
+from tofuse.simulation.record import Plan, plan, write
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 OUT = sequences.OUT / "recordings" / "ghosts"
+WALKS = (
+    "flat/sr4000/31/6",
+    "flat/ifm-o3r/31/10",
+    "flat/sr4000/52/10",
+    "flat-alike/pico-flexx/53/10",
+    "flat/sr4000/54/10/direct",
+    "flat-alike/ifm-o3r/55/10/direct",
+)
 NEAR_M = 0.05
 CELL_M = 0.02  # of the places that were measured, one stands for each such cube
 PIXELS, RIGHT = 3, 0.5
 DARK = 0.3
-SAMPLES = 1_500_000  # of the flat: 1.5 cm apart
+SAMPLES = 600_000  # of a surface: of a flat's 2.5 cm apart, and the triangles around each
 
 
 @dataclass(frozen=True)
@@ -64,46 +76,46 @@ class Walk:
         Of scene, path and noise.
     every
         Every so-many-th of 1140 raw frames is taken.
+    direct
+        Whether there is no indirect light.
     """
 
     scene: str
     camera: str
     seed: int
     every: int
+    direct: bool = False
 
     @classmethod
     def named(cls, name: str) -> Walk:
-        """The walk called scene/camera/seed/every."""
-        scene, camera, seed, every = name.split("/")
-        return cls(scene, camera, int(seed), int(every))
+        """The walk called scene/camera/seed/every, or with /direct."""
+        scene, camera, seed, every, *light = name.split("/")
+        return cls(scene, camera, int(seed), int(every), light == ["direct"])
 
     def __str__(self) -> str:
-        return f"{self.scene}/{self.camera}/{self.seed}/{self.every}"
-
-    @property
-    def folder(self) -> Path:
-        """Where it is kept."""
-        return OUT / str(self).replace("/", "_")
+        name = f"{self.scene}/{self.camera}/{self.seed}/{self.every}"
+        return f"{name}/direct" if self.direct else name
 
     @cached_property
     def plan(self) -> Plan:
         """What is recorded."""
-        return plan(self.scene, camera=self.camera, seed=self.seed, every=self.every)
+        return plan(
+            self.scene,
+            camera=self.camera,
+            seed=self.seed,
+            every=self.every,
+            effects=Effects(multipath=not self.direct),
+        )
 
     def recording(self) -> Recording:
         """The recording, made unless it was before."""
-        if not self.folder.is_dir():
-            unfinished = self.folder.with_suffix(".part")
+        folder = OUT / str(self).replace("/", "_")
+        if not folder.is_dir():
+            unfinished = folder.with_suffix(".part")
             shutil.rmtree(unfinished, ignore_errors=True)
-            simulate(
-                self.scene,
-                unfinished,
-                camera=self.camera,
-                seed=self.seed,
-                every=self.every,
-            )
-            unfinished.rename(self.folder)
-        return open_recording(self.folder)
+            write(self.plan, unfinished)
+            unfinished.rename(folder)
+        return open_recording(folder)
 
     @cached_property
     def surface(self) -> Shape:
@@ -148,3 +160,64 @@ def measured(walk: Walk, recording: Recording) -> Places:
     surface = np.concatenate(surfaces)[chosen]
     where = np.concatenate(points)[chosen].astype(float)
     return Places(where, np.isin(surface, floors), albedo[surface] < DARK)
+
+
+def at_true_poses(recording: Recording) -> Mesh:
+    """What the default method makes of the recording if its poses are known."""
+    assert recording.reference is not None
+    config = learnt(fitted(from_method("default"), recording), recording)
+    preparation, views = Preparation(config), []
+    for frame, T in zip(recording, recording.reference, strict=True):
+        ready = preparation.ready(frame, T, None, None)
+        preparation.placed(ready.filtered, T)
+        assert isinstance(ready.filtered, RangeFrame)
+        assert isinstance(ready.clean, RangeFrame)
+        surface = surface_map(ready.filtered, SurfaceOptions())
+        views.append(RangeView.of(ready.clean, surface))
+    return fuse_surface(views, recording.reference, config.fusion)
+
+
+def row(label: str, mesh: Mesh, T_true_world: Float64, walk: Walk, seen: Places, ate: float) -> str:
+    """One line of the table."""
+    vertices = se3.transform(T_true_world, mesh.vertices.astype(float))
+    off = distances(vertices, walk.surface, SAMPLES)
+    found = distances(seen.points, Shape(vertices, mesh.faces), SAMPLES) <= NEAR_M
+    ghosts = " | ".join(f"{100 * (off > limit).mean():.3f}" for limit in (0.05, 0.10, 0.20))
+    complete = " | ".join(f"{100 * found[m].mean():.1f}" for m in (..., seen.floor, seen.dark))
+    return f"| {walk}, {label} | {1e3 * ate:.0f} | {len(mesh):,} | {ghosts} | {complete} |"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--walks", nargs="+", default=WALKS, metavar="SCENE/CAMERA/SEED/EVERY")
+    parser.add_argument("--estimated", action="store_true", help="also at estimated poses")
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args(arguments)
+    print(
+        "| walk, poses | poses off mm | vertices | > 5 cm % | > 10 cm % | > 20 cm % "
+        "| complete % | floors % | dark % |\n|---|---|---|---|---|---|---|---|---|"
+    )
+    with threads(options.threads):
+        for walk in map(Walk.named, options.walks):
+            recording = walk.recording()
+            seen = measured(walk, recording)
+            print(row("true", at_true_poses(recording), np.eye(4), walk, seen, 0.0), flush=True)
+            if not options.estimated:
+                continue
+            result = reconstruct(recording, threads=options.threads)
+            assert result.mesh is not None
+            assert recording.reference is not None
+            known = result.has_pose
+            truth, found = recording.reference[known], result.trajectory[known]
+            T = align(found, truth)
+            ate = float(np.sqrt((((T @ found)[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(1).mean()))
+            label = f"estimated ({known.sum()} of {len(known)})"
+            print(row(label, result.mesh, T, walk, seen, ate), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

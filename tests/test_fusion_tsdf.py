@@ -266,6 +266,70 @@ def test_free_space_carves_away_what_one_view_made_up() -> None:
     assert len(mesh) > 1000
 
 
+def test_what_a_wrong_pixel_shows_behind_a_wall_is_left_out() -> None:
+    """Nobody contradicts it there, but its light would have come through the wall."""
+    wall = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    ghost = wall.copy()
+    ghost[26:48, 30:56] = plane_range(EYE, np.array([0, 0, 1.0]), 2.12)[26:48, 30:56]
+    options = Fusion(voxel_m=0.02, island=10)
+    frames = [frame_of(wall, k) for k in range(8)]
+    views = [RangeView.of(f) for f in [*frames[:7], frame_of(ghost, 8)]]
+    poses = np.array([EYE] * 8)
+    volume = Volume.around(views, poses, 0.02, options)
+    volume.add(views, poses)
+    behind = volume.surface().without_islands(10).vertices[:, 2]
+    assert (np.abs(behind - 2.12) < 0.02).sum() > 100
+    seen = fuse_surface(views, poses, options)
+    assert np.abs(seen.vertices[:, 2] - 2).max() < 0.02
+    plain = fuse_surface([RangeView.of(f) for f in frames], poses, options)
+    assert len(seen) > 0.98 * len(plain)
+
+
+def test_what_is_seen_past_the_rim_of_something_stays() -> None:
+    """A panel close before a wall, which other views see from the side."""
+    T = [look([x, 0, 0], [0.1, 0, 2.0]) for x in (-0.9, 0.0, 0.9)]
+    frames = []
+    for k, pose in enumerate(T):
+        front = plane_range(pose, np.array([0, 0, 1.0]), 1.9)
+        back = plane_range(pose, np.array([0, 0, 1.0]), 2.0)
+        rays = np.insert(CAMERA.rays().astype(float), 2, 1, -1)
+        d = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ pose[:3, :3].T
+        x = pose[0, 3] + front * d[..., 0]
+        frames.append(frame_of(np.where(x < 0, front, back), k))
+    views, poses = [RangeView.of(f) for f in frames], np.array(T)
+    volume = Volume.around(views, poses, 0.012, Fusion())
+    volume.add(views, poses)
+    all_of_it = volume.surface().without_islands(100)
+    left = fuse_surface(views, poses, Fusion(voxel_m=0.012))
+    assert len(left) > 0.985 * len(all_of_it)
+    wall = left.vertices[np.abs(left.vertices[:, 2] - 2) < 0.02]
+    assert wall[:, 0].min() < 0.03  # as far behind the panel as a view from the side sees
+
+
+def test_noisy_views_make_one_surface_not_several() -> None:
+    """Behind its surface a view knows nothing only from where on it is surely behind."""
+    code = 137
+    assert 1 / np.sqrt(DECODED[code]) == pytest.approx(0.05, rel=0.1)
+    views = []
+    for k in range(7):
+        z = 3.13 if k == 3 else 3.0  # 2.6 sigmas
+        view = RangeView.of(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), z), k))
+        noisy = np.where(view.strength > 0, code, 0).astype(np.uint8)
+        views.append(replace(view, strength=noisy))
+    poses = np.array([EYE] * 7)
+    volume = Volume.around(views, poses, 0.03, Fusion())
+    assert volume.reach_m < 0.1
+    volume.add(views, poses)
+    z = volume.surface().vertices[:, 2]
+    assert len(z) > 1000
+    assert np.abs(z - 3).max() < 0.05
+    # What is surely behind stays: a precise view says nothing of it.
+    sure = [replace(v, strength=np.where(v.strength > 0, 200, 0).astype(np.uint8)) for v in views]
+    volume = Volume.around(sure, poses, 0.03, Fusion())
+    volume.add(sure, poses)
+    assert (np.abs(volume.surface().vertices[:, 2] - 3.13) < 0.01).sum() > 500
+
+
 def test_at_a_jump_surfaces_end_with_the_pixels_that_measured_them() -> None:
     ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
     ranges[:, 40:] = plane_range(EYE, np.array([0, 0, 1.0]), 1.0)[:, 40:]

@@ -67,4 +67,5 @@ class Wrapped(Filter):
         dark = seen & (lit * np.square(some) < self.darkest * white)
         if dark.sum() <= self.share * seen.sum():
             return keep
-        return count_periods(radial, light, period, white, pixel_pitch(frame), self.options) == 0
+        periods = count_periods(radial, light, period, white, pixel_pitch(frame), self.options)
+        return (periods == 0) & (light * np.square(radial) >= self.darkest * white)

@@ -240,7 +240,8 @@ def open_view(
     rays, lookup_frame
         Of the view's `Projection`.
     reach, backs
-        How far before a surface it matters, and (256,) how far behind it, by the code of the weight.
+        How far before a surface a pixel matters, and (256,) how far behind it, by the code of its
+        weight.
     heights, codes
         (H W + 1,) get h of the pixel's plane n . p = h, and n and the code of its weight in four
         bytes. The last one stands for all that is not in the image.
@@ -422,9 +423,9 @@ def integrate(
     """Add views of one camera, in order, to blocks start..stop.
 
     Voxel (i, j, k) of a block lies at its corner plus (i, j, k) `voxel_m`. Its distance is that to
-    the plane of the pixel that it lands on, cut at `reach`. Behind the surface a view knows nothing,
-    from where on it is sure to be behind: `reach`, or more where the pixel is noisy. Blocks come
-    first and views second, so that a block is fetched once for all of them.
+    the plane of the pixel that it lands on, cut at `reach`. A view knows nothing from where on it
+    is surely behind its surface: by `reach`, or more where the pixel is noisy. Blocks come first
+    and views second, so that a block is fetched once for all of them.
 
     Of what is not near to what it saw, a view tells at most that it is free. There only every
     so-many-th view is looked at, in turn, and counts so many times.
