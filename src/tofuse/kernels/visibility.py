@@ -117,7 +117,7 @@ def _passes(
         if key != last:
             last = key
             slot = slot_of(table, key)
-            row = rows[slot] if table[slot] == key else -1
+            row = int(rows[slot]) if table[slot] == key else -1
         if row < 0:
             # To the end of the empty block.
             out = length
