@@ -104,7 +104,7 @@ def _passes(
     x = point[0] / voxel_m + 0.5
     y = point[1] / voxel_m + 0.5
     z = point[2] / voxel_m + 0.5
-    last = np.int64(-1)
+    last = -1
     row = -1
     t = _APART
     while t < length:
