@@ -266,46 +266,6 @@ def test_free_space_carves_away_what_one_view_made_up() -> None:
     assert len(mesh) > 1000
 
 
-def test_what_a_wrong_pixel_shows_behind_a_wall_is_left_out() -> None:
-    """Nobody contradicts it there, but its light would have come through the wall."""
-    wall = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
-    ghost = wall.copy()
-    ghost[26:48, 30:56] = plane_range(EYE, np.array([0, 0, 1.0]), 2.12)[26:48, 30:56]
-    options = Fusion(voxel_m=0.02, island=10)
-    frames = [frame_of(wall, k) for k in range(8)]
-    views = [RangeView.of(f) for f in [*frames[:7], frame_of(ghost, 8)]]
-    poses = np.array([EYE] * 8)
-    volume = Volume.around(views, poses, 0.02, options)
-    volume.add(views, poses)
-    behind = volume.surface().without_islands(10).vertices[:, 2]
-    assert (np.abs(behind - 2.12) < 0.02).sum() > 100
-    seen = fuse_surface(views, poses, options)
-    assert np.abs(seen.vertices[:, 2] - 2).max() < 0.02
-    plain = fuse_surface([RangeView.of(f) for f in frames], poses, options)
-    assert len(seen) > 0.98 * len(plain)
-
-
-def test_what_is_seen_past_the_rim_of_something_stays() -> None:
-    """A panel close before a wall, which other views see from the side."""
-    T = [look([x, 0, 0], [0.1, 0, 2.0]) for x in (-0.9, 0.0, 0.9)]
-    frames = []
-    for k, pose in enumerate(T):
-        front = plane_range(pose, np.array([0, 0, 1.0]), 1.9)
-        back = plane_range(pose, np.array([0, 0, 1.0]), 2.0)
-        rays = np.insert(CAMERA.rays().astype(float), 2, 1, -1)
-        d = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ pose[:3, :3].T
-        x = pose[0, 3] + front * d[..., 0]
-        frames.append(frame_of(np.where(x < 0, front, back), k))
-    views, poses = [RangeView.of(f) for f in frames], np.array(T)
-    volume = Volume.around(views, poses, 0.012, Fusion())
-    volume.add(views, poses)
-    all_of_it = volume.surface().without_islands(100)
-    left = fuse_surface(views, poses, Fusion(voxel_m=0.012))
-    assert len(left) > 0.985 * len(all_of_it)
-    wall = left.vertices[np.abs(left.vertices[:, 2] - 2) < 0.02]
-    assert wall[:, 0].min() < 0.03  # as far behind the panel as a view from the side sees
-
-
 def test_noisy_views_make_one_surface_not_several() -> None:
     """Behind its surface a view knows nothing only from where on it is surely behind."""
     code = 137

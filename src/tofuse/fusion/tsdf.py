@@ -26,7 +26,6 @@ from tofuse.kernels.blocks import (
 from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import integrate, near_cubes, open_view, settle_free
-from tofuse.kernels.visibility import count_witnesses, mark_covered
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -240,13 +239,10 @@ class Volume:
         )
         self.added += count
 
-    def surface(
-        self, min_views: int = 1, views: Sequence[RangeView] = (), poses: Float64 | None = None
-    ) -> Mesh:
+    def surface(self, min_views: int = 1) -> Mesh:
         """Return where the distances change sign, between voxels that views saw.
 
-        What is not known to within a few voxels is left out: there noise makes the surface. With
-        the views and their poses (N, 4, 4) so is what they could not have seen, see `_refuted`.
+        What is not known to within a few voxels is left out: there noise makes the surface.
         """
         blocks = len(self.keys)
         run_chunks(
@@ -281,7 +277,7 @@ class Volume:
         normals = np.empty((total, 3), np.float32)
         tints = np.empty((total, channels), np.float32)
         sigma = np.empty(total, np.float32)
-        seen_by = np.empty(total, np.int32)
+        views = np.empty(total, np.int32)
         run_chunks(
             lambda a, b: make_vertices(
                 self.keys,
@@ -297,7 +293,7 @@ class Volume:
                 normals,
                 tints,
                 sigma,
-                seen_by,
+                views,
                 a,
                 b,
             ),
@@ -305,83 +301,12 @@ class Volume:
             _CHUNKS,
         )
         faces = self._faces(neighbours, cells, starts, points)
-        if poses is not None and total:
-            rows = np.repeat(np.arange(blocks, dtype=np.int32), counts)
-            refuted = self._refuted(views, poses, points, normals, rows, neighbours)
-            faces = faces[~refuted[faces].any(1)]
         color = None
         if channels == 3:
             color = np.round(tints).clip(0, 255).astype(np.uint8)
         elif channels:
             color = grey_of(tints[:, 0].astype(float) ** 2)
-        return Mesh(points.astype(np.float32), faces, normals, color, sigma, seen_by, np.zeros(3))
-
-    def _refuted(
-        self,
-        views: Sequence[RangeView],
-        poses: Float64,
-        points: Float64,
-        normals: Float32,
-        blocks: NDArray[np.int32],
-        neighbours: NDArray[np.int32],
-    ) -> NDArray[np.bool_]:
-        """Which vertices (N,) the views that measured them would have seen through a surface.
-
-        What lies behind a surface is contradicted by nobody, as no view sees it: what a wrong pixel
-        puts there would stay. But there are no witnesses either. Where most of the weight of those
-        who measured a vertex comes through the back of another surface, they were wrong.
-        """
-        covered = np.zeros(len(points), bool)
-        run_chunks(
-            lambda a, b: mark_covered(
-                self.keys,
-                neighbours,
-                blocks,
-                self.voxel_m,
-                self.distance,
-                self.weight,
-                points,
-                normals,
-                covered,
-                a,
-                b,
-            ),
-            len(points),
-            _CHUNKS,
-        )
-        chosen = np.flatnonzero(covered)
-        asked, facing = points[chosen], normals[chosen]
-        votes = np.zeros((len(chosen), 2))
-        T_camera_world = np.array([se3.inverse(T) for T in poses])
-
-        def ask(a: int, b: int) -> None:
-            for view, T, T_inverse in zip(views, poses, T_camera_world, strict=True):
-                count_witnesses(
-                    asked,
-                    facing,
-                    T,
-                    T_inverse,
-                    view.z,
-                    view.unit,
-                    view.normals,
-                    view.strength,
-                    DECODED,
-                    view.projection.rays,
-                    view.projection.lookup,
-                    view.projection.frame,
-                    self.reach_m,
-                    self.voxel_m,
-                    *self.index,
-                    self.distance,
-                    self.weight,
-                    votes,
-                    a,
-                    b,
-                )
-
-        run_chunks(ask, len(chosen), _CHUNKS)
-        covered[chosen] = votes[:, 1] >= votes[:, 0]
-        return covered
+        return Mesh(points.astype(np.float32), faces, normals, color, sigma, views, np.zeros(3))
 
     def _faces(
         self,
@@ -513,4 +438,4 @@ def fuse_surface(
     options = options or Fusion()
     volume = Volume.around(views, poses, options.voxel_m or fitting_voxel(views), options)
     volume.add(views, poses, advance)
-    return volume.surface(options.min_views, views, poses).without_islands(options.island)
+    return volume.surface(options.min_views).without_islands(options.island)
