@@ -16,7 +16,7 @@ from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.cloud_pair import follow_clouds, register_clouds
+from tofuse.registration.cloud_pair import follow_clouds, measured_as_clouds, register_clouds
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
@@ -63,8 +63,10 @@ class AnyPair(Registrar):
         # Of other clouds the shapes are compared below.
         proposals = partial(_alike, source, target, rng) if are_images else None
         seen = _registered_as_images(source, target, guess, proposals, search=searches)
-        if seen is not None and (seen.believed or are_images):
+        if seen is not None and are_images:
             return seen
+        if seen is not None and seen.believed:
+            return measured_as_clouds(source, target, seen, rng)
         if not searches and guess is not None:
             return follow_clouds(source, target, guess, rng)
         return register_clouds(source, target, guess, rng, seen)

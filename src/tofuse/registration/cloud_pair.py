@@ -20,6 +20,7 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap, cloud_agreement
+from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.registration.coarse_to_fine import CoarseToFine, spacing
 from tofuse.registration.confidence import CERTAIN, CloudEvidence
 from tofuse.registration.fpfh import Fpfh
@@ -111,6 +112,11 @@ class _Views:
         through = self.knows_free_space
         return CloudEvidence(said.support, said.contradiction, lead, degenerate, through)
 
+    def measured(self, found: Registration) -> Registration:
+        """A registration with what it knows of its errors."""
+        T, free = found.T_target_source, found.unobservable
+        return replace(found, information=cloud_information(self.there, self.here, T, free))
+
     def differ(self, a: Float64, b: Float64) -> bool:
         """Whether two poses take the middle of the source elsewhere, or turn it otherwise."""
         points = self.there.view.points.astype(np.float64)
@@ -178,7 +184,7 @@ def _registered(
     if views.evidence(near).probability >= CERTAIN and not always_search:
         found = _registration(views, near)
         if (found.probability or 0.0) >= CERTAIN and not len(found.unobservable):
-            return found
+            return views.measured(found)
     poses = [near] if seen is None else [near, views.judged(seen.T_target_source)]
     poses += _proposed(views, start)
     poses.sort(key=lambda pose: -pose.agreement.score)
@@ -188,13 +194,13 @@ def _registered(
         best = min(alike, key=lambda p: _apart(p.T_target_source, guess))
     found = _registration(views, best, poses)
     if guess is None or best.guess is not None or not len(found.unobservable):
-        return found
+        return views.measured(found)
     # What differs along degenerate directions alone stays as in the guess.
     hold = Hold.of(found.unobservable, views.there.view.points.astype(np.float64))
     across = hold.across(se3.inverse(near.T_target_source) @ found.T_target_source)
     if views.differ(near.T_target_source, near.T_target_source @ across):
-        return found
-    return _registration(views, near, [best])
+        return views.measured(found)
+    return views.measured(_registration(views, near, [best]))
 
 
 def _power_of_scale(source: Frame, target: Frame) -> int:
@@ -219,6 +225,18 @@ def _registered_scaled(
     return found if found.believed else None
 
 
+def measured_as_clouds(
+    source: Frame, target: Frame, found: Registration, rng: np.random.Generator
+) -> Registration:
+    """A registration of the images of two clouds, with what the clouds say of its errors.
+
+    Images of clouds have holes, and no noise that is known.
+    """
+    views = _Views.of(source, target, rng)
+    free = cloud_unobservable(views.there, views.here, found.T_target_source)
+    return views.measured(replace(found, unobservable=free))
+
+
 def follow_clouds(
     source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
 ) -> Registration:
@@ -229,7 +247,7 @@ def follow_clouds(
         far = CoarseToFine().register(source, target, guess, rng)
         other = replace(views.judged(far.T_target_source), guess=guess)
         near = max(near, other, key=lambda pose: pose.agreement.score)
-    return _registration(views, near)
+    return views.measured(_registration(views, near))
 
 
 def _proposed(views: _Views, start: Float64) -> list[_Pose]:
@@ -320,8 +338,6 @@ def _registration(views: _Views, best: _Pose, poses: Sequence[_Pose] | None = No
     reason = evidence.objection()
     return replace(
         found,
-        # Planes that neighbours are fitted to share their points, and so their errors.
-        information=found.information / NEIGHBOURS,
         margin=lead,
         believed=not reason,
         probability=evidence.probability,

@@ -24,7 +24,12 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap
-from tofuse.registration.pairs import FEWEST_PAIRS, loss_weights
+from tofuse.registration.pairs import (
+    FEWEST_PAIRS,
+    SurfacePairs,
+    loss_weights,
+    unobservable_directions,
+)
 
 Float64 = NDArray[np.float64]
 
@@ -32,40 +37,59 @@ Float64 = NDArray[np.float64]
 # largest angle between their normals.
 _NEAR, _ALIKE = 3.0, 0.75
 # Patches: edge in resolutions at least, how many at most, and how many to learn from.
-_EDGE, _LARGER = 2.0, 1.25
-_MOST_PATCHES, _LEAST_PATCHES = 150, 12
+_EDGE, _LARGER = 2.0, 1.05
+_MOST_PATCHES, _LEAST_PATCHES = 120, 12
 # Variances of the field that are tried, relative to that of the noise of a patch.
 _SHARES = np.r_[0.0, np.geomspace(0.03, 300.0, 9)]
-# Lengths of correlation that are tried, from the patches' edge to the size of the overlap.
-_LENGTHS = 5
+# Lengths of correlation that are tried, from the patches' edge to this many sizes of the overlap:
+# what bends a view may reach further than what both views share of it.
+_LENGTHS, _FURTHEST = 5, 2.5
 # Least slope of the gradient, as a share of what the matches and their weights say, and points of
 # which it is measured.
-_STEEPNESS, _TRIED = 0.1, 2000
-# Sigma along directions that nothing holds, in sizes of the overlap, and in rad.
+_STEEPNESS, _TRIED = 0.1, 1500
+# Sigma along directions that nothing holds, in sizes of the overlap, or in rad.
 _UNBOUNDED = 100.0
 
 
-def cloud_covariance(
+def cloud_information(
     source: CloudMap, target: CloudMap, T_target_source: Float64, unobservable: Float64
 ) -> Float64:
-    """(6, 6) covariance of a pose (4, 4), m and rad, right perturbation in the source's frame.
+    """(6, 6) information of a pose (4, 4), in 1/m and 1/rad, right perturbation in the source.
 
-    Along the `unobservable` directions (k, 6) it is as good as unbounded.
+    The inverse of the covariance, but for the `unobservable` directions (k, 6): there is none along
+    these, to speak of.
     """
     pairs = _Pairs.of(source, target, T_target_source)
     if pairs is None:
         size = max(float(np.linalg.norm(np.ptp(source.view.points, axis=0))), source.size)
-        return np.diag((_UNBOUNDED * np.r_[[size] * 3, [1.0] * 3]) ** 2)
+        return np.diag((_UNBOUNDED * np.r_[[size] * 3, [1.0] * 3]) ** -2.0)
     shift = np.eye(4)
     shift[:3, 3] = -pairs.centre
-    to_centre = se3.adjoint(shift)
+    # From the perturbation about the origin to that about the centroid, in units in which turns
+    # move the points as far as slides.
     unit = np.array([1, 1, 1, *[1 / pairs.size] * 3])
-    free = (unobservable @ to_centre.T) / unit
+    to_centre = se3.adjoint(shift) / unit[:, None]
     slope = _slope(source, target, T_target_source, pairs, unit)
-    C = _covariance(pairs, slope, unit, free) * np.outer(unit, unit)
-    back = se3.adjoint(se3.inverse(shift))
-    C = back @ C @ back.T
-    return np.asarray(0.5 * (C + C.T), np.float64)
+    H = to_centre.T @ _information(pairs, slope, unit, unobservable @ to_centre.T) @ to_centre
+    return np.asarray(0.5 * (H + H.T), np.float64)
+
+
+def cloud_unobservable(source: CloudMap, target: CloudMap, T_target_source: Float64) -> Float64:
+    """(k, 6) directions of the right perturbation that two clouds don't hold at a pose (4, 4)."""
+    pairs = _Pairs.of(source, target, T_target_source)
+    if pairs is None:
+        return np.eye(6)
+    surface = SurfacePairs(
+        T_target_source,
+        pairs.centre,
+        pairs.points,
+        pairs.residual[:, None] * pairs.normals,
+        pairs.target_normals,
+        pairs.source_normals,
+        pairs.weight,
+        pairs.resolution,
+    )
+    return unobservable_directions(surface, pairs.noise**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +123,7 @@ class _Pairs:
     resolution: float
 
     @classmethod
-    def of(
-        cls, source: CloudMap, target: CloudMap, T: Float64, every: int = 1
-    ) -> _Pairs | None:
+    def of(cls, source: CloudMap, target: CloudMap, T: Float64, every: int = 1) -> _Pairs | None:
         """Match every so manieth point with the nearest of the target; None if few are near."""
         size = max(source.size, target.size)
         p = source.view.points[::every].astype(np.float64)
@@ -186,11 +208,14 @@ class _Patches:
         edge = _EDGE * pairs.resolution
         while True:
             cell = np.floor(pairs.points / edge).astype(np.int64)
-            _, patch = np.unique(np.column_stack([cell, facing]), axis=0, return_inverse=True)
-            if patch.max() <  _MOST_PATCHES:
+            cell -= cell.min(0)
+            _, rows, layers = cell.max(0) + 1
+            key = ((cell[:, 0] * rows + cell[:, 1]) * layers + cell[:, 2]) * 3 + facing
+            patch = np.unique(key, return_inverse=True)[1]
+            count = int(patch.max()) + 1
+            if count <= _MOST_PATCHES:
                 break
-            edge *= _LARGER
-        patch = patch.reshape(-1)
+            edge *= _LARGER * float(np.sqrt(count / _MOST_PATCHES))
         total = np.bincount(patch, pairs.weight)
         told = total > 0
 
@@ -210,32 +235,30 @@ class _Patches:
         )
 
 
-def _covariance(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) -> Float64:
-    """(6, 6) about the centroid, in units in which turns move the points as far as slides."""
-    basis = np.eye(6)
+def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) -> Float64:
+    """(6, 6) about the centroid, without directions (k, 6) that are free."""
+    held = np.eye(6)
+    H = np.zeros((6, 6))
     if len(free):
         _, s, vt = np.linalg.svd(free)
         count = int((s > 1e-9 * s[0]).sum())
-        lost, basis = vt[:count].T, vt[count:].T
-    else:
-        lost = np.zeros((6, 0))
-    C = (_UNBOUNDED * pairs.size) ** 2 * lost @ lost.T
-    if not basis.shape[1]:
-        return C
+        held = vt[count:].T
+        H += vt[:count].T @ vt[:count] / (_UNBOUNDED * pairs.size) ** 2
+    if not held.shape[1]:
+        return H
     patches = _Patches.of(pairs, unit)
-    J = patches.responses @ basis
-    bread = np.linalg.inv(basis.T @ slope @ basis)
-    if len(J) >= _LEAST_PATCHES:
-        meat = _learnt(patches, J)
+    if len(patches.residual) >= _LEAST_PATCHES:
+        meat = _learnt(patches, patches.responses @ held)
     else:  # nothing can be learnt of what they share: as few independent points as there may be
-        meat = NEIGHBOURS * pairs.noise**2 * basis.T @ pairs.weighed(unit) @ basis
-    own = bread @ meat @ bread
-    return C + basis @ own @ basis.T
+        meat = NEIGHBOURS * pairs.noise**2 * held.T @ pairs.weighed(unit) @ held
+    bread = np.linalg.inv(held.T @ slope @ held)
+    # A pose that comes from elsewhere is off by the step that would be made from it, or may be.
+    step = bread @ held.T @ pairs.gradient(pairs.centre, unit)
+    C = bread @ meat @ bread + np.outer(step, step)
+    return np.asarray(H + held @ np.linalg.inv(C) @ held.T, np.float64)
 
 
-def _slope(
-    source: CloudMap, target: CloudMap, T: Float64, pairs: _Pairs, unit: Float64
-) -> Float64:
+def _slope(source: CloudMap, target: CloudMap, T: Float64, pairs: _Pairs, unit: Float64) -> Float64:
     """X (6, 6): how the gradient ``sum w J r`` changes with the pose, points matched anew.
 
     Where noise is as large as the spacing of the points, each finds a nearest one that it misses by
@@ -283,7 +306,7 @@ def _learnt(patches: _Patches, J: Float64) -> Float64:
     y, A = root * patches.residual, root[:, None] * J
     apart = np.linalg.norm(patches.places[:, None] - patches.places, axis=2)
     along = (patches.normals @ patches.normals.T) * np.outer(root, root) / np.mean(root**2)
-    largest = max(float(np.percentile(apart, 90)), 2 * patches.edge)
+    largest = max(_FURTHEST * float(np.percentile(apart, 90)), 2 * patches.edge)
     freedom = max(n - held, 1)
     likely, meat = [], []
     for length in np.geomspace(patches.edge, largest, _LENGTHS):
