@@ -18,6 +18,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, measured_as_clouds, register_clouds
 from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.uncertainty import UncertaintyOptions
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.registration.viewpoint import as_image, viewpoint_of
@@ -25,6 +26,9 @@ from tofuse.registration.viewpoint import as_image, viewpoint_of
 Float64 = NDArray[np.float64]
 
 FEWEST_POINTS = 10
+# Views as they were recorded, far apart: light by way of other surfaces is in them, and bends each
+# of them otherwise. See docs/uncertainty.md for how these were found.
+_AS_RECORDED = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
 # Poses that shapes propose, at most.
 PROPOSALS = 8
 
@@ -114,9 +118,9 @@ def _registered_as_images(
             )
         return None  # as clouds, the unit of one of them may be found to be wrong
     if search:
-        found = register_pair(data, model, start, proposals=proposals)
+        found = register_pair(data, model, start, proposals=proposals, uncertainty=_AS_RECORDED)
     else:
-        found = follow(data, model, start)
+        found = follow(data, model, start, uncertainty=_AS_RECORDED)
     return None if found is None else found.between(T_target_camera, T_camera_source)
 
 

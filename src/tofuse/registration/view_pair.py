@@ -27,7 +27,7 @@ from tofuse.registration.projective import (
     registration_of,
 )
 from tofuse.registration.search import Candidate, Match, Search, SearchOptions
-from tofuse.registration.uncertainty import covariance
+from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 from tofuse.registration.verification import (
     COARSE,
     PATIENT,
@@ -89,6 +89,7 @@ def register_pair(
     options: SearchOptions | None = None,
     always_search: bool = False,
     proposals: Callable[[], Float64] | None = None,
+    uncertainty: UncertaintyOptions | None = None,
 ) -> Registration | None:
     """Register two prepared views.
 
@@ -105,6 +106,8 @@ def register_pair(
     proposals
         Gives poses (N, 4, 4) beyond the reach of the search, which are tried where what it finds is
         not believed.
+    uncertainty
+        The constants of the covariance; those of views without multipath unless given.
 
     Returns
     -------
@@ -114,7 +117,7 @@ def register_pair(
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, options)
+    pair = _Pair.of(source, target, usual, options, uncertainty)
     near = pair.followed(np.eye(4) if guess is None else guess)
     if near is not None and near.is_certain and not always_search:
         return pair.registration(near, near.evidence, None)
@@ -129,15 +132,21 @@ def register_pair(
 
 
 def follow(
-    source: SurfaceMap, target: SurfaceMap, guess: Float64, *, usual: UsualFit | None = None
+    source: SurfaceMap,
+    target: SurfaceMap,
+    guess: Float64,
+    *,
+    usual: UsualFit | None = None,
+    uncertainty: UncertaintyOptions | None = None,
 ) -> Registration | None:
     """Register two prepared views from a guess (4, 4) alone; None where they don't fit there.
 
-    `usual` is how views of this camera usually fit, if something is known of it.
+    `usual` is how views of this camera usually fit, if something is known of it; for `uncertainty`
+    see `register_pair`.
     """
     if not comparable(source.depth, target.depth):
         return None
-    pair = _Pair.of(source, target, usual, None)
+    pair = _Pair.of(source, target, usual, None, uncertainty)
     near = pair.followed(guess)
     return None if near is None else pair.registration(near, near.evidence, None)
 
@@ -150,6 +159,7 @@ class _Pair:
     target: SurfaceMap
     usual: UsualFit
     options: SearchOptions
+    uncertainty: UncertaintyOptions | None
 
     @classmethod
     def of(
@@ -158,6 +168,7 @@ class _Pair:
         target: SurfaceMap,
         usual: UsualFit | None,
         options: SearchOptions | None,
+        uncertainty: UncertaintyOptions | None,
     ) -> _Pair:
         """With lengths that suit the depth of the views, and errors that the camera usually has."""
         usual = usual or UsualFit()
@@ -168,7 +179,7 @@ class _Pair:
         compared = replace(compared, floor_m=compared.floor_m * min(1.0, depth / _NEAR_M))
         distinct = min(options.distinct_m, _DISTINCT * depth)
         options = replace(options, distinct_m=distinct, agreement=compared)
-        return cls(source, target, usual, options)
+        return cls(source, target, usual, options, uncertainty)
 
     def followed(self, guess: Float64) -> _Pose | None:
         """Align from a guess, first with few iterations; None where the views don't fit there."""
@@ -268,7 +279,9 @@ class _Pair:
         )
 
     def _covariance(self, pose: _Pose) -> Float64:
-        C = covariance(self.source, _at(self.target), pose.aligned, pose.options)
+        # Where the search left it bounds no direction that the views don't hold.
+        loose = replace(pose.options, prior_m=_NEAR.prior_m, prior_rad=_NEAR.prior_rad)
+        C = covariance(self.source, _at(self.target), pose.aligned, loose, self.uncertainty)
         if pose.T_target_source is not pose.aligned.T_world_source:
             # It is known as well as the search leaves it.
             o = pose.options
