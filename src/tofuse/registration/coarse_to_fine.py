@@ -31,8 +31,8 @@ Float64 = NDArray[np.float64]
 _SPACING_SAMPLE = 5000
 _SMALLEST_LEVEL = 60
 _EXTENT_SHARE = 10
-# Median roughness of surfaces above which normals say little.
-_ROUGHEST = 0.25
+# Median roughness of surfaces above which normals say little, and of how many points it is taken.
+_ROUGHEST, _ROUGHNESS_SAMPLE = 0.25, 1500
 _COARSER = 1.5
 # The finest level has at least this many resolutions along the scene.
 _FINEST = 10
@@ -207,7 +207,8 @@ class CoarseToFine(Registrar):
         return size, data, model
 
     def _roughness(self, view: CloudFrame) -> float:
-        rough = shape_at(view, np.arange(len(view)), self.neighbours).roughness
+        some = np.arange(0, len(view), max(1, len(view) // _ROUGHNESS_SAMPLE))
+        rough = shape_at(view, some, self.neighbours).roughness
         return float(np.nanmedian(rough)) if np.isfinite(rough).any() else 0.0
 
 

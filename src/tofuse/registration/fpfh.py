@@ -277,7 +277,8 @@ def _fitting(
     source: Described, target: Described, tree: KdTree, T: Float64, far: float
 ) -> tuple[NDArray[np.bool_], Int64]:
     """(n,) points of the source near a surface of the target that is turned alike, and which."""
-    nearest, squared = tree.nearest(se3.transform(T, source.points))
+    nearest, squared = tree.nearest(se3.transform(T, source.points), far)
     turned = source.normals @ T[:3, :3].T
+    # Where none is near, the square is infinite, and the last normal compared for nothing.
     alike = np.abs((turned * target.normals[nearest]).sum(1)) > _ALIKE
     return (squared < far * far) & alike, nearest

@@ -38,8 +38,13 @@ class ClosestPoint(Matcher):
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: Points) -> Search:
-        """Build the tree, once for all iterations: the target doesn't move."""
-        return _TreeSearch(KdTree(target.points))
+        """Build the tree, once for all iterations: the target doesn't move.
+
+        That over a whole view is built once for all registrations against it.
+        """
+        view = target.view
+        whole = len(target) == len(view) and bool((np.diff(target.index) == 1).all())
+        return _TreeSearch(tree_of(view) if whole else KdTree(target.points))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
@@ -267,7 +268,7 @@ def _compatible(pairs: Pairs, options: ConsensusOptions, _rng: np.random.Generat
     if len(pairs) > _MOST_COMPARED:
         pairs = pairs.some(np.linspace(0, len(pairs) - 1, _MOST_COMPARED).astype(np.int64))
     p, q = pairs.source, pairs.target
-    one, other = (np.linalg.norm(x[:, None] - x, axis=2) for x in (p, q))
+    one, other = (cdist(x, x) for x in (p, q))
     sigma = np.sqrt(pairs.variance[:, None] + pairs.variance)
     # Points at one place agree with all that one of them agrees with, and fix no rotation.
     apart = np.minimum(one, other) > 2 * options.sigmas * sigma
