@@ -43,7 +43,7 @@ _MOST_PATCHES, _LEAST_PATCHES = 120, 12
 _SHARES = np.r_[0.0, np.geomspace(0.03, 300.0, 9)]
 # Lengths of correlation that are tried, from the patches' edge to this many sizes of the overlap:
 # what bends a view may reach further than what both views share of it.
-_LENGTHS, _FURTHEST = 5, 2.5
+_LENGTHS, _FURTHEST = 5, 4.0
 # Least slope of the gradient, as a share of what the matches and their weights say, and points of
 # which it is measured.
 _STEEPNESS, _TRIED = 0.1, 1500
@@ -204,7 +204,7 @@ class _Patches:
     @classmethod
     def of(cls, pairs: _Pairs, unit: Float64) -> _Patches:
         """Divide the points into cubes, and those of a cube by the axis that their normals face."""
-        facing = np.abs(pairs.normals).argmax(1)
+        facing = np.abs(pairs.normals).argmax(1).astype(np.int64)
         edge = _EDGE * pairs.resolution
         while True:
             cell = np.floor(pairs.points / edge).astype(np.int64)
@@ -230,7 +230,7 @@ class _Patches:
             mean(pairs.normals),
             mean(pairs.residual)[:, 0],
             mean(J),
-            total[told],
+            np.asarray(total[told], np.float64),
             edge,
         )
 
@@ -252,9 +252,10 @@ def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) ->
     else:  # nothing can be learnt of what they share: as few independent points as there may be
         meat = NEIGHBOURS * pairs.noise**2 * held.T @ pairs.weighed(unit) @ held
     bread = np.linalg.inv(held.T @ slope @ held)
-    # A pose that comes from elsewhere is off by the step that would be made from it, or may be.
+    # A pose that was found in another way differs from where the points would take it: half of the
+    # square is the variance that two estimates of the same share.
     step = bread @ held.T @ pairs.gradient(pairs.centre, unit)
-    C = bread @ meat @ bread + np.outer(step, step)
+    C = bread @ meat @ bread + 0.5 * np.outer(step, step)
     return np.asarray(H + held @ np.linalg.inv(C) @ held.T, np.float64)
 
 

@@ -1,0 +1,111 @@
+"""What is told of the errors of a pose between two clouds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from registration_scenes import bumpy_ball, view
+from tofuse.geometry import se3
+from tofuse.recordings.frames import CloudFrame
+from tofuse.registration.base import Registration
+from tofuse.registration.cloud_agreement import CloudMap
+from tofuse.registration.cloud_uncertainty import cloud_information, cloud_unobservable
+from tofuse.registration.coarse_to_fine import CoarseToFine
+
+SIZE = 0.05
+# 99.9 % of a chi square of six dimensions.
+HARDLY_EVER = 22.5
+
+
+def maps(*clouds):
+    return tuple(CloudMap.of(cloud, SIZE, cloud) for cloud in clouds)
+
+
+def sigma(information):
+    """Largest standard deviation of the position and of the angle."""
+    C = np.linalg.inv(information)
+    return [np.sqrt(np.linalg.eigvalsh(C[k, k])[-1]) for k in (slice(0, 3), slice(3, 6))]
+
+
+def aligned(seed, bend=0.0, points=4000, noise=0.004):
+    """A ball with bumps seen twice, once bent: the maps, and the pose that ICP finds."""
+    first, second = (bumpy_ball(points, seed + k, noise) for k in (0, 1000))
+    first[:, 0] += bend * np.sin(6 * first[:, 1] + seed)
+    first[:, 2] += bend * np.sin(5 * first[:, 0] + seed)
+    clouds = view(first), view(second)
+    start = np.eye(4)
+    return maps(*clouds), CoarseToFine().at(SIZE, *clouds, start, start).T_target_source
+
+
+def nees(seed, bend):
+    (source, target), T = aligned(seed, bend)
+    xi = se3.log(se3.inverse(T))  # the truth is the identity
+    return xi @ cloud_information(source, target, T, np.zeros((0, 6))) @ xi
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.01])
+def test_errors_are_as_large_as_stated(bend):
+    found = np.array([nees(seed, bend) for seed in range(6)])
+    assert (found < HARDLY_EVER).all()
+    assert np.median(found) > 0.1  # nor far smaller
+
+
+def test_what_bends_a_cloud_makes_its_pose_less_certain():
+    plain, bent = (
+        cloud_information(*aligned(0, bend)[0], np.eye(4), np.zeros((0, 6))) for bend in (0, 0.01)
+    )
+    for known, doubted in zip(sigma(plain), sigma(bent), strict=True):
+        assert doubted > 2 * known
+
+
+def test_points_that_share_an_error_tell_no_more_than_a_few_of_them():
+    few, many = (
+        cloud_information(*aligned(0, 0.01, points)[0], np.eye(4), np.zeros((0, 6)))
+        for points in (2000, 8000)
+    )
+    for a, b in zip(sigma(few), sigma(many), strict=True):
+        assert b > 0.6 * a  # half of it, if they were independent
+
+
+def test_a_wall_holds_three_directions_and_bounds_no_other():
+    rng = np.random.default_rng(0)
+    walls = [
+        CloudFrame.of(np.c_[rng.uniform(-1, 1, (4000, 2)), 2 + rng.normal(0, 0.004, 4000)], index=k)
+        for k in range(2)
+    ]
+    source, target = maps(*walls)
+    free = cloud_unobservable(source, target, np.eye(4))
+    assert len(free) == 3
+    information = cloud_information(source, target, np.eye(4), free)
+    for direction in free:
+        assert direction @ information @ direction < 1 / 10**2
+    towards = np.array([0, 0, 1.0, 0, 0, 0])
+    assert towards @ information @ towards > 1 / 0.01**2
+
+
+def test_clouds_that_do_not_meet_know_nothing():
+    cloud = view(bumpy_ball(2000, 0))
+    away = CloudFrame.of(cloud.points + np.array([30.0, 0, 0]))
+    source, target = maps(cloud, away)
+    assert len(cloud_unobservable(source, target, np.eye(4))) == 6
+    free = np.zeros((0, 6))
+    assert np.diag(cloud_information(source, target, np.eye(4), free)).max() < 1e-2
+
+
+def test_a_pose_from_elsewhere_is_off_by_what_the_points_say():
+    (source, target), T = aligned(1)
+    off = T @ se3.exp([0.01, 0, 0, 0, 0, 0])
+    free = np.zeros((0, 6))
+    near, far = (cloud_information(source, target, pose, free) for pose in (T, off))
+    x = np.array([1.0, 0, 0, 0, 0, 0])
+    assert 0.003**2 < x @ np.linalg.inv(far) @ x < 0.03**2
+    assert x @ np.linalg.inv(near) @ x < x @ np.linalg.inv(far) @ x
+
+
+def test_the_information_of_a_registration_is_usable():
+    found = Registration(np.eye(4), True, 1, 1, 1, 0.0, 0.0, np.eye(6))
+    (source, target), T = aligned(2)
+    information = cloud_information(source, target, T, found.unobservable)
+    np.testing.assert_allclose(information, information.T)
+    assert np.linalg.eigvalsh(information).min() > 0
