@@ -47,6 +47,8 @@ _LENGTHS, _FURTHEST = 5, 4.0
 # Least slope of the gradient, as a share of what the matches and their weights say, and points of
 # which it is measured.
 _STEEPNESS, _TRIED = 0.1, 1500
+# Residuals below this share of the resolution say nothing about the true error of the points.
+_LEAST_SIGMA = 1e-3
 # Sigma along directions that nothing holds, in sizes of the overlap, or in rad.
 _UNBOUNDED = 100.0
 
@@ -151,7 +153,7 @@ class _Pairs:
     @property
     def noise(self) -> float:
         """Robust standard deviation of the residuals, m."""
-        return max(1.4826 * float(np.median(np.abs(self.residual))), 1e-3 * self.resolution)
+        return max(1.4826 * float(np.median(np.abs(self.residual))), _LEAST_SIGMA * self.resolution)
 
     def kept(self, unit: Float64) -> Float64:
         """(6, 6) sum of w times the symmetrised product of both Jacobians: noise cancels in it."""
@@ -256,6 +258,7 @@ def _information(pairs: _Pairs, slope: Float64, unit: Float64, free: Float64) ->
     # square is the variance that two estimates of the same share.
     step = bread @ held.T @ pairs.gradient(pairs.centre, unit)
     C = bread @ meat @ bread + 0.5 * np.outer(step, step)
+    C += (_LEAST_SIGMA * pairs.resolution) ** 2 / len(pairs.points) * np.eye(len(C))
     return np.asarray(H + held @ np.linalg.inv(C) @ held.T, np.float64)
 
 
