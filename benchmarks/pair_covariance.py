@@ -18,7 +18,7 @@ believed and right (within 5 % of the extent and 4 degrees) the table says
     python benchmarks/pair_covariance.py [--seeds 8] [--first 1008] [--families scans]
 
 The constants were chosen on the recordings of `pairs.py` (seed 0), scans of seeds 0 to 9, and seeds
-1000 to 1007. Views are kept in benchmarks/out/pair_covariance.
+1000 to 1007 (camera clouds: to 1009). Views are kept in benchmarks/out/pair_covariance.
 """
 
 from __future__ import annotations
