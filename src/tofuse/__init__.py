@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from tofuse.pipeline.judging import Judgement, judge
     from tofuse.pipeline.mapper import Mapper
     from tofuse.recordings.arrays import from_arrays
+    from tofuse.pipeline.merging import merge
     from tofuse.recordings.frames import CloudFrame, RangeFrame
     from tofuse.recordings.open import open_recording as open  # noqa: A004
     from tofuse.recordings.recording import Recording
@@ -65,6 +66,7 @@ _HOMES = {
     "inspect": "tofuse.inspection.inspect",
     "judge": "tofuse.pipeline.judging",
     "load": "tofuse.api.result",
+    "merge": "tofuse.pipeline.merging",
     "open": "tofuse.recordings.open",
     "reconstruct": "tofuse.api.result",
     "register": "tofuse.registration.register",
@@ -99,6 +101,7 @@ __all__ = [
     "inspect",
     "judge",
     "load",
+    "merge",
     "open",
     "reconstruct",
     "register",

@@ -224,6 +224,26 @@ def judge(arguments: argparse.Namespace) -> int:
     return status
 
 
+def merge(arguments: argparse.Namespace) -> int:
+    """``tofuse merge``."""
+    from tofuse.pipeline.merging import MergeOptions, merge_files
+    from tofuse.pipeline.run import exit_status
+
+    options = MergeOptions(
+        out=arguments.out,
+        overwrite=arguments.overwrite,
+        tolerance=arguments.tolerance,
+        voxel=arguments.voxel,
+        faces=arguments.faces,
+        seed=arguments.seed or 0,
+        threads=arguments.threads,
+    )
+    with progress_for(as_json=arguments.json) as progress:
+        result = merge_files(arguments.results, options, progress)
+    _tell(result, arguments.out, as_json=arguments.json)
+    return exit_status(result)
+
+
 def _check_overwrite(arguments: argparse.Namespace) -> None:
     """Refuse --overwrite where --out is optional and not given."""
     from tofuse.errors import InputError
@@ -258,6 +278,11 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     from tofuse.results.output import accuracy_json, component_name, plain, reasons_json
     from tofuse.results.ranges import in_words
 
+    sessions = []
+    if result.sessions:
+        from tofuse.pipeline.merging import sentences
+
+        sessions = sentences(result)
     d = result.diagnostics
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
     skipped = sum(f.status == "skipped" for f in d.frames)
@@ -271,6 +296,7 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
                 "reasons": reasons_json(d.reasons),
                 "frames": {**counts, "skipped": skipped},
                 "loops": sum(p.accepted for p in d.loops),
+                "sessions": sessions,
                 "points": len(result.cloud),
                 "seconds": round(sum(d.seconds.values()), 2),
             }
@@ -279,6 +305,8 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     console = Output(highlight=False, soft_wrap=True)
     console.print(f"[bold {COLORS[d.verdict]}]{d.verdict}[/]")
     _print_reasons(console, d.reasons)
+    for line in sessions:
+        console.print(line, markup=False)
     console.print(SEPARATOR.join(card(result)), markup=False)
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]

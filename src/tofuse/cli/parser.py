@@ -46,6 +46,19 @@ exit status:
 """
 
 
+_SESSIONS = """\
+A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must be where it
+was. The first one's world stays. What can't be joined is kept apart, and named.
+
+"""
+_EXIT_MERGE = """\
+exit status:
+  0  a result was written and every readable frame is in one map
+  3  a result was written, but a session or a frame could not be joined
+  2  nothing was written: one line on stderr says why
+"""
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser that says what is wrong in one line."""
 
@@ -95,6 +108,7 @@ def make_parser(kind: type[Parser] = Parser) -> Parser:
     _batch(commands)
     _register(commands)
     _judge(commands)
+    _merge(commands)
     _demo(commands)
     _simulate(commands)
     _inspect(commands)
@@ -309,6 +323,39 @@ def _judge(commands: Any) -> None:
     g = p.add_argument_group("what to read")
     _source(g)
     _selection(g)
+
+
+def _merge(commands: Any) -> None:
+    p = _command(
+        commands,
+        "merge",
+        "put the results of several recordings into one map",
+        epilog=_SESSIONS + _EXIT_MERGE,
+    )
+    p.add_argument(
+        "results",
+        nargs="+",
+        type=Path,
+        metavar="RESULT",
+        help="two or more; the world is the first one's",
+    )
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the map")
+    p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
+    p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+    p.add_argument(
+        "--tolerance",
+        type=_length,
+        metavar="LENGTH",
+        help='accuracy of a "good" map, as 30mm (default: that of the first result)',
+    )
+    p.add_argument(
+        "--faces", type=_count, metavar="N", help="at most so many triangles (as the first result)"
+    )
+    p.add_argument(
+        "--voxel", type=_length, metavar="LENGTH", help="resolution of the model, as 5mm (likewise)"
+    )
+    _seed(p)
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
 
 
 def _demo(commands: Any) -> None:

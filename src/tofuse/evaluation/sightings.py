@@ -124,12 +124,24 @@ def whole(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:
     return frame.keep(kept & frame.valid)
 
 
-def compared(views: Sequence[SurfaceMap], poses: Float64) -> Sightings:
-    """Compare all pairs of prepared views under their poses (N, 4, 4) T_world_camera."""
+def compared(
+    views: Sequence[SurfaceMap], poses: Float64, groups: Sequence[int] | None = None
+) -> Sightings:
+    """Compare pairs of prepared views under their poses (N, 4, 4) T_world_camera.
+
+    Parameters
+    ----------
+    groups
+        Number of the group of each view: pairs within a group are left out. All pairs, unless
+        given.
+    """
     options = AgreementOptions(points=_POINTS)
     axes = poses[:, :3, 2]
     # Cameras that look in opposite directions see no surface from the same side.
-    pairs = np.argwhere(np.triu(axes @ axes.T > 0, 1))
+    facing = axes @ axes.T > 0
+    if groups is not None:
+        facing &= np.not_equal.outer(groups, groups)
+    pairs = np.argwhere(np.triu(facing, 1))
 
     def work(start: int, stop: int) -> list[Sighting]:
         found = []

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
-from tofuse.odometry.base import Odometry, Step, Tracker
+from tofuse.odometry.base import Odometry, Status, Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -88,3 +89,76 @@ class _GivenTracker(Tracker):
         C = covariance(view, [keyframe.target], aligned, options.alignment, options.uncertainty)
         T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ aligned.T_world_source
         return registration_of(aligned, T_keyframe_camera, C)
+
+
+@dataclass(frozen=True, eq=False)
+class StatedPose:
+    """What an earlier result says of a frame.
+
+    Attributes
+    ----------
+    status, reason
+        As of `Step`.
+    T_component_camera
+        (4, 4); None where it has no pose.
+    component
+        Number of the component whose frame that is.
+    """
+
+    status: Status
+    reason: str
+    T_component_camera: Float64 | None = None
+    component: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class StatedPoses(Odometry):
+    """Takes the poses of earlier results as they are, each component in a frame of its own.
+
+    Attributes
+    ----------
+    stated
+        By the index of the frame. Others are lost.
+    options
+        How frames are aligned with keyframes of their component.
+    """
+
+    stated: Mapping[int, StatedPose]
+    options: GivenPoses
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def start(self, seed: int) -> Tracker:
+        """See `Odometry.start`. There is nothing random in it."""
+        return _StatedTracker(self)
+
+
+_UNKNOWN = StatedPose("lost", "no pose was given")
+
+
+class _StatedTracker(Tracker):
+    def __init__(self, odometry: StatedPoses) -> None:
+        self._odometry = odometry
+        self._trackers: dict[int, Tracker] = {}  # by component
+
+    def prepare(self, frame: Frame) -> SurfaceMap | None:
+        """See `Tracker.prepare`."""
+        if self._stated(frame).T_component_camera is None or not isinstance(frame, RangeFrame):
+            return None
+        return surface_map(frame, self._odometry.options.surface)
+
+    def push(
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+    ) -> Step:
+        """See `Tracker.push`."""
+        stated = self._stated(frame)
+        if stated.T_component_camera is None:
+            return Step("lost", stated.reason, None)
+        if stated.component not in self._trackers:
+            self._trackers[stated.component] = self._odometry.options.start(0)
+        tracker = self._trackers[stated.component]
+        step = tracker.push(frame, stated.T_component_camera, surface)
+        return replace(step, status=stated.status, reason=stated.reason, component=stated.component)
+
+    def _stated(self, frame: Frame) -> StatedPose:
+        return self._odometry.stated.get(frame.index, _UNKNOWN)

@@ -281,6 +281,7 @@ class BackEnd:
                 optimisation.parts,
                 closed.told.records,
                 accuracy=accuracy,
+                joins=tuple(self._joins),
             ),
             config=self._config.to_dict(),
             recording={"path": None, "format": "frames", "frames": len(log.entries)},

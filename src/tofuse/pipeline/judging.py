@@ -34,7 +34,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct, view_kind
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.open import open_recording
+from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, evenly
 from tofuse.results.card import bound, length
@@ -254,9 +254,16 @@ def judge_files(
         If the result can't be written; nothing that was there before has changed then.
     """
     options, progress = options or JudgeOptions(), progress or Silent()
-    recording = open_recording(
-        *inputs, format=options.format, camera=options.camera, topic=options.topic
-    ).select(options.start, options.end, options.every)
+    opening = Opening(
+        tuple(Path(path) for path in inputs),
+        options.format,
+        options.camera,
+        options.topic,
+        options.start,
+        options.end,
+        options.every,
+    )
+    recording = opening.open()
     folder = None
     if options.out is not None:
         folder = OutputFolder(options.out, overwrite=options.overwrite)
@@ -268,6 +275,8 @@ def judge_files(
             threads=options.threads,
             progress=progress,
         )
+        told = {**found.refined.recording, "opening": opening.to_dict()}
+        found = replace(found, refined=replace(found.refined, recording=told))
         if folder is not None:
             progress.stage("writing")
             with threadpool_limits(1):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.kernels.threads import thread_count, threads, undivided
+from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
 from tofuse.pipeline.assembly import Assembly
@@ -25,6 +26,7 @@ from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.loops import GivenLoop
+from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import Frame
 from tofuse.results.types import FrameRecord, Reconstruction
 
@@ -200,10 +202,26 @@ class Mapper:
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
         self._progress.advance(self._log.entries[-1].record)
 
-    def interrupt(self) -> None:
-        """Say that the next frame begins another recording: the camera may be elsewhere by then."""
-        self._log.interruptions.append(len(self._log.entries))
+    def interrupt(self, config: Config | None = None) -> None:
+        """Say that the next frame begins another recording: the camera may be elsewhere by then.
+
+        Parameters
+        ----------
+        config
+            Its corrections, filters and odometry are for the frames of this recording, where they
+            are others than so far. Numbers of its components must not have been used before.
+        """
+        if self._log.entries:
+            self._log.interruptions.append(len(self._log.entries))
         self._tracker.interrupt()
+        if config is not None:
+            self._preparation = Preparation(config, self._preparation.counts)
+            self._tracker = config.odometry.start(self.seed)
+
+    @property
+    def views(self) -> Sequence[PosedView[SurfaceMap]]:
+        """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
+        return self._kept.views.views
 
     def end(self) -> None:
         """Say that no frame follows: what only they would ask for need not be kept any longer."""
@@ -236,7 +254,7 @@ class Mapper:
         result = self._assembly().run(self._log, stages or NotKept())
         diagnostics = replace(
             result.diagnostics,
-            removed=self._preparation.removed,
+            removed=self._preparation.counts.shares,
             seconds=dict(self.watch.seconds),
             samples=self._kept.samples.all,
         )

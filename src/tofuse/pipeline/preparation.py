@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,20 +55,43 @@ class Prepared:
     ready: Ready | None
 
 
-class Preparation:
-    """Corrections and filters at work on one recording."""
+@dataclass(frozen=True)
+class Counts:
+    """How many points filters saw and removed, by name."""
 
-    def __init__(self, config: Config) -> None:
+    seen: Counter[str] = field(default_factory=Counter)
+    removed: Counter[str] = field(default_factory=Counter)
+
+    def add(self, removal: Removal) -> None:
+        """Count what a filter removed of a frame."""
+        self.seen[removal.name] += removal.seen
+        self.removed[removal.name] += removal.removed
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Fraction of the points that each filter removed."""
+        return {name: self.removed[name] / max(seen, 1) for name, seen in self.seen.items()}
+
+
+class Preparation:
+    """Corrections and filters at work on one recording.
+
+    Parameters
+    ----------
+    counts
+        Of the recordings before, which these are added to.
+
+    Attributes
+    ----------
+    counts
+        What filters removed so far.
+    """
+
+    def __init__(self, config: Config, counts: Counts | None = None) -> None:
+        self.counts = Counts() if counts is None else counts
         self._config = config
         self._correctors = [correction.start() for correction in config.corrections]
         self._history: deque[Frame] = deque(maxlen=config.window - 1)
-        self._seen: dict[str, int] = {}
-        self._removed: dict[str, int] = {}
-
-    @property
-    def removed(self) -> dict[str, float]:
-        """Fraction of the points that each filter removed so far, by name."""
-        return {name: self._removed[name] / max(seen, 1) for name, seen in self._seen.items()}
 
     def ahead(self, frame: Frame, tracker: Tracker) -> Prepared | None:
         """Make what can be made of a frame before its turn; None if nothing can.
@@ -116,8 +139,7 @@ class Preparation:
             ready = self._filtered(frame, past)
         self._history.append(frame)
         for removal in ready.removals:
-            self._seen[removal.name] = self._seen.get(removal.name, 0) + removal.seen
-            self._removed[removal.name] = self._removed.get(removal.name, 0) + removal.removed
+            self.counts.add(removal)
         return ready
 
     def placed(self, frame: Frame, T_component_camera: Float64) -> None:

@@ -102,11 +102,14 @@ def _once(
     with threadpool_limits(1):
         tracked = stages.load(_TRACKING)
         if tracked is None:
-            tracked = _Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
+            tracked = Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
         elif tracked.done:
             progress.note(f"goes on after frame {tracked.done} of a run that was stopped")
         tracked.mapper.go_on(threads, progress)
-        _track(tracked, recording, config.window, stages)
+        if tracked.done < len(recording):
+            push_frames(tracked, recording, config.window, stages)
+            tracked.mapper.end()
+            _save(tracked, stages)
         if len(tracked.unreadable) == len(recording):
             raise InputError(
                 f"none of the {len(recording)} frames can be read (first: {tracked.unreadable[0]})",
@@ -127,7 +130,7 @@ def _described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruct
 
 
 @dataclass(eq=False)
-class _Tracked:
+class Tracked:
     """How far tracking has come: the mapper, how many frames it saw, and why some can't be read."""
 
     mapper: Mapper
@@ -135,10 +138,16 @@ class _Tracked:
     unreadable: list[str] = field(default_factory=list)
 
 
-def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages) -> None:
-    """Give the mapper the frames that it has not seen."""
-    if tracked.done == len(recording):
-        return
+def push_frames(tracked: Tracked, recording: Recording, window: int, stages: Stages) -> None:
+    """Give the mapper the frames of a recording that it has not seen.
+
+    Parameters
+    ----------
+    window
+        How many frames the filters look at, the current one included.
+    stages
+        Is offered what there is, whenever it is due.
+    """
     mapper, odometry, gravity = tracked.mapper, recording.odometry, recording.gravity
     recent: dict[int, Frame] = {}
     first = tracked.done
@@ -166,11 +175,9 @@ def _track(tracked: _Tracked, recording: Recording, window: int, stages: Stages)
         tracked.done = k + 1
         if tracked.done < len(recording) and stages.due():
             _save(tracked, stages)
-    mapper.end()
-    _save(tracked, stages)
 
 
-def _save(tracked: _Tracked, stages: Stages) -> None:
+def _save(tracked: Tracked, stages: Stages) -> None:
     with tracked.mapper.watch.timing("keeping"):
         stages.save(_TRACKING, tracked)
 

@@ -33,9 +33,8 @@ from tofuse.pipeline.reconstruct import (
 )
 from tofuse.posegraph.given import read_loops
 from tofuse.recordings.frames import CloudFrame, Frame
-from tofuse.recordings.open import open_recording
+from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.still import average_still
 from tofuse.results.output import (
     RECORDING,
     OutputFolder,
@@ -97,12 +96,8 @@ def run(
     seed = _seed(options)
     watch = Stopwatch()
     with watch.timing("opening"):
-        recording = open_recording(
-            *inputs, format=options.format, camera=options.camera, topic=options.topic
-        )
-        recording = recording.select(options.start, options.end, options.every)
-        if options.average_still:
-            recording = average_still(recording)
+        opening = _opening(inputs, options)
+        recording = opening.open()
         _preview(recording, progress)
         config = resolve(options, view_kind(recording))
         if not options.object:  # of an object that is the world no sensor knows the motion
@@ -143,6 +138,7 @@ def run(
         if size and texture is None:
             progress.note("no texture: there is no surface, or neither colour nor amplitude")
         result = with_findings(result, findings, turning=options.object)
+        result = replace(result, recording={**result.recording, "opening": opening.to_dict()})
         if device := device_sentence(recording, result):
             progress.note(device)
         seconds = {**watch.seconds, **result.diagnostics.seconds}
@@ -161,6 +157,20 @@ def run(
     finally:
         folder.discard()
     return result
+
+
+def _opening(inputs: Sequence[str | Path], options: Options) -> Opening:
+    """How the recording is opened, which the result remembers."""
+    return Opening(
+        tuple(Path(path) for path in inputs),
+        options.format,
+        options.camera,
+        options.topic,
+        options.start,
+        options.end,
+        options.every,
+        options.average_still,
+    )
 
 
 def _preview(recording: Recording, progress: Progress) -> None:

@@ -65,8 +65,6 @@ _HARDLY, _SAME_PLACE = 2.0, 0.3
 _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
 # Links that say something else than those that are believed must weigh less than this.
 _RIVAL = 0.5
-# View pairs that are tried between the same two components.
-_TRIES = 4
 _SHIFT = 0.35
 _NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
 
@@ -162,21 +160,32 @@ class Joining:
         each frame.
     bridge
         Whether short gaps may be bridged by motion alone.
+    tries
+        How many view pairs are tried between the same two components.
+    main
+        Which group is the main one: of the most frames ("largest"), or with the component of the
+        lowest number ("first").
     """
 
     search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
     searches: int = 12
     searches_per_frame: float = 0.02
     bridge: bool = True
+    tries: int = 4
+    main: Literal["largest", "first"] = "largest"
 
     def __post_init__(self) -> None:
         if not 0 <= self.searches <= 1_000_000:
             raise ValueError(f"searches is {self.searches}, not 0 or more")
         if not 0 <= self.searches_per_frame <= 100:
             raise ValueError(f"searches_per_frame is {self.searches_per_frame}, not 0 or more")
+        if not 0 <= self.tries <= 1_000_000:
+            raise ValueError(f"tries is {self.tries}, not 0 or more")
+        if self.main not in ("largest", "first"):
+            raise ValueError(f"main is {self.main!r}, not largest or first")
 
     def join(self, stretches: Sequence[Stretch], links: Sequence[Link]) -> list[Group]:
-        """Join what can be joined; largest group first.
+        """Join what can be joined; the main group first, then the largest ones.
 
         Parameters
         ----------
@@ -309,7 +318,7 @@ class _Joiner:
                 continue
             ends = (int(component[i[k]]), int(component[j[k]]))
             between[ends] = between.get(ends, 0) + 1
-            if between[ends] > _TRIES:
+            if between[ends] > self._options.tries:
                 continue
             self._tried.add(pair)
             link = self._registered(first, second)
@@ -361,7 +370,7 @@ class _Joiner:
                 self._merge(a, b, link, [Join(link, "motion", True)])
 
     def groups(self) -> list[Group]:
-        """What is joined, largest first."""
+        """What is joined, the main group first, then the largest ones."""
         found = []
         for island in self._islands:
             first = min(island.T, key=lambda c: int(self._stretches[c].frames[0]))
@@ -376,7 +385,9 @@ class _Joiner:
                 )
             )
         began = [int(self._stretches[next(iter(g.T_group_component))].frames[0]) for g in found]
-        order = sorted(range(len(found)), key=lambda k: (-found[k].frames, began[k]))
+        lowest = min(self._stretches) if self._options.main == "first" else None
+        main = [lowest in g.T_group_component for g in found]
+        order = sorted(range(len(found)), key=lambda k: (not main[k], -found[k].frames, began[k]))
         return [found[k] for k in order]
 
     def _bridged_from(self, island: _Island, first: int) -> frozenset[int]:

@@ -388,7 +388,10 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
         {
             "schema": 1,
             "version": __version__,
-            "input": {key: result.recording[key] for key in ("path", "format", "frames")},
+            "input": {
+                **{key: result.recording[key] for key in ("path", "format", "frames")},
+                "opening": result.recording.get("opening"),
+            },
             "warnings": result.recording.get("warnings", []),
             "findings": result.recording.get("findings", []),
             "seed": result.seed,
@@ -411,9 +414,23 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                     "covariance": None if f.covariance is None else f.covariance.ravel(),
                     "unobservable": f.unobservable,
                     "component": f.component,
+                    "session": _session_of(f.index, result),
                 }
                 for f in d.frames
             ],
+            "sessions": [
+                {
+                    "name": s.name,
+                    "result": s.result,
+                    "opening": s.opening,
+                    "config": s.config,
+                    "first": s.first,
+                    "count": s.count,
+                    "T_main_session": s.T_main_session,
+                }
+                for s in result.sessions
+            ],
+            "session_pairs": [asdict(pair) for pair in result.session_pairs],
             "T_up_world": T_up_world(result.mesh, result.trajectory),
             "components": [_component(c) for c in result.components],
             "loops": [
@@ -455,6 +472,11 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
     )
+
+
+def _session_of(index: int, result: Reconstruction) -> int | None:
+    """Number of the session that a frame is of; None where there is only one."""
+    return next((k for k, session in enumerate(result.sessions) if session.has(index)), None)
 
 
 def clock_of(folder: Path) -> tuple[Float64, NDArray[np.intp]] | None:

@@ -14,6 +14,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.odometry.base import Status
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
+from tofuse.posegraph.joining import Join
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
 from tofuse.results.ranges import Range
@@ -119,6 +120,8 @@ class Diagnostics:
         95 % bounds of the poses' errors.
     calibrated
         How the camera's calibration was corrected; None where it was left as stated.
+    joins
+        What joins the components of the main model.
     """
 
     verdict: Verdict
@@ -136,6 +139,7 @@ class Diagnostics:
     samples: tuple[FrameSample, ...] = ()
     accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
     calibrated: SelfCalibration | None = None
+    joins: tuple[Join, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +169,74 @@ class Component:
     def connected(self) -> bool:
         """Whether it is part of the main model."""
         return self.T_main_component is not None
+
+
+@dataclass(frozen=True, eq=False)
+class SessionRecord:
+    """One of several recordings in one map.
+
+    Attributes
+    ----------
+    name
+        What it is called in words, unlike the others.
+    result
+        Folder of the result that it came from.
+    opening
+        How its recording was opened, as plain data.
+    config
+        By which its frames are corrected and filtered, as plain data.
+    first, count
+        Index of the first frame of its recording, and how many that has: of the merged frames,
+        those from `first` to before `first + count` are of this session.
+    T_main_session
+        (4, 4) from the world of its own result into this one's; None where it is not part of the
+        main model.
+    """
+
+    name: str
+    result: str
+    opening: dict[str, Any]
+    config: dict[str, Any]
+    first: int
+    count: int
+    T_main_session: Float64 | None
+
+    def has(self, index: int) -> bool:
+        """Whether a frame is of this session."""
+        return self.first <= index < self.first + self.count
+
+
+@dataclass(frozen=True)
+class SessionPair:
+    """Whether two sessions overlap, and how sure that is.
+
+    Attributes
+    ----------
+    a, b
+        Numbers of the sessions; a < b.
+    joined
+        Whether they are in one model; it may be by way of others.
+    before
+        Whether an earlier result had joined them.
+    links
+        How many registrations between their views hold in the final model.
+    probability
+        That the best of them is right, 0 to 1; None without any.
+    overlap
+        Share of the views of either that see surfaces which the other sees too, the smaller one.
+    support
+        Share of what these say that supports the final poses and does not contradict them; None
+        where they don't overlap.
+    """
+
+    a: int
+    b: int
+    joined: bool
+    before: bool = False
+    links: int = 0
+    probability: float | None = None
+    overlap: float = 0.0
+    support: float | None = None
 
 
 def in_main_model(record: FrameRecord, components: Sequence[Component]) -> bool:
@@ -201,6 +273,9 @@ class Reconstruction:
     components
         Component 0 is the main one: trajectory, graph, cloud and mesh are of what is connected to
         it. Empty where nothing looked for them.
+    sessions, session_pairs
+        The recordings of several results that were merged, and what connects each two of them;
+        empty for a run.
     """
 
     trajectory: Float64
@@ -214,6 +289,8 @@ class Reconstruction:
     threads: int
     mesh: Mesh | None = None
     components: tuple[Component, ...] = ()
+    sessions: tuple[SessionRecord, ...] = ()
+    session_pairs: tuple[SessionPair, ...] = ()
 
     def __repr__(self) -> str:
         a = self.diagnostics.accuracy

@@ -1,0 +1,384 @@
+"""Merging: the results of several runs in one map.
+
+Each session, a recording with the poses that its result states, is a component of one large run.
+From there on everything is as in a run: components are joined where views of both sides say so and
+none contradicts, loops between them are closed, all views are refined together, and fused. The
+world stays that of the first result. What can't be joined stays apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from tofuse.evaluation.sightings import Sightings, compared
+from tofuse.evaluation.trajectory import align
+from tofuse.geometry import se3
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
+from tofuse.pipeline.checkpoint import NotKept
+from tofuse.pipeline.config import Config, from_method
+from tofuse.pipeline.mapper import Mapper
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.reconstruct import Tracked, push_frames
+from tofuse.pipeline.sessions import Session, read_sessions
+from tofuse.posegraph.views import PosedView
+from tofuse.recordings.recording import Recording, Source, evenly
+from tofuse.recordings.sources import JoinedSource
+from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.types import (
+    Reason,
+    Reconstruction,
+    SessionPair,
+    SessionRecord,
+)
+
+Float64 = NDArray[np.float64]
+
+# View pairs that are registered at most to join the same two sessions, and searches in all.
+_TRIES, _SEARCHES = 24, 48
+# Views of each session that are compared with those of the others.
+_COMPARED = 60
+
+
+@dataclass(frozen=True)
+class MergeOptions:
+    """The options of ``tofuse merge``; see its ``--help``."""
+
+    out: Path
+    overwrite: bool = False
+    tolerance: float | None = None
+    voxel: float | None = None
+    faces: int | None = None
+    seed: int = 0
+    threads: int | None = None
+
+
+def merge(
+    results: Sequence[str | Path],
+    *,
+    tolerance_m: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Put the results of several runs into one map, in the world of the first.
+
+    Parameters
+    ----------
+    results
+        Output folders of `tofuse run` or `tofuse merge`; at least two sessions. Their recordings
+        must be where they were.
+    tolerance_m
+        As of `Config`; that of the first result unless given.
+    seed, threads
+        As of `reconstruct`.
+
+    Returns
+    -------
+    A result as of a run, with `sessions` and `session_pairs`. What can't be joined to the first one
+    is a component with a model of its own.
+
+    Raises
+    ------
+    InputError
+        If something is no result, or its recording is gone or has changed.
+    """
+    progress = progress or Silent()
+    sessions = read_sessions(results, threads, progress)
+    config = merged_config(sessions)
+    if tolerance_m is not None:
+        config = replace(config, tolerance_m=tolerance_m)
+    return merge_sessions(sessions, config, seed=seed, threads=threads, progress=progress)
+
+
+def merged_config(sessions: Sequence[Session]) -> Config:
+    """How sessions are joined, refined and fused: by default, the model as of the first one."""
+    first = sessions[0].config
+    default = from_method("default")
+    outside = default.outside if all(s.config.outside for s in sessions) else ()
+    joining = replace(default.joining, main="first", tries=_TRIES, searches=_SEARCHES)
+    return replace(
+        default,
+        corrections=first.corrections,
+        filters=first.filters,
+        model_filters=first.model_filters,
+        odometry=first.odometry,
+        fusion=first.fusion,
+        tolerance_m=first.tolerance_m,
+        outside=outside,
+        joining=joining,
+        self_calibration=False,  # done for each session
+    )
+
+
+def merge_sessions(
+    sessions: Sequence[Session],
+    config: Config,
+    *,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Join, refine and fuse sessions; see `merge`."""
+    progress = progress or Silent()
+    recording, firsts = joined_recording(sessions)
+    mapper = Mapper(config, seed=seed, threads=threads, progress=progress)
+    progress.stage("reading sessions", len(recording))
+    with threadpool_limits(1):
+        for session, first in zip(sessions, firsts, strict=True):
+            mapper.interrupt(_config_of(session, first))
+            own = replace(recording, indices=session.recording.indices + first)
+            push_frames(Tracked(mapper), own, session.config.window, NotKept())
+        result = mapper.finish()
+        return _told(result, sessions, firsts, mapper.views, recording)
+
+
+def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]:
+    """The recordings of all sessions as one, and the index of the first frame of each."""
+    sources: list[Source] = []
+    names: list[str] = []
+    firsts, count = [], 0
+    for session in sessions:
+        source = session.recording.source
+        firsts.append(count)
+        count += len(source.timestamps)
+        if isinstance(source, JoinedSource):
+            sources += source.parts
+            names += [f"{session.name}, {part['name']}" for part in source.metadata["parts"]]
+        else:
+            sources.append(source)
+            names.append(session.name)
+    indices = [s.recording.indices + first for s, first in zip(sessions, firsts, strict=True)]
+    formats = dict.fromkeys(s.recording.format for s in sessions)
+    path = " ".join(s.recording.path for s in sessions)
+    joined = JoinedSource(sources, names)
+    return Recording(joined, path, "+".join(formats), np.concatenate(indices)), firsts
+
+
+def _config_of(session: Session, first: int) -> Config:
+    """How the frames of a session are prepared, and which poses they have."""
+    given = session.config.odometry
+    assert isinstance(given, GivenPoses)
+    stated = {k + first: pose for k, pose in session.stated.items()}
+    return replace(session.config, odometry=StatedPoses(stated, given))
+
+
+def _told(
+    result: Reconstruction,
+    sessions: Sequence[Session],
+    firsts: Sequence[int],
+    views: Sequence[PosedView[SurfaceMap]],
+    recording: Recording,
+) -> Reconstruction:
+    """The result, which says what became of each session."""
+    pose = {
+        record.index: T
+        for record, T in zip(result.diagnostics.frames, result.trajectory, strict=True)
+        if np.isfinite(T).all()
+    }
+    records = tuple(
+        SessionRecord(
+            session.name,
+            str(session.result),
+            session.opening.to_dict(),
+            session.config.to_dict(),
+            first,
+            len(session.recording.source.timestamps),
+            _T_main_session(session.posed, first, pose, fixed=k == 0),
+        )
+        for k, (session, first) in enumerate(zip(sessions, firsts, strict=True))
+    )
+    result = replace(
+        result,
+        sessions=records,
+        recording={
+            "path": recording.path,
+            "format": recording.format,
+            "frames": len(recording),
+            "warnings": list(recording.warnings),
+        },
+    )
+    result = replace(result, session_pairs=_pairs(result, sessions, views, pose))
+    reasons = tuple(_named(reason, result) for reason in result.diagnostics.reasons)
+    return replace(result, diagnostics=replace(result.diagnostics, reasons=reasons))
+
+
+def _T_main_session(
+    posed: dict[int, StatedPose], first: int, pose: dict[int, Float64], *, fixed: bool
+) -> Float64 | None:
+    """(4, 4) from the world of a session's result into the main one; None where it is apart.
+
+    The refinement has moved its frames a little against each other, so this is what fits best; but
+    of the first session, whose world is the main one, its first frame counts.
+    """
+    main = min((s.component for s in posed.values()), default=None)
+    both = [k for k, s in posed.items() if s.component == main and k + first in pose]
+    if not both:
+        return None
+    stated = np.array([posed[k].T_component_camera for k in both])
+    here = np.array([pose[k + first] for k in both])
+    if fixed:
+        return np.asarray(here[0] @ se3.inverse(stated[0]), np.float64)
+    return align(stated, here)
+
+
+def _pairs(
+    result: Reconstruction,
+    sessions: Sequence[Session],
+    views: Sequence[PosedView[SurfaceMap]],
+    pose: dict[int, Float64],
+) -> tuple[SessionPair, ...]:
+    """What connects each two of the sessions."""
+    records = result.sessions
+
+    def number(index: int) -> int:
+        return next(k for k, record in enumerate(records) if record.has(index))
+
+    links: dict[tuple[int, int], set[frozenset[int]]] = {}
+    best: dict[tuple[int, int], float] = {}
+    for join in result.diagnostics.joins:
+        a, b = sorted((number(join.link.i), number(join.link.j)))
+        links.setdefault((a, b), set()).add(frozenset((join.link.i, join.link.j)))
+        said = join.link.registration.probability
+        if said is not None:
+            best[a, b] = max(best.get((a, b), 0.0), said)
+    for loop in result.diagnostics.loops:
+        if loop.accepted:
+            a, b = sorted((number(loop.i), number(loop.j)))
+            links.setdefault((a, b), set()).add(frozenset((loop.i, loop.j)))
+    mine = [[v for v in views if record.has(v.index) and v.index in pose] for record in records]
+    mine = [[some[k] for k in evenly(np.arange(len(some)), _COMPARED)] for some in mine]
+    before = [{s.component for s in session.posed.values()} for session in sessions]
+    pairs = []
+    for a, b in combinations(range(len(records)), 2):
+        seen = _seen(mine[a], mine[b], pose)
+        overlap = np.isfinite(seen.share_of_views()) if len(seen.frames) else np.zeros(0, bool)
+        n = len(mine[a])
+        shares = [float(some.mean()) if len(some) else 0.0 for some in (overlap[:n], overlap[n:])]
+        share = seen.share()
+        pairs.append(
+            SessionPair(
+                a,
+                b,
+                bool(mine[a]) and bool(mine[b]),
+                bool(before[a] & before[b]),
+                len(links.get((a, b), ())),
+                best.get((a, b)),
+                min(shares),
+                float(share) if np.isfinite(share) else None,
+            )
+        )
+    return tuple(pairs)
+
+
+def _seen(
+    ours: Sequence[PosedView[SurfaceMap]],
+    theirs: Sequence[PosedView[SurfaceMap]],
+    pose: dict[int, Float64],
+) -> Sightings:
+    """What views of two sessions say of each other."""
+    both = [*ours, *theirs]
+    poses = np.array([pose[v.index] for v in both]).reshape(-1, 4, 4)
+    groups = [0] * len(ours) + [1] * len(theirs)
+    return compared([v.view for v in both], poses, groups)
+
+
+def _named(reason: Reason, result: Reconstruction) -> Reason:
+    """A reason that names the sessions which could not be joined."""
+    if reason.code != "disconnected":
+        return reason
+    apart = [s.name for s in result.sessions if s.T_main_session is None]
+    if not apart:
+        return reason
+    names = ", ".join(apart)
+    main = ", ".join(s.name for s in result.sessions if s.T_main_session is not None)
+    text = f"No overlap could be confirmed between {main} and {names}. {reason.text}"
+    return replace(reason, text=text)
+
+
+def sentences(result: Reconstruction) -> list[str]:
+    """What to say of the sessions: one line for each two, and one for each that stays apart."""
+    names = [session.name for session in result.sessions]
+    found = []
+    for pair in result.session_pairs:
+        a, b = names[pair.a], names[pair.b]
+        if not pair.joined:
+            continue
+        if not pair.overlap and not pair.links:
+            found.append(f"{a} and {b} are in one map, but see nothing in common.")
+            continue
+        said = f"{a} and {b} overlap: {pair.overlap:.0%} of the views"
+        if pair.links:
+            said += f", {pair.links} registration{'s' * (pair.links > 1)}"
+        if pair.probability is not None:
+            said += f", the best of them right with a probability of {pair.probability:.1%}"
+        if pair.support is not None:
+            said += f"; {pair.support:.0%} of what both saw agrees"
+        found.append(f"{said}.")
+    found += [
+        f"{s.name} stays apart: no overlap with the others could be confirmed."
+        for s in result.sessions
+        if s.T_main_session is None
+    ]
+    return found
+
+
+def merge_files(
+    results: Sequence[str | Path], options: MergeOptions, progress: Progress | None = None
+) -> Reconstruction:
+    """Merge results and write the output folder.
+
+    Raises
+    ------
+    InputError
+        See `merge`.
+    OutputError
+        If the result can't be written; nothing that was there before has changed then.
+    """
+    progress = progress or Silent()
+    progress.stage("opening")
+    sessions = read_sessions(results, options.threads, progress)
+    config = merged_config(sessions)
+    fusion = config.fusion
+    if options.voxel is not None:
+        fusion = replace(fusion, voxel_m=options.voxel)
+    if options.faces is not None:
+        fusion = replace(fusion, faces=options.faces)
+    config = replace(config, fusion=fusion)
+    if options.tolerance is not None:
+        config = replace(config, tolerance_m=options.tolerance)
+    folder = OutputFolder(options.out, overwrite=options.overwrite)
+    try:
+        result = merge_sessions(
+            sessions, config, seed=options.seed, threads=options.threads, progress=progress
+        )
+        progress.stage("writing")
+        with threadpool_limits(1):
+            write_result(result, folder, _report)
+    finally:
+        folder.discard()
+    return result
+
+
+def _report(result: Reconstruction, folder: Path) -> None:
+    from tofuse.report.extras import ReportExtras
+    from tofuse.report.html import write_report
+    from tofuse.report.pictures import draw
+    from tofuse.viewer.kept import NAME, write_kept
+
+    pictures = draw(result.diagnostics.samples)
+    names = ", ".join(session.name for session in result.sessions)
+    extras = ReportExtras(
+        title=f"{names} merged" if names else f"{folder.name} of a merged result",
+        headline=" ".join(sentences(result)),
+        pictures=pictures,
+    )
+    write_report(result, folder / "report.html", extras)
+    write_kept(result, pictures, folder / NAME)

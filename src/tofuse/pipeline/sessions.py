@@ -1,0 +1,280 @@
+"""Results of earlier runs as sessions: recordings, opened again, with the poses they state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.trajectory import read_tum
+from tofuse.odometry.base import Status
+from tofuse.odometry.given import GivenPoses, StatedPose
+from tofuse.odometry.keyframes import Keyframes
+from tofuse.pipeline.config import Config, changed, from_method, kind_of
+from tofuse.pipeline.learn import learnt
+from tofuse.pipeline.progress import Progress
+from tofuse.pipeline.reconstruct import fitted
+from tofuse.recordings.opening import Opening
+from tofuse.recordings.recording import Recording
+from tofuse.results.output import (
+    RECORDING,
+    component_name,
+    frames_in_main_model,
+    is_result,
+    read_run_json,
+)
+
+Float64 = NDArray[np.float64]
+
+_REMEDY = "give the --out of `tofuse run`"
+# Times of frames that differ by more are not those of the same recording, s.
+_SAME_TIME = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """One recording, and what a result states of its frames.
+
+    Attributes
+    ----------
+    name
+        What it is called in words.
+    result
+        Folder of the result.
+    opening
+        How its recording was opened.
+    recording
+        The frames that the result is of.
+    config
+        By which they are corrected and filtered, with odometry "given".
+    stated
+        By the index of a frame in the recording. Components are numbered over all sessions: those
+        of one result that were joined have the same number and frame.
+    """
+
+    name: str
+    result: Path
+    opening: Opening
+    recording: Recording
+    config: Config
+    stated: Mapping[int, StatedPose]
+
+    @property
+    def posed(self) -> dict[int, StatedPose]:
+        """What has a pose."""
+        return {k: s for k, s in self.stated.items() if s.T_component_camera is not None}
+
+
+def read_sessions(
+    results: Sequence[str | Path], threads: int | None, progress: Progress
+) -> list[Session]:
+    """Read the sessions of several results, in their order; a merged one gives all of its own.
+
+    Raises
+    ------
+    InputError
+        If a folder holds no result, its recording is gone or another one by now, or holds clouds;
+        or if something was given twice, or a single session.
+    """
+    folders = [Path(each) for each in results]
+    for a, b in combinations(folders, 2):
+        if a.resolve() == b.resolve():
+            raise InputError("is given twice", where=b, remedy="give each result once")
+    sessions: list[Session] = []
+    components = 0
+    for folder in folders:
+        found = list(_of_result(folder, components, threads, progress))
+        sessions += found
+        numbers = [s.component for session in found for s in session.posed.values()]
+        components = max([components, *(number + 1 for number in numbers)])
+    if len(sessions) < 2:
+        raise InputError(
+            "is a single session",
+            where=folders[0] if folders else None,
+            remedy="give two or more results of `tofuse run`",
+        )
+    for one, other in combinations(sessions, 2):
+        _check_different(one, other)
+    return _named_apart(sessions)
+
+
+def _of_result(
+    folder: Path, components: int, threads: int | None, progress: Progress
+) -> Iterator[Session]:
+    """The sessions of one result; its components are numbered from `components`."""
+    if not folder.exists():
+        raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
+    if not folder.is_dir() or not is_result(folder):
+        raise InputError("holds no result (no run.json)", where=folder, remedy=_REMEDY)
+    run = read_run_json(folder / "run.json")
+    try:
+        stated = _stated(folder, run, components)
+        frames = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
+        parts = run.get("sessions") or [
+            {
+                "name": None,
+                "opening": run["input"].get("opening") or _of_old(run["input"]),
+                "config": run["config"],
+                "first": 0,
+                "count": max(frames) + 1,
+            }
+        ]
+        for part in parts:
+            first, count = int(part["first"]), int(part["count"])
+            mine = {k - first: t for k, t in frames.items() if first <= k < first + count}
+            own = {k - first: s for k, s in stated.items() if first <= k < first + count}
+            opening = _where_it_lies(Opening.from_dict(part["opening"], folder), folder)
+            recording = _opened(opening, mine, folder, same_clock=not run.get("sessions"))
+            config = _config(part["config"], recording, folder, threads, progress)
+            name = part["name"] or folder.name or str(folder)
+            yield Session(name, folder, opening, recording, config, own)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
+        ) from error
+
+
+def _of_old(told: Mapping[str, Any]) -> dict[str, Any]:
+    """How the recording of a result of before version 0.2 was opened, as far as it says."""
+    return Opening((Path(told["path"]),)).to_dict()
+
+
+def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:
+    """What a result says of each frame, by index."""
+    poses = _poses(folder, dict(run))
+    main = {k: (T, components) for k, T in poses.items()}
+    apart = [k for k, c in enumerate(run.get("components", ())) if c["T_main_component"] is None]
+    for number, k in enumerate(apart, components + 1):
+        own = folder / component_name(k)
+        if is_result(own):
+            main |= {i: (T, number) for i, T in _poses(own, None).items()}
+    found = {}
+    for frame in run["frames"]:
+        index, status = int(frame["index"]), frame["status"]
+        if status not in get_args(Status):
+            raise ValueError(f"frame {index} is {status!r}")
+        if index in main:
+            T, component = main[index]
+            found[index] = StatedPose(status, str(frame["reason"]), T, component)
+        else:
+            reason = str(frame["reason"]) if status in ("lost", "skipped") else "was in no model"
+            found[index] = StatedPose("lost", reason)
+    return found
+
+
+def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
+    """(4, 4) T_world_camera by index, of the frames in the main model of a folder."""
+    run = read_run_json(folder / "run.json") if run is None else run
+    indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
+    _, poses = read_tum(folder / "trajectory.txt")
+    if len(indices) != len(poses):
+        raise InputError(
+            f"says that {len(indices)} frames have a pose, and trajectory.txt holds {len(poses)}",
+            where=folder / "run.json",
+            remedy="copy the whole folder, or run again",
+        )
+    return dict(zip(indices, poses, strict=True))
+
+
+def _where_it_lies(opening: Opening, folder: Path) -> Opening:
+    """The recording where it was, or where `tofuse demo` leaves it: beside its result."""
+    beside = folder / RECORDING
+    lies = all(path.exists() for path in opening.paths)
+    if not lies and beside.is_dir() and [path.name for path in opening.paths] == [RECORDING]:
+        return replace(opening, paths=(beside,))
+    return opening
+
+
+def _opened(
+    opening: Opening, frames: Mapping[int, float], folder: Path, *, same_clock: bool
+) -> Recording:
+    """Open the recording of a result, and check that it still is what it was."""
+    for path in (*opening.paths, *((opening.camera,) if opening.camera else ())):
+        if not path.exists():
+            raise InputError(
+                f"needs {path}, which is gone",
+                where=folder,
+                remedy="put it back there, or run `tofuse run` again where it is now",
+            )
+    recording = opening.open()
+    chosen = np.isin(recording.indices, list(frames))
+    same = int(chosen.sum()) == len(frames)
+    recording = replace(recording, indices=recording.indices[chosen])
+    if same and same_clock:
+        times = np.array([frames[k] for k in recording.indices.tolist()])
+        same = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_SAME_TIME))
+    if not same:
+        raise InputError(
+            f"is not of the frames that {recording.path} holds by now",
+            where=folder,
+            remedy="run `tofuse run` again",
+        )
+    frame = recording.first_readable()
+    if frame is not None and kind_of(frame) != "range":
+        raise InputError(
+            "is of clouds, and only results of images can be merged",
+            where=folder,
+            remedy="give their clouds together to one `tofuse run`",
+        )
+    return recording
+
+
+def _config(
+    told: Mapping[str, Any],
+    recording: Recording,
+    folder: Path,
+    threads: int | None,
+    progress: Progress,
+) -> Config:
+    """The configuration of a result, with the odometry that takes poses as they are."""
+    where = f"{folder / 'run.json'}: config"
+    config = changed(from_method("default"), told, where=where)
+    given = GivenPoses()
+    if isinstance(config.odometry, Keyframes | GivenPoses):
+        odometry = config.odometry
+        given = GivenPoses(
+            odometry.surface,
+            odometry.alignment,
+            odometry.uncertainty,
+            odometry.keyframe_angle,
+            odometry.keyframe_distance,
+        )
+    config = replace(config, odometry=given)
+    return learnt(fitted(config, recording), recording, threads, progress)
+
+
+def _check_different(one: Session, other: Session) -> None:
+    """Refuse frames that would count twice."""
+
+    def facts(session: Session) -> tuple[object, ...]:
+        o = session.opening
+        return tuple(path.resolve() for path in o.paths), o.average_still
+
+    both = one.posed.keys() & other.posed.keys()
+    if facts(one) == facts(other) and both:
+        raise InputError(
+            f"is of the same recording as {one.result}: {len(both)} frames are in both",
+            where=other.result,
+            remedy="give one of the two results",
+        )
+
+
+def _named_apart(sessions: list[Session]) -> list[Session]:
+    """Give each session a name of its own."""
+    names = [session.name for session in sessions]
+    taken: set[str] = set()
+    out = []
+    for session, name in zip(sessions, names, strict=True):
+        unlike, number = name, 1
+        while unlike in taken or (number > 1 and unlike in names):
+            number += 1
+            unlike = f"{name} ({number})"
+        taken.add(unlike)
+        out.append(replace(session, name=unlike))
+    return out

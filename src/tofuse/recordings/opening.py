@@ -1,0 +1,79 @@
+"""How a recording was opened, kept beside a result so that it can be opened again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tofuse.errors import InputError
+from tofuse.recordings.open import open_recording
+from tofuse.recordings.recording import Recording
+from tofuse.recordings.still import average_still
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What was asked for when a recording was opened; see `open_recording` and `tofuse run`.
+
+    Attributes
+    ----------
+    paths
+        Files or folders.
+    start, end, every
+        Which frames, see `Recording.select`.
+    average_still
+        Whether stretches in which nothing moves became one frame each.
+    """
+
+    paths: tuple[Path, ...]
+    format: str | None = None
+    camera: Path | None = None
+    topic: str | None = None
+    start: int = 0
+    end: int | None = None
+    every: int = 1
+    average_still: bool = False
+
+    def open(self) -> Recording:
+        """Open the recording; InputError if it can't be."""
+        recording = open_recording(
+            *self.paths, format=self.format, camera=self.camera, topic=self.topic
+        ).select(self.start, self.end, self.every)
+        return average_still(recording) if self.average_still else recording
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, with paths that hold wherever the program is started."""
+        return {
+            "paths": [str(path.absolute()) for path in self.paths],
+            "format": self.format,
+            "camera": None if self.camera is None else str(self.camera.absolute()),
+            "topic": self.topic,
+            "start": self.start,
+            "end": self.end,
+            "every": self.every,
+            "average_still": self.average_still,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], where: str | Path) -> Opening:
+        """Make it of what `to_dict` gave; InputError that names `where` if it is something else."""
+        try:
+            paths = tuple(Path(str(path)) for path in data["paths"])
+            camera, end = data["camera"], data["end"]
+            found = cls(
+                paths,
+                data["format"],
+                None if camera is None else Path(str(camera)),
+                data["topic"],
+                int(data["start"]),
+                None if end is None else int(end),
+                int(data["every"]),
+                bool(data["average_still"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError("does not say how its recording was opened", where=where) from error
+        if not paths:
+            raise InputError("names no recording", where=where)
+        return found
