@@ -43,6 +43,8 @@ Float64 = NDArray[np.float64]
 
 # View pairs that are registered at most to join the same two sessions, and searches in all.
 _TRIES, _SEARCHES = 24, 48
+# Which probability of being right a join must have.
+_SURELY = 0.99
 # Views of each session that are compared with those of the others.
 _COMPARED = 60
 
@@ -103,7 +105,9 @@ def merged_config(sessions: Sequence[Session]) -> Config:
     first = sessions[0].config
     default = from_method("default")
     outside = default.outside if all(s.config.outside for s in sessions) else ()
-    joining = replace(default.joining, main="first", tries=_TRIES, searches=_SEARCHES)
+    joining = replace(
+        default.joining, main="first", tries=_TRIES, searches=_SEARCHES, surely=_SURELY
+    )
     return replace(
         default,
         corrections=first.corrections,
@@ -242,13 +246,12 @@ def _pairs(
         return next(k for k, record in enumerate(records) if record.has(index))
 
     links: dict[tuple[int, int], set[frozenset[int]]] = {}
-    best: dict[tuple[int, int], float] = {}
+    sure: dict[tuple[int, int], float] = {}
     for join in result.diagnostics.joins:
         a, b = sorted((number(join.link.i), number(join.link.j)))
         links.setdefault((a, b), set()).add(frozenset((join.link.i, join.link.j)))
-        said = join.link.registration.probability
-        if said is not None:
-            best[a, b] = max(best.get((a, b), 0.0), said)
+        if join.sure is not None:
+            sure[a, b] = max(sure.get((a, b), 0.0), join.sure)
     for loop in result.diagnostics.loops:
         if loop.accepted:
             a, b = sorted((number(loop.i), number(loop.j)))
@@ -270,7 +273,7 @@ def _pairs(
                 bool(mine[a]) and bool(mine[b]),
                 bool(before[a] & before[b]),
                 len(links.get((a, b), ())),
-                best.get((a, b)),
+                sure.get((a, b)),
                 min(shares),
                 float(share) if np.isfinite(share) else None,
             )
@@ -318,7 +321,7 @@ def sentences(result: Reconstruction) -> list[str]:
         if pair.links:
             said += f", {pair.links} registration{'s' * (pair.links > 1)}"
         if pair.probability is not None:
-            said += f", the best of them right with a probability of {pair.probability:.1%}"
+            said += f", right with a probability of {pair.probability:.1%}"
         if pair.support is not None:
             said += f"; {pair.support:.0%} of what both saw agrees"
         found.append(f"{said}.")

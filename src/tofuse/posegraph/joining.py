@@ -32,7 +32,7 @@ from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
 from tofuse.posegraph.views import PosedView
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
-from tofuse.registration.confidence import CONTRADICTION
+from tofuse.registration.confidence import CONTRADICTION, logistic
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
@@ -66,6 +66,8 @@ _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
 # Links that say something else than those that are believed must weigh less than this.
 _RIVAL = 0.5
 _SHIFT = 0.35
+# No model of probabilities is to be trusted beyond what it was fitted to: some hundred poses.
+_MOST_SURE = 0.998
 _NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
 
 
@@ -114,11 +116,15 @@ class Join:
         "links", or "motion" where the motion over a gap was extrapolated.
     needed
         Whether the component hangs on it; else it is one more that says the same.
+    sure
+        Probability that all that joins the two sides together says what is right; None where it
+        was not asked for.
     """
 
     link: Link
     how: How
     needed: bool
+    sure: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +168,10 @@ class Joining:
         Whether short gaps may be bridged by motion alone.
     tries
         How many view pairs are tried between the same two components.
+    surely
+        Probability that a join is right which it must have, given how many view pairs were tried:
+        who looks often finds something by chance. 0 where that is not asked for, as the motion
+        from one side to the other speaks for the join as well.
     main
         Which group is the main one: of the most frames ("largest"), or with the component of the
         lowest number ("first").
@@ -172,6 +182,7 @@ class Joining:
     searches_per_frame: float = 0.02
     bridge: bool = True
     tries: int = 4
+    surely: float = 0.0
     main: Literal["largest", "first"] = "largest"
 
     def __post_init__(self) -> None:
@@ -181,6 +192,8 @@ class Joining:
             raise ValueError(f"searches_per_frame is {self.searches_per_frame}, not 0 or more")
         if not 0 <= self.tries <= 1_000_000:
             raise ValueError(f"tries is {self.tries}, not 0 or more")
+        if not 0 <= self.surely < 1:
+            raise ValueError(f"surely is {self.surely}, not from 0 to below 1")
         if self.main not in ("largest", "first"):
             raise ValueError(f"main is {self.main!r}, not largest or first")
 
@@ -542,17 +555,53 @@ class _Joiner:
         T_a_b = self._T_a_b(a, b, best)
         extra = self._confirming(a, b, T_a_b, links)
         certain = any(link.certain for link in links)
+        sure = self._sureness(a, b, [*links, *extra]) if self._options.surely else None
         if (
             not (certain or len(links) + len(extra) > 1)
+            or (sure is not None and sure < self._options.surely)
             or self._contradicts(a, b, best)
             or not self._reachable(a, b, T_a_b)
         ):
             between = self._links_between()[self._positions(a, b)]
             self._refused.add(_key(a, b, between))
             return False
-        joins = [Join(link, "links", link is best) for link in [*links, *extra]]
+        joins = [Join(link, "links", link is best, sure) for link in [*links, *extra]]
         self._merge(a, b, best, joins)
         return True
+
+    def _sureness(self, a: _Island, b: _Island, links: Sequence[Link]) -> float:
+        """Probability that links between two islands, which agree, are right.
+
+        Odds multiply as far as views see something else than those before them, and share what
+        each of the view pairs that were tried could have found by chance (Bonferroni).
+        """
+        counted: list[Link] = []
+        total = 0.0
+        for link in sorted(links, key=lambda link: -(link.registration.probability or 0.0)):
+            p = min(link.registration.probability or 0.0, _MOST_SURE)
+            if p <= 0:
+                continue
+            new = min([1.0, *(self._apart(a, b, link, other) / IN_SIGHT for other in counted)])
+            total += new * float(np.log(p / (1 - p)))
+            counted.append(link)
+        ours = {f for f, c in self._component_of.items() if c in a.T}
+        theirs = {f for f, c in self._component_of.items() if c in b.T}
+        tried = sum(
+            (i in ours and j in theirs) or (i in theirs and j in ours) for i, j in self._tried
+        )
+        return logistic(total - float(np.log(max(tried, 1))))
+
+    def _apart(self, a: _Island, b: _Island, link: Link, other: Link) -> float:
+        """How far the views of two links are from each other on the side where that is farther.
+
+        Motion as a fraction of the depth plus turn in rad.
+        """
+        far = []
+        for island, i, k in zip((a, b), self._ends(a, link), self._ends(a, other), strict=True):
+            T = se3.inverse(self._T_island(island, i)) @ self._T_island(island, k)
+            metres = float(np.linalg.norm(T[:3, 3]))
+            far.append(metres / self._depth_of(i) + float(se3.angle(T)))
+        return max(far)
 
     def _positions(self, a: _Island, b: _Island) -> tuple[int, int]:
         first, second = sorted((self._islands.index(a), self._islands.index(b)))
@@ -661,7 +710,8 @@ class _Joiner:
         """Registrations of other view pairs that say the same as T_a_b."""
         seen = {frozenset((link.i, link.j)) for link in known}
         found = []
-        for first, second, T, _ in self._overlapping(a, b, T_a_b)[:4]:
+        count = _VERIFY if self._options.surely else 4
+        for first, second, T, _ in self._overlapping(a, b, T_a_b)[:count]:
             if frozenset((first.index, second.index)) in seen:
                 continue
             # Along degenerate directions an alignment stays where it began: that confirms nothing.

@@ -221,7 +221,7 @@ class SessionPair:
     links
         How many registrations between their views hold in the final model.
     probability
-        That the best of them is right, 0 to 1; None without any.
+        That those which first joined the two are right, 0 to 1; None where others did.
     overlap
         Share of the views of either that see surfaces which the other sees too, the smaller one.
     support
