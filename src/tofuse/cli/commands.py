@@ -277,13 +277,10 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     from tofuse.results.card import SEPARATOR, card
     from tofuse.results.output import accuracy_json, component_name, plain, reasons_json
     from tofuse.results.ranges import in_words
+    from tofuse.results.sessions import sentences
 
-    sessions = []
-    if result.sessions:
-        from tofuse.pipeline.merging import sentences
-
-        sessions = sentences(result)
     d = result.diagnostics
+    sessions = sentences(result)
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
     skipped = sum(f.status == "skipped" for f in d.frames)
     if as_json:

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from tofuse.evaluation.sightings import Sightings, compared
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
@@ -26,16 +24,17 @@ from tofuse.pipeline.checkpoint import NotKept
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.pipeline.reconstruct import Tracked, push_frames
+from tofuse.pipeline.reconstruct import Tracked, described, push_frames
+from tofuse.pipeline.session_pairs import Model, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions
 from tofuse.posegraph.views import PosedView
-from tofuse.recordings.recording import Recording, Source, evenly
+from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
 from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.sessions import sentences
 from tofuse.results.types import (
     Reason,
     Reconstruction,
-    SessionPair,
     SessionRecord,
 )
 
@@ -45,8 +44,6 @@ Float64 = NDArray[np.float64]
 _TRIES, _SEARCHES = 24, 48
 # Which probability of being right a join must have.
 _SURELY = 0.99
-# Views of each session that are compared with those of the others.
-_COMPARED = 60
 
 
 @dataclass(frozen=True)
@@ -182,11 +179,7 @@ def _told(
     recording: Recording,
 ) -> Reconstruction:
     """The result, which says what became of each session."""
-    pose = {
-        record.index: T
-        for record, T in zip(result.diagnostics.frames, result.trajectory, strict=True)
-        if np.isfinite(T).all()
-    }
+    pose = Model.of(result).poses
     records = tuple(
         SessionRecord(
             session.name,
@@ -199,17 +192,15 @@ def _told(
         )
         for k, (session, first) in enumerate(zip(sessions, firsts, strict=True))
     )
-    result = replace(
-        result,
-        sessions=records,
-        recording={
-            "path": recording.path,
-            "format": recording.format,
-            "frames": len(recording),
-            "warnings": list(recording.warnings),
-        },
-    )
-    result = replace(result, session_pairs=_pairs(result, sessions, views, pose))
+    facts = {
+        "path": recording.path,
+        "format": recording.format,
+        "frames": len(recording),
+        "warnings": list(recording.warnings),
+    }
+    stated = [{s.component for s in session.posed.values()} for session in sessions]
+    pairs = session_pairs(result, records, stated, views)
+    result = replace(described(result, facts), sessions=records, session_pairs=pairs)
     reasons = tuple(_named(reason, result) for reason in result.diagnostics.reasons)
     return replace(result, diagnostics=replace(result.diagnostics, reasons=reasons))
 
@@ -233,66 +224,6 @@ def _T_main_session(
     return align(stated, here)
 
 
-def _pairs(
-    result: Reconstruction,
-    sessions: Sequence[Session],
-    views: Sequence[PosedView[SurfaceMap]],
-    pose: dict[int, Float64],
-) -> tuple[SessionPair, ...]:
-    """What connects each two of the sessions."""
-    records = result.sessions
-
-    def number(index: int) -> int:
-        return next(k for k, record in enumerate(records) if record.has(index))
-
-    links: dict[tuple[int, int], set[frozenset[int]]] = {}
-    sure: dict[tuple[int, int], float] = {}
-    for join in result.diagnostics.joins:
-        a, b = sorted((number(join.link.i), number(join.link.j)))
-        links.setdefault((a, b), set()).add(frozenset((join.link.i, join.link.j)))
-        if join.sure is not None:
-            sure[a, b] = max(sure.get((a, b), 0.0), join.sure)
-    for loop in result.diagnostics.loops:
-        if loop.accepted:
-            a, b = sorted((number(loop.i), number(loop.j)))
-            links.setdefault((a, b), set()).add(frozenset((loop.i, loop.j)))
-    mine = [[v for v in views if record.has(v.index) and v.index in pose] for record in records]
-    mine = [[some[k] for k in evenly(np.arange(len(some)), _COMPARED)] for some in mine]
-    before = [{s.component for s in session.posed.values()} for session in sessions]
-    pairs = []
-    for a, b in combinations(range(len(records)), 2):
-        seen = _seen(mine[a], mine[b], pose)
-        overlap = np.isfinite(seen.share_of_views()) if len(seen.frames) else np.zeros(0, bool)
-        n = len(mine[a])
-        shares = [float(some.mean()) if len(some) else 0.0 for some in (overlap[:n], overlap[n:])]
-        share = seen.share()
-        pairs.append(
-            SessionPair(
-                a,
-                b,
-                bool(mine[a]) and bool(mine[b]),
-                bool(before[a] & before[b]),
-                len(links.get((a, b), ())),
-                sure.get((a, b)),
-                min(shares),
-                float(share) if np.isfinite(share) else None,
-            )
-        )
-    return tuple(pairs)
-
-
-def _seen(
-    ours: Sequence[PosedView[SurfaceMap]],
-    theirs: Sequence[PosedView[SurfaceMap]],
-    pose: dict[int, Float64],
-) -> Sightings:
-    """What views of two sessions say of each other."""
-    both = [*ours, *theirs]
-    poses = np.array([pose[v.index] for v in both]).reshape(-1, 4, 4)
-    groups = [0] * len(ours) + [1] * len(theirs)
-    return compared([v.view for v in both], poses, groups)
-
-
 def _named(reason: Reason, result: Reconstruction) -> Reason:
     """A reason that names the sessions which could not be joined."""
     if reason.code != "disconnected":
@@ -304,33 +235,6 @@ def _named(reason: Reason, result: Reconstruction) -> Reason:
     main = ", ".join(s.name for s in result.sessions if s.T_main_session is not None)
     text = f"No overlap could be confirmed between {main} and {names}. {reason.text}"
     return replace(reason, text=text)
-
-
-def sentences(result: Reconstruction) -> list[str]:
-    """What to say of the sessions: one line for each two, and one for each that stays apart."""
-    names = [session.name for session in result.sessions]
-    found = []
-    for pair in result.session_pairs:
-        a, b = names[pair.a], names[pair.b]
-        if not pair.joined:
-            continue
-        if not pair.overlap and not pair.links:
-            found.append(f"{a} and {b} are in one map, but see nothing in common.")
-            continue
-        said = f"{a} and {b} overlap: {pair.overlap:.0%} of the views"
-        if pair.links:
-            said += f", {pair.links} registration{'s' * (pair.links > 1)}"
-        if pair.probability is not None:
-            said += f", right with a probability of {pair.probability:.1%}"
-        if pair.support is not None:
-            said += f"; {pair.support:.0%} of what both saw agrees"
-        found.append(f"{said}.")
-    found += [
-        f"{s.name} stays apart: no overlap with the others could be confirmed."
-        for s in result.sessions
-        if s.T_main_session is None
-    ]
-    return found
 
 
 def merge_files(

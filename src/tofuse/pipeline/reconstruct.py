@@ -117,13 +117,13 @@ def _once(
                 remedy="check that the files are complete, or give --format",
             )
         result = tracked.mapper.finish(stages)
-    return _described(result, describe(recording))
+    return described(result, describe(recording))
 
 
-def _described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
+def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
     """Say what a result, and those of its components, were made of."""
     components = tuple(
-        c if c.result is None else replace(c, result=_described(c.result, recording))
+        c if c.result is None else replace(c, result=described(c.result, recording))
         for c in result.components
     )
     return replace(result, recording=recording, components=components)

@@ -15,6 +15,7 @@ from tofuse.report import (
     section_frames,
     section_model,
     section_path,
+    section_sessions,
     section_views,
     words,
 )
@@ -30,6 +31,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     out: Values = {}
     parts: tuple[Callable[[Subject], Values], ...] = (
         _verdict,
+        section_sessions.sessions,
         section_components.components,
         section_model.views,
         section_path.cameras,
@@ -56,6 +58,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         out["facts"].insert(5, ("width × height × depth", size))
     names = {
         "verdict": "Verdict",
+        "sessions": "Sessions",
         "components": "Components",
         "model": "3D model",
         "views": "Sizes",
@@ -72,6 +75,8 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     }
     if not out["clouds"]:
         del names["recording"]
+    if not out["sessions"]:
+        del names["sessions"]
     if not out["components"]:
         del names["components"]
     out["contents"] = list(names.items())

@@ -1,0 +1,133 @@
+"""Which sessions of a merged result overlap, and what speaks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.evaluation.sightings import Sightings, compared
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.posegraph.views import PosedView
+from tofuse.recordings.recording import evenly
+from tofuse.results.types import Reconstruction, SessionPair, SessionRecord
+
+Float64 = NDArray[np.float64]
+View = PosedView[SurfaceMap]
+
+# Views of each session that are compared with those of the others.
+_COMPARED = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """One of the models of a result: the main one, or that of a component apart.
+
+    Attributes
+    ----------
+    poses
+        (4, 4) T_world_camera by frame index.
+    """
+
+    result: Reconstruction
+    poses: dict[int, Float64]
+
+    @classmethod
+    def of(cls, result: Reconstruction) -> Model:
+        """The main model of a result."""
+        frames = zip(result.diagnostics.frames, result.trajectory, strict=True)
+        return cls(result, {f.index: T for f, T in frames if np.isfinite(T).all()})
+
+    def views(self, session: SessionRecord, views: Sequence[View]) -> list[View]:
+        """Some of the views of a session with a pose here, evenly spaced."""
+        mine = [v for v in views if session.has(v.index) and v.index in self.poses]
+        return [mine[k] for k in evenly(np.arange(len(mine)), _COMPARED)]
+
+    def links(self, one: SessionRecord, other: SessionRecord) -> set[tuple[int, int]]:
+        """Pairs of frames of two sessions whose registrations hold here."""
+        diagnostics = self.result.diagnostics
+        ends = [(join.link.i, join.link.j) for join in diagnostics.joins]
+        ends += [(loop.i, loop.j) for loop in diagnostics.loops if loop.accepted]
+        return {
+            (min(i, j), max(i, j))
+            for i, j in ends
+            if (one.has(i) and other.has(j)) or (one.has(j) and other.has(i))
+        }
+
+    def sure(self, one: SessionRecord, other: SessionRecord) -> float | None:
+        """Probability that what joined two sessions is right; None where others did."""
+        said = [
+            join.sure
+            for join in self.result.diagnostics.joins
+            if join.sure is not None
+            and any(one.has(k) for k in (join.link.i, join.link.j))
+            and any(other.has(k) for k in (join.link.i, join.link.j))
+        ]
+        return max(said, default=None)
+
+    def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> Sightings:
+        """What views of two sessions say of each other."""
+        both = [*ours, *theirs]
+        poses = np.array([self.poses[v.index] for v in both]).reshape(-1, 4, 4)
+        return compared([v.view for v in both], poses, [0] * len(ours) + [1] * len(theirs))
+
+
+def session_pairs(
+    result: Reconstruction,
+    records: Sequence[SessionRecord],
+    stated: Sequence[Collection[int]],
+    views: Sequence[View],
+) -> tuple[SessionPair, ...]:
+    """Say of each two sessions whether they are in one model, and what speaks for an overlap.
+
+    Parameters
+    ----------
+    stated
+        Of each session the components that its frames were in before.
+    views
+        Prepared views of frames with a pose.
+    """
+    apart = [c.result for c in result.components if c.result is not None and not c.connected]
+    models = [Model.of(each) for each in (result, *apart)]
+    pairs = []
+    for a, b in combinations(range(len(records)), 2):
+        one, other = records[a], records[b]
+        for model in models:
+            ours, theirs = model.views(one, views), model.views(other, views)
+            if ours and theirs:
+                before = bool(set(stated[a]) & set(stated[b]))
+                pairs.append(_pair(a, b, one, other, model, ours, theirs, before=before))
+                break
+        else:
+            pairs.append(SessionPair(a, b, joined=False))
+    return tuple(pairs)
+
+
+def _pair(
+    a: int,
+    b: int,
+    one: SessionRecord,
+    other: SessionRecord,
+    model: Model,
+    ours: Sequence[View],
+    theirs: Sequence[View],
+    *,
+    before: bool,
+) -> SessionPair:
+    """What connects two sessions in one model."""
+    seen = model.seen(ours, theirs)
+    overlap = np.isfinite(seen.share_of_views())
+    share = seen.share()
+    return SessionPair(
+        a,
+        b,
+        True,
+        before,
+        len(model.links(one, other)),
+        model.sure(one, other),
+        float(min(overlap[: len(ours)].mean(), overlap[len(ours) :].mean())),
+        float(share) if np.isfinite(share) else None,
+    )

@@ -1,0 +1,55 @@
+"""The sessions of a merged result, and which of them overlap."""
+
+from __future__ import annotations
+
+from tofuse.report import words
+from tofuse.report.subject import ROWS, Subject, Values
+from tofuse.results.sessions import probability
+from tofuse.results.types import SessionPair
+
+
+def sessions(s: Subject) -> Values:
+    """Return the tables of sessions and of pairs of them; empty where there is one recording."""
+    records, pairs = s.result.sessions, s.result.session_pairs
+    if not records:
+        return {"sessions": [], "session_pairs": [], "sessions_text": ""}
+    rows = []
+    for session in records:
+        mine = [f for f in s.result.diagnostics.frames if session.has(f.index)]
+        last = mine[-1].index if mine else session.first
+        rows.append(
+            {
+                "name": session.name,
+                "frames": f"{mine[0].index if mine else session.first}–{last}",
+                "count": f"{len(mine):,}",
+                "where": "in this map" if session.T_main_session is not None else "apart",
+                "recording": ", ".join(session.opening["paths"]),
+            }
+        )
+    apart = sum(session.T_main_session is None for session in records)
+    text = f"{words.count(len(records), 'session')} were merged. "
+    if apart:
+        text += (
+            f"For {apart:,} of them no overlap with the first one could be confirmed: "
+            f"{'it stays' if apart == 1 else 'they stay'} apart."
+        )
+    else:
+        text += "All of them are in this map, in the world of the first."
+    names = [session.name for session in records]
+    told = [_pair(pair, names) for pair in pairs]
+    return {"sessions": rows[:ROWS], "session_pairs": told[:ROWS], "sessions_text": text}
+
+
+def _pair(pair: SessionPair, names: list[str]) -> Values:
+    joined = "no"
+    if pair.joined:
+        joined = "before" if pair.before else "yes"
+        joined += "" if pair.links or pair.overlap else ", by way of others"
+    return {
+        "names": f"{names[pair.a]}, {names[pair.b]}",
+        "joined": joined,
+        "overlap": words.share(pair.overlap) if pair.joined else "–",
+        "links": f"{pair.links:,}" if pair.joined else "–",
+        "probability": "–" if pair.probability is None else probability(pair.probability),
+        "support": "–" if pair.support is None else words.share(pair.support),
+    }

@@ -1,0 +1,47 @@
+"""What to say of several sessions in one map."""
+
+from __future__ import annotations
+
+from tofuse.results.types import Reconstruction, SessionPair
+
+# A probability is not told more exactly.
+_AS_GOOD_AS_CERTAIN = 0.999
+
+
+def sentences(result: Reconstruction) -> list[str]:
+    """One sentence for each two sessions in one model, and one for each that stays apart."""
+    names = [session.name for session in result.sessions]
+    found = []
+    for pair in result.session_pairs:
+        if not pair.joined:
+            continue
+        both = f"{names[pair.a]} and {names[pair.b]}"
+        if pair.links or pair.overlap:
+            found.append(f"{both} overlap: {', '.join(evidence(pair))}.")
+        else:
+            found.append(f"{both} are in one map, but see nothing in common.")
+    found += [
+        f"{s.name} stays apart: no overlap with the first session could be confirmed."
+        for s in result.sessions
+        if s.T_main_session is None
+    ]
+    return found
+
+
+def evidence(pair: SessionPair) -> list[str]:
+    """What speaks for an overlap: "86 % of the views", "8 registrations", ..."""
+    found = [f"{100 * pair.overlap:.0f} % of the views"]
+    if pair.links:
+        found.append(f"{pair.links} registration{'s' * (pair.links > 1)}")
+    if pair.probability is not None:
+        found.append(f"right with a probability of {probability(pair.probability)}")
+    if pair.support is not None:
+        found.append(f"{100 * pair.support:.0f} % of what both saw agrees")
+    return found
+
+
+def probability(value: float) -> str:
+    """In words, no more exact than it can be known: "99.5 %", "over 99.9 %"."""
+    if value > _AS_GOOD_AS_CERTAIN:
+        return f"over {100 * _AS_GOOD_AS_CERTAIN:.1f} %"
+    return f"{100 * value:.1f} %"

@@ -1,0 +1,76 @@
+"""Results of runs on small recordings of one room, or of another one of the same plan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from made_rooms import BOXES, CAMERA, Box, at, seen
+from tofuse.fusion.options import Fusion
+from tofuse.geometry import se3
+from tofuse.pipeline.config import Config, from_method
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.appearance import Appearance
+from tofuse.recordings.native import RecordingWriter
+from tofuse.recordings.opening import Opening
+from tofuse.registration.search import SearchOptions
+from tofuse.results.output import OutputFolder, write_result
+
+Float64 = NDArray[np.float64]
+
+QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
+# Two walks that see the same corner of the room from opposite sides.
+HERE = [at(0.2 * np.sin(0.2 * k), 0.2 * np.cos(0.2 * k), 0.06 * k) for k in range(12)]
+THERE = [
+    at(0.1 + 0.25 * np.sin(0.2 * k), -0.1 + 0.2 * np.cos(0.2 * k), 1.5 - 0.06 * k)
+    for k in range(12)
+]
+
+
+def quick(config: Config | None = None) -> Config:
+    """Coarse and quick: it is about poses."""
+    config = from_method("default") if config is None else config
+    return replace(
+        config,
+        corrections=(),
+        model_filters=(),
+        fusion=Fusion(voxel_m=0.05),
+        loops=replace(config.loops, searches=0, appearance=Appearance(most=0)),
+        joining=replace(config.joining, search=QUICK),
+        self_calibration=False,
+    )
+
+
+def with_moved(which: int, by: Sequence[float]) -> tuple[Box, ...]:
+    """The room's boxes, of which one has been moved, m."""
+    centre, half, turn = BOXES[which]
+    there = (centre[0] + by[0], centre[1] + by[1], centre[2] + by[2])
+    return (*BOXES[:which], (there, half, turn), *BOXES[which + 1 :])
+
+
+def made_result(folder: Path, path: Sequence[Float64], number: int, **scene: object) -> Path:
+    """Record a walk beside `folder`, and write the result of a run, without a report, into it.
+
+    `number` is for the noise, unlike that of other walks.
+    """
+    recording = folder.with_name(f"{folder.name}-recording")
+    writer = RecordingWriter(
+        recording,
+        CAMERA,
+        depth_unit_m=0.0005,
+        depth_kind="z",
+        frame_rate_hz=10.0,
+        amplitude_kind="range_compensated",
+    )
+    for k, T in enumerate(path):
+        writer.add(replace(seen(T, 100 * number + k, **scene), index=k, timestamp=k / 10))
+    writer.finish(groundtruth=se3.inverse(path[0]) @ np.array(path))
+    opening = Opening((recording,))
+    result = reconstruct(opening.open(), quick(), threads=2)
+    told = {**result.recording, "opening": opening.to_dict()}
+    write_result(replace(result, recording=told), OutputFolder(folder))
+    return folder

@@ -1,0 +1,203 @@
+"""Several sessions in one map: joined where they overlap, kept apart and named where they don't."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from made_rooms import OTHER
+from made_sessions import HERE, THERE, made_result, quick
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.files.trajectory import read_tum
+from tofuse.geometry import se3
+from tofuse.kernels.threads import threads
+from tofuse.pipeline import merging
+from tofuse.pipeline.merging import merge_sessions, merged_config
+from tofuse.pipeline.progress import Silent
+from tofuse.pipeline.run import exit_status
+from tofuse.pipeline.sessions import read_sessions
+from tofuse.results.output import OutputFolder, run_json, write_result
+from tofuse.results.sessions import sentences
+
+TRUE = np.array([*HERE, *THERE])
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> dict[str, Path]:
+    """Two walks in a room, and one in another flat of the same plan, furnished differently."""
+    base = tmp_path_factory.mktemp("sessions")
+    return {
+        "here": made_result(base / "here", HERE, 1),
+        "there": made_result(base / "there", THERE, 2),
+        "elsewhere": made_result(base / "elsewhere", THERE, 3, boxes=OTHER),
+    }
+
+
+def merged(*folders, searches=6, **options):
+    sessions = read_sessions(folders, 2, Silent())
+    config = quick(merged_config(sessions))
+    joining = replace(config.joining, searches=searches, searches_per_frame=0, tries=searches)
+    return merge_sessions(sessions, replace(config, joining=joining), threads=2, **options)
+
+
+@pytest.fixture(scope="module")
+def both(results):
+    return merged(results["here"], results["there"])
+
+
+def copied(folder: Path, to: Path) -> Path:
+    """A result beside its recording, elsewhere."""
+    shutil.copytree(folder, to / "out")
+    return to / "out"
+
+
+def changed_run_json(folder: Path, **changes: object) -> None:
+    path = folder / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def test_two_walks_in_one_room_are_one_map(both) -> None:
+    assert both.has_pose.all()
+    off = se3.inverse(TRUE[0]) @ TRUE
+    error = np.linalg.norm(off[:, :3, 3] - both.trajectory[:, :3, 3], axis=1)
+    assert error.max() < 0.005
+    assert both.diagnostics.verdict == "good"
+    assert exit_status(both) == 0
+
+
+def test_the_world_is_that_of_the_first(both) -> None:
+    np.testing.assert_array_equal(both.trajectory[0], np.eye(4))
+    first, second = both.sessions
+    np.testing.assert_array_equal(first.T_main_session, np.eye(4))
+    between = se3.inverse(TRUE[0]) @ THERE[0]
+    np.testing.assert_allclose(second.T_main_session, between, atol=0.005)
+
+
+def test_it_says_which_overlap_and_how_sure(both) -> None:
+    (pair,) = both.session_pairs
+    assert (pair.a, pair.b, pair.joined, pair.before) == (0, 1, True, False)
+    assert pair.links >= 2
+    assert pair.probability > 0.99
+    assert pair.support > 0.99
+    assert 0.5 < pair.overlap <= 1
+    (text,) = sentences(both)
+    assert "overlap" in text
+    assert "probability" in text
+
+
+def test_run_json_says_of_which_session_a_frame_is(both, results) -> None:
+    data = run_json(both)
+    assert [frame["session"] for frame in data["frames"]] == [0] * 12 + [1] * 12
+    assert [s["name"] for s in data["sessions"]] == ["here", "there"]
+    assert [s["result"] for s in data["sessions"]] == [str(results[k]) for k in ("here", "there")]
+    assert [s["first"] for s in data["sessions"]] == [0, 12]
+    assert data["session_pairs"][0]["joined"]
+
+
+def test_a_flat_of_the_same_plan_is_not_joined(results) -> None:
+    found = merged(results["here"], results["elsewhere"], searches=4)
+    assert found.has_pose.tolist() == [True] * 12 + [False] * 12
+    (pair,) = found.session_pairs
+    assert not pair.joined
+    assert (pair.links, pair.probability, pair.support) == (0, None, None)
+    assert found.sessions[1].T_main_session is None
+    assert sentences(found) == [
+        "elsewhere stays apart: no overlap with the first session could be confirmed."
+    ]
+    (told,) = [r for r in found.diagnostics.reasons if r.code == "disconnected"]
+    assert "between here and elsewhere" in told.text
+    assert found.components[1].result.has_pose.all()
+    assert exit_status(found) == 3
+
+
+def test_the_first_stays_the_main_one_even_if_others_are_larger(results, tmp_path) -> None:
+    """And a merged result can be merged again: what was joined stays so."""
+    pair = merged(results["here"], results["there"])
+    write_result(pair, OutputFolder(tmp_path / "pair"))
+    found = merged(results["elsewhere"], tmp_path / "pair", searches=3)
+    assert [s.name for s in found.sessions] == ["elsewhere", "here", "there"]
+    assert found.has_pose.tolist() == [True] * 12 + [False] * 24
+    assert [s.T_main_session is None for s in found.sessions] == [False, True, True]
+    assert [(p.a, p.b, p.joined, p.before) for p in found.session_pairs] == [
+        (0, 1, False, False),
+        (0, 2, False, False),
+        (1, 2, True, True),
+    ]
+
+
+def test_threads_change_nothing(both, results) -> None:
+    sessions = read_sessions([results["here"], results["there"]], 1, Silent())
+    config = quick(merged_config(sessions))
+    joining = replace(config.joining, searches=6, searches_per_frame=0, tries=6)
+    with threads(1):
+        again = merge_sessions(sessions, replace(config, joining=joining), threads=1)
+    assert again.trajectory.tobytes() == both.trajectory.tobytes()
+    assert again.cloud.points.tobytes() == both.cloud.points.tobytes()
+
+
+def test_the_command_writes_a_result(results, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
+    out = tmp_path / "all"
+    words = ["merge", str(results["here"]), str(results["there"]), "--out", str(out)]
+    assert main([*words, "--threads", "2"]) == 0
+    assert "here and there overlap" in capsys.readouterr().out
+    times, poses = read_tum(out / "trajectory.txt")
+    assert len(poses) == 24
+    assert (np.diff(times) > 0).all()
+    data = json.loads((out / "run.json").read_text())
+    assert [s["name"] for s in data["sessions"]] == ["here", "there"]
+    report = (out / "report.html").read_text()
+    assert "here, there merged" in report
+    assert "Sessions" in report
+    assert main(words) == 2  # holds a result already
+    assert "overwrite" in capsys.readouterr().err
+
+
+def refused(folders, *parts) -> None:
+    with pytest.raises(InputError) as caught:
+        read_sessions(folders, 1, Silent())
+    for part in parts:
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_input_is_refused_in_one_line(results, tmp_path) -> None:
+    here, there = results["here"], results["there"]
+    refused([here], str(here), "single session")
+    refused([], "single session")
+    refused([here, there, there.parent / "there" / ".." / "here"], "given twice")
+    refused([here, tmp_path / "nothing"], "doesn't exist")
+    refused([here, tmp_path], "no run.json")
+    copied(here, tmp_path)
+    refused([here, tmp_path / "out"], "same recording", "12 frames are in both")
+
+
+def test_a_recording_that_is_gone_is_named_with_a_remedy(results, tmp_path) -> None:
+    again = copied(results["there"], tmp_path)
+    run = json.loads((again / "run.json").read_text())
+    run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
+    changed_run_json(again, input=run["input"])
+    refused([results["here"], again], str(tmp_path / "was-here"), "gone", "put it back there")
+
+
+def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:
+    again = copied(results["there"], tmp_path)
+    run = json.loads((again / "run.json").read_text())
+    frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
+    changed_run_json(again, frames=frames)
+    refused([results["here"], again], "frames that", "by now", "run `tofuse run` again")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"frames": [{}]}, {"frames": 3}, {"input": {}}, {"components": [1]}]
+)
+def test_a_damaged_result_is_refused(results, tmp_path, changes) -> None:
+    again = copied(results["there"], tmp_path)
+    changed_run_json(again, **changes)
+    refused([results["here"], again], "damaged")
