@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
+from tofuse.kernels.threads import threads as use_threads
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
 from tofuse.pipeline.checkpoint import NotKept
@@ -25,7 +26,7 @@ from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import Tracked, described, push_frames
-from tofuse.pipeline.session_pairs import Model, session_pairs
+from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import Recording, Source
@@ -138,7 +139,9 @@ def merge_sessions(
             own = replace(recording, indices=session.recording.indices + first)
             push_frames(Tracked(mapper), own, session.config.window, NotKept())
         result = mapper.finish()
-        return _told(result, sessions, firsts, mapper.views, recording)
+        progress.stage("comparing sessions")
+        with use_threads(mapper.threads):
+            return _told(result, sessions, firsts, mapper.views, recording)
 
 
 def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]:
@@ -200,7 +203,12 @@ def _told(
     }
     stated = [{s.component for s in session.posed.values()} for session in sessions]
     pairs = session_pairs(result, records, stated, views)
-    result = replace(described(result, facts), sessions=records, session_pairs=pairs)
+    result = replace(
+        described(result, facts),
+        sessions=records,
+        session_pairs=pairs,
+        changes=session_changes(result, records, views),
+    )
     reasons = tuple(_named(reason, result) for reason in result.diagnostics.reasons)
     return replace(result, diagnostics=replace(result.diagnostics, reasons=reasons))
 

@@ -9,11 +9,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.evaluation.changes import changes
 from tofuse.evaluation.sightings import Sightings, compared
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import evenly
-from tofuse.results.types import Reconstruction, SessionPair, SessionRecord
+from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
 
 Float64 = NDArray[np.float64]
 View = PosedView[SurfaceMap]
@@ -131,3 +132,25 @@ def _pair(
         float(min(overlap[: len(ours)].mean(), overlap[len(ours) :].mean())),
         float(share) if np.isfinite(share) else None,
     )
+
+
+def session_changes(
+    result: Reconstruction, records: Sequence[SessionRecord], views: Sequence[View]
+) -> tuple[SessionChange, ...]:
+    """Say what changed between each two sessions in the main model.
+
+    Parameters
+    ----------
+    views
+        Prepared views of frames with a pose.
+    """
+    model = Model.of(result)
+    mine = [model.views(record, views) for record in records]
+    found = []
+    for a, b in combinations(range(len(records)), 2):
+        both = [
+            ([v.view for v in some], np.array([model.poses[v.index] for v in some]))
+            for some in (mine[a], mine[b])
+        ]
+        found += [SessionChange(a, b, change) for change in changes(*both[0], *both[1])]
+    return tuple(found)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from tofuse.report import words
 from tofuse.report.subject import ROWS, Subject, Values
+from tofuse.results.output import CHANGED
 from tofuse.results.sessions import probability
-from tofuse.results.types import SessionPair
+from tofuse.results.types import SessionChange, SessionPair
 
 
 def sessions(s: Subject) -> Values:
     """Return the tables of sessions and of pairs of them; empty where there is one recording."""
     records, pairs = s.result.sessions, s.result.session_pairs
     if not records:
-        return {"sessions": [], "session_pairs": [], "sessions_text": ""}
+        return {"sessions": [], "session_pairs": [], "sessions_text": "", "changes": []}
     rows = []
     for session in records:
         mine = [f for f in s.result.diagnostics.frames if session.has(f.index)]
@@ -37,7 +38,26 @@ def sessions(s: Subject) -> Values:
         text += "All of them are in this map, in the world of the first."
     names = [session.name for session in records]
     told = [_pair(pair, names) for pair in pairs]
-    return {"sessions": rows[:ROWS], "session_pairs": told[:ROWS], "sessions_text": text}
+    changes = [_change(change, names) for change in s.result.changes[:ROWS]]
+    return {
+        "sessions": rows[:ROWS],
+        "session_pairs": told[:ROWS],
+        "sessions_text": text,
+        "changes": changes,
+    }
+
+
+def _change(found: SessionChange, names: list[str]) -> Values:
+    change = found.change
+    return {
+        "kind": change.kind,
+        "color": "#{:02x}{:02x}{:02x}".format(*CHANGED[change.kind]),
+        "session": names[found.b],
+        "since": names[found.a],
+        "centre": ", ".join(f"{x:.2f}" for x in change.centre).replace("-", "−"),
+        "size": " × ".join(words.length(float(x)) for x in change.size),
+        "volume": f"{1e3 * change.volume_m3:.1f} l",
+    }
 
 
 def _pair(pair: SessionPair, names: list[str]) -> Values:

@@ -42,6 +42,9 @@ CHECKPOINT = f"{UNFINISHED}checkpoint"  # what a run has so far
 _ASIDE, _FORWARD, _BACK = "replaced", "plan.json", "undo.json"  # in the staging folder
 RECORDING = "recording"  # what `tofuse demo` puts beside its result
 
+# Colours of surfaces that changed between sessions; people who are colour-blind tell them apart.
+CHANGED = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
+
 # What `tofuse run` and `tofuse export` may write; of an earlier result nothing of it stays.
 FILES = (
     "trajectory.txt",
@@ -49,6 +52,7 @@ FILES = (
     "cloud.ply",
     "mesh.ply",
     "mesh.glb",
+    "changes.ply",
     "mesh.obj",
     "mesh.mtl",
     "mesh.png",
@@ -341,6 +345,21 @@ def _write_model(result: Reconstruction, folder: Path, texture: Textured | None)
     )
     if result.mesh is not None:
         _write_mesh(result.mesh, result, folder, texture)
+    if result.changes:
+        _write_changes(result, folder / "changes.ply")
+
+
+def _write_changes(result: Reconstruction, path: Path) -> None:
+    """Write the surfaces that changed between sessions, in the colours of `CHANGED`."""
+    found = [c.change for c in result.changes]
+    counts = [len(change.points) for change in found]
+    colors = np.array([CHANGED[change.kind] for change in found], np.uint8)
+    write_ply(
+        path,
+        np.concatenate([change.points for change in found]).astype(np.float32),
+        color=np.repeat(colors, counts, axis=0),
+        scalars={"change": np.repeat(np.arange(len(found), dtype=np.int32), counts)},
+    )
 
 
 def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
@@ -431,6 +450,17 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 for s in result.sessions
             ],
             "session_pairs": [asdict(pair) for pair in result.session_pairs],
+            "changes": [
+                {
+                    "a": c.a,
+                    "b": c.b,
+                    "kind": c.change.kind,
+                    "centre_m": c.change.centre,
+                    "size_m": c.change.size,
+                    "volume_m3": c.change.volume_m3,
+                }
+                for c in result.changes
+            ],
             "T_up_world": T_up_world(result.mesh, result.trajectory),
             "components": [_component(c) for c in result.components],
             "loops": [

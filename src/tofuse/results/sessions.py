@@ -25,7 +25,23 @@ def sentences(result: Reconstruction) -> list[str]:
         for s in result.sessions
         if s.T_main_session is None
     ]
+    for pair in result.session_pairs:
+        count = changed(result, pair)
+        if count:
+            found.append(f"Between {names[pair.a]} and {names[pair.b]} {count}.")
     return found
+
+
+def changed(result: Reconstruction, pair: SessionPair) -> str:
+    """How many surfaces changed: "2 surfaces appeared and 1 vanished"; empty if none did."""
+    kinds = [c.change.kind for c in result.changes if (c.a, c.b) == (pair.a, pair.b)]
+    counts = [(kinds.count(kind), kind) for kind in ("appeared", "vanished") if kind in kinds]
+    if not counts:
+        return ""
+    (n, kind), *more = counts
+    return " and ".join(
+        [f"{n} surface{'s' * (n > 1)} {kind}", *(f"{n} {kind}" for n, kind in more)]
+    )
 
 
 def evidence(pair: SessionPair) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.evaluation.changes import Change
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.odometry.base import Status
@@ -239,6 +240,21 @@ class SessionPair:
     support: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SessionChange:
+    """A surface that is there in one of two sessions only.
+
+    Attributes
+    ----------
+    a, b
+        Numbers of the earlier and of the later session, as they were given.
+    """
+
+    a: int
+    b: int
+    change: Change
+
+
 def in_main_model(record: FrameRecord, components: Sequence[Component]) -> bool:
     """Say whether a frame has a pose in the main model, and not only in one of another component.
 
@@ -276,6 +292,8 @@ class Reconstruction:
     sessions, session_pairs
         The recordings of several results that were merged, and what connects each two of them;
         empty for a run.
+    changes
+        What changed between two sessions in the main model, in its world.
     """
 
     trajectory: Float64
@@ -291,6 +309,7 @@ class Reconstruction:
     components: tuple[Component, ...] = ()
     sessions: tuple[SessionRecord, ...] = ()
     session_pairs: tuple[SessionPair, ...] = ()
+    changes: tuple[SessionChange, ...] = ()
 
     def __repr__(self) -> str:
         a = self.diagnostics.accuracy
