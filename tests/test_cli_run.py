@@ -132,10 +132,15 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "findings",
         "warnings",
         "components",
+        "sessions",
+        "session_pairs",
+        "changes",
         "T_up_world",
     }
     assert data["schema"] == 1
+    opening = data["input"].pop("opening")
     assert data["input"] == {"path": str(room_recording), "format": "native", "frames": 8}
+    assert opening["paths"] == [str(room_recording)]
     assert (data["seed"], data["threads"]) == (0, 2)
     assert data["verdict"] in ("good", "degraded", "failed")
     assert all(isinstance(s, float) and s >= 0 for s in data["seconds"].values())

@@ -257,6 +257,9 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "frames",
         "T_up_world",
         "components",
+        "sessions",
+        "session_pairs",
+        "changes",
         "loops",
         "optimiser",
         "outside",
@@ -264,7 +267,12 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "filters",
     ]
     assert data["schema"] == 1
-    assert data["input"] == {"path": "/somewhere", "format": "native", "frames": 2}
+    assert data["input"] == {
+        "path": "/somewhere",
+        "format": "native",
+        "frames": 2,
+        "opening": None,
+    }
     assert data["reasons"] == [
         {
             "code": "lost_frames",

@@ -42,6 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     from tofuse.pipeline.run import run as run_pipeline
 
     options = run_options(arguments)
+    if arguments.into is not None:
+        return _run_into(arguments, options)
     if arguments.view:
         return _run_in_view(arguments, options)
     for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
@@ -83,6 +85,38 @@ def run_options(arguments: argparse.Namespace) -> Options:
         voxel=arguments.voxel,
         overwrite=arguments.overwrite,
     )
+
+
+def _run_into(arguments: argparse.Namespace, options: Options) -> int:
+    """Run, then merge the result into an earlier one, which stays as it was if that fails."""
+    from tofuse.errors import InputError
+    from tofuse.pipeline.merging import MergeOptions, check_result, merge_files
+    from tofuse.pipeline.run import exit_status
+    from tofuse.pipeline.run import run as run_pipeline
+
+    into = arguments.into
+    if arguments.view:
+        raise InputError("does not go with --into", where="--view", remedy="view the result later")
+    if into.resolve() == options.out.resolve():
+        raise InputError("is --out as well", where="--into", remedy="give two folders")
+    check_result(into)  # before hours of work
+    with progress_for(as_json=arguments.json) as progress:
+        result = run_pipeline(arguments.inputs, options, progress)
+    tell(result, options.out, as_json=arguments.json)
+    map_options = MergeOptions(
+        into,
+        overwrite=True,
+        tolerance=options.tolerance,
+        voxel=options.voxel,
+        faces=options.faces,
+        seed=options.seed or 0,
+        threads=options.threads,
+        only_joined=True,
+    )
+    with progress_for(as_json=arguments.json) as progress:
+        merged = merge_files([into, options.out], map_options, progress)
+    tell(merged, into, as_json=arguments.json)
+    return exit_status(merged)
 
 
 def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
@@ -240,7 +274,7 @@ def merge(arguments: argparse.Namespace) -> int:
     )
     with progress_for(as_json=arguments.json) as progress:
         result = merge_files(arguments.results, options, progress)
-    _tell(result, arguments.out, as_json=arguments.json)
+    tell(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
 
 

@@ -152,6 +152,12 @@ def _run(commands: Any) -> None:
     p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
     p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     p.add_argument(
+        "--into",
+        type=Path,
+        metavar="RESULT",
+        help="an earlier result that becomes a map of both, if they overlap (see `tofuse merge`)",
+    )
+    p.add_argument(
         "--texture", action="store_true", help="a texture on the surface, in mesh.glb and mesh.obj"
     )
     p.add_argument(

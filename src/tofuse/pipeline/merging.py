@@ -27,7 +27,7 @@ from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import Tracked, described, push_frames
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
-from tofuse.pipeline.sessions import Session, read_sessions
+from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
@@ -49,7 +49,13 @@ _SURELY = 0.99
 
 @dataclass(frozen=True)
 class MergeOptions:
-    """The options of ``tofuse merge``; see its ``--help``."""
+    """The options of ``tofuse merge``; see its ``--help``.
+
+    Attributes
+    ----------
+    only_joined
+        Whether nothing is written where the last session can't be joined to the first.
+    """
 
     out: Path
     overwrite: bool = False
@@ -58,6 +64,7 @@ class MergeOptions:
     faces: int | None = None
     seed: int = 0
     threads: int | None = None
+    only_joined: bool = False
 
 
 def merge(
@@ -245,6 +252,11 @@ def _named(reason: Reason, result: Reconstruction) -> Reason:
     return replace(reason, text=text)
 
 
+def check_result(folder: Path) -> None:
+    """Refuse what can't be merged with a result that is still to be made; see `merge`."""
+    sessions_of(folder, 0, None, Silent())
+
+
 def merge_files(
     results: Sequence[str | Path], options: MergeOptions, progress: Progress | None = None
 ) -> Reconstruction:
@@ -274,6 +286,9 @@ def merge_files(
         result = merge_sessions(
             sessions, config, seed=options.seed, threads=options.threads, progress=progress
         )
+        if options.only_joined and result.sessions[-1].T_main_session is None:
+            progress.note(f"{options.out} is left as it was")
+            return result
         progress.stage("writing")
         with threadpool_limits(1):
             write_result(result, folder, _report)

@@ -89,7 +89,7 @@ def read_sessions(
     sessions: list[Session] = []
     components = 0
     for folder in folders:
-        found = list(_of_result(folder, components, threads, progress))
+        found = sessions_of(folder, components, threads, progress)
         sessions += found
         numbers = [s.component for session in found for s in session.posed.values()]
         components = max([components, *(number + 1 for number in numbers)])
@@ -104,10 +104,22 @@ def read_sessions(
     return _named_apart(sessions)
 
 
+def sessions_of(
+    folder: Path, components: int, threads: int | None, progress: Progress
+) -> list[Session]:
+    """Read the sessions of one result; its components are numbered from `components`.
+
+    Raises
+    ------
+    InputError
+        If it can't be merged with any other; see `read_sessions`.
+    """
+    return list(_of_result(folder, components, threads, progress))
+
+
 def _of_result(
     folder: Path, components: int, threads: int | None, progress: Progress
 ) -> Iterator[Session]:
-    """The sessions of one result; its components are numbered from `components`."""
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
     if not folder.is_dir() or not is_result(folder):

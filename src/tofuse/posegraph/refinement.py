@@ -42,8 +42,8 @@ class Refinement:
     poses
         (N, 4, 4) T_world_camera; the first has not moved.
     kept
-        Whether they differ from what they were: only a trajectory whose views support each other
-        better is believed.
+        Whether it is believed: only a trajectory whose views support each other better. Where they
+        do so as well as before, but for chance, the poses stay, and what was measured counts.
     views, pairs
         How many took part.
     moved_m, moved_rad
@@ -184,9 +184,14 @@ class _Joint(Refiner):
         support = refined.before.of_views(len(views)), refined.after.of_views(len(views))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(views), len(refined.pairs), support=mean)
-        if not len(refined.pairs) or mean[1] < mean[0]:
+        gained = support[1] - support[0]
+        if not len(refined.pairs) or _fell(gained):
             return unchanged
-        after = without_losers(before, refined.poses, support[1] < support[0] - options.loss)
+        after = without_losers(before, refined.poses, gained < -options.loss)
+        if mean[1] < mean[0]:
+            # They were refined before, and are as good as they can be; but what the pairs measure
+            # says how good that is.
+            after = before
         if numbers:
             gap = loop_gap(views, refined, refined.poses, refined.errors, options.refine)
             found = Suspicion(gap=gap)
@@ -198,6 +203,12 @@ class _Joint(Refiner):
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
             edges=_measured([v.surface.index for v in views], refined),
         )
+
+
+def _fell(gained: Float64) -> bool:
+    """Whether the support of views (N,) fell on average by more than chance explains."""
+    error = float(gained.std(ddof=1)) / np.sqrt(len(gained))
+    return float(gained.mean()) < -error
 
 
 def _measured(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:

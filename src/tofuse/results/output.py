@@ -437,6 +437,8 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 }
                 for f in d.frames
             ],
+            "T_up_world": T_up_world(result.mesh, result.trajectory),
+            "components": [_component(c) for c in result.components],
             "sessions": [
                 {
                     "name": s.name,
@@ -461,8 +463,6 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 }
                 for c in result.changes
             ],
-            "T_up_world": T_up_world(result.mesh, result.trajectory),
-            "components": [_component(c) for c in result.components],
             "loops": [
                 {
                     "i": p.i,
