@@ -18,8 +18,10 @@ from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.pipeline import merging
+from tofuse.pipeline import run as run_module
 from tofuse.pipeline.merging import merge_sessions, merged_config
 from tofuse.pipeline.progress import Silent
+from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import exit_status
 from tofuse.pipeline.sessions import read_sessions
 from tofuse.results.output import OutputFolder, run_json, write_result
@@ -201,3 +203,32 @@ def test_a_damaged_result_is_refused(results, tmp_path, changes) -> None:
     again = copied(results["there"], tmp_path)
     changed_run_json(again, **changes)
     refused([results["here"], again], "damaged")
+
+
+def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -> None:
+    """And one that can't be located there leaves the map as it was."""
+    monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
+    monkeypatch.setattr(merging, "_report", lambda result, folder: None)
+    into = copied(results["here"], tmp_path)
+    (session, _) = read_sessions([results["there"], results["elsewhere"]], 1, Silent())
+    told = reconstruct(session.recording.select(end=2), quick())
+
+    def runs_to(folder: Path) -> None:
+        """Whatever is asked for, the run has this result."""
+        shutil.rmtree(tmp_path / "new", ignore_errors=True)
+        shutil.copytree(folder, tmp_path / "new")
+        monkeypatch.setattr(run_module, "run", lambda *_: told)
+
+    runs_to(results["there"])
+    words = ["run", "recording", "--out", str(tmp_path / "new"), "--into", str(into)]
+    assert main(words) == 0
+    data = json.loads((into / "run.json").read_text())
+    assert [s["name"] for s in data["sessions"]] == ["out", "new"]
+    before = (into / "run.json").read_bytes()
+    runs_to(results["elsewhere"])
+    assert main(words) == 3
+    assert (into / "run.json").read_bytes() == before
+    assert "stays apart" in capsys.readouterr().out
+    assert main([*words[:-1], str(tmp_path / "new")]) == 2
+    assert "--out as well" in capsys.readouterr().err
+    assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
