@@ -14,10 +14,12 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Status, Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
+from tofuse.odometry.moving import MovingObjects, at_size
+from tofuse.odometry.segmentation import NOTICED
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
-from tofuse.registration.projective import ProjectiveOptions, align, registration_of
+from tofuse.registration.projective import ProjectiveOptions, Target, align, registration_of
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
 Float64 = NDArray[np.float64]
@@ -28,8 +30,9 @@ Float64 = NDArray[np.float64]
 class GivenPoses(Odometry):
     """Takes the poses of the odometry beside the images as they are.
 
-    Each frame is aligned with the newest keyframe, to know what the images say of the motion
-    between them; the pose stays as given. A frame without a pose is lost.
+    Each frame is aligned with the newest keyframe, or with the nearest one where that sees another
+    place, to know what the images say of the motion between them; the pose stays as given. What
+    moves by itself is left out. A frame without a pose is lost.
 
     Attributes
     ----------
@@ -56,6 +59,7 @@ class _GivenTracker(Tracker):
     def __init__(self, options: GivenPoses) -> None:
         self._options = options
         self._keyframes = KeyframeMap(options.keyframe_angle, options.keyframe_distance)
+        self._objects = MovingObjects()
         self._T_component_world: Float64 | None = None
 
     def prepare(self, frame: Frame) -> SurfaceMap | None:
@@ -77,16 +81,27 @@ class _GivenTracker(Tracker):
         if not len(self._keyframes):
             self._keyframes.add(Keyframe(view, T, 0))
             return Step("tracked", "", T, surface=view)
-        keyframe = self._keyframes.newest
-        registration = self._registration(view, keyframe, T)
-        if self._keyframes.is_far(T, keyframe):
+        keyframe = self._keyframes.in_sight(T)
+        moving = self._objects.compare(view, T, keyframe.view, keyframe.T_component_camera)
+        self._objects.learn(moving)
+        mask = None
+        target = keyframe.target
+        if moving.fraction > NOTICED:
+            mask = at_size(moving.view, frame)
+            view = moving.applied(view)
+            reference = moving.applied_to_reference(keyframe.view)
+            target = Target(reference, se3.inverse(keyframe.T_component_camera))
+        registration = self._registration(view, keyframe, target, T)
+        if self._keyframes.is_far(T, self._keyframes.newest):
             self._keyframes.add(Keyframe(view, T, 0))
-        return Step("tracked", "", T, keyframe.view.index, registration, view)
+        return Step("tracked", "", T, keyframe.view.index, registration, view, moving=mask)
 
-    def _registration(self, view: SurfaceMap, keyframe: Keyframe, T: Float64) -> Registration:
+    def _registration(
+        self, view: SurfaceMap, keyframe: Keyframe, target: Target, T: Float64
+    ) -> Registration:
         options = self._options
-        aligned = align(view, [keyframe.target], T, options.alignment)
-        C = covariance(view, [keyframe.target], aligned, options.alignment, options.uncertainty)
+        aligned = align(view, [target], T, options.alignment)
+        C = covariance(view, [target], aligned, options.alignment, options.uncertainty)
         T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ aligned.T_world_source
         return registration_of(aligned, T_keyframe_camera, C)
 

@@ -12,6 +12,7 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.likeness import look_of, unlikeness
 from tofuse.registration.projective import Target
+from tofuse.registration.verification import IN_SIGHT
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -84,6 +85,14 @@ class KeyframeMap:
             se3.angle(between) > self._angle
             or np.linalg.norm(between[:3, 3]) > self._distance * keyframe.depth
         )
+
+    def in_sight(self, T_component_camera: Float64) -> Keyframe:
+        """The newest keyframe, or the nearest one where the newest sees another place."""
+        T = np.stack([k.T_component_camera for k in self._keyframes])
+        between = se3.inverse(T_component_camera) @ T
+        depth = np.array([k.depth for k in self._keyframes])
+        away = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
+        return self._keyframes[-1 if away[-1] < IN_SIGHT else int(np.argmin(away))]
 
     def alike(self, view: SurfaceMap, component: int) -> Keyframe | None:
         """The keyframe outside of a component that looks most like a view, of equals the newest."""

@@ -15,6 +15,7 @@ from tofuse.odometry.base import Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.odometry.motion import Moment, Motion
+from tofuse.odometry.moving import at_size
 from tofuse.odometry.relocalization import Relocalizer
 from tofuse.odometry.rivals import Rivals
 from tofuse.odometry.segmentation import NOTICED, Segmentation
@@ -24,7 +25,6 @@ from tofuse.registration.projective import registration_of
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit, comparable
 
-Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
 
@@ -183,7 +183,7 @@ class KeyframeTracker(Tracker):
             self._keyframes.add(Keyframe(view, T, self._component, doubtful))
         mask = None
         if moving is not None and moving.fraction > NOTICED:
-            mask = _at_size(moving.view, frame)
+            mask = at_size(moving.view, frame)
             view = moving.applied(view)
         return Step(
             status,
@@ -205,13 +205,3 @@ class KeyframeTracker(Tracker):
         # Odds that are twice as high as usual double the standard deviation.
         C = C * np.exp(2 * min(found.assessment.excess, 5.0))
         return registration_of(a, found.T_keyframe_camera, C)
-
-
-def _at_size(mask: Bool, frame: RangeFrame) -> Bool:
-    """A mask of the prepared view at the size of the frame's image."""
-    rows, columns = frame.valid.shape
-    step = columns // mask.shape[1]
-    large = np.kron(mask, np.ones((step, step), np.bool_))
-    out = np.zeros((rows, columns), np.bool_)
-    out[: large.shape[0], : large.shape[1]] = large[:rows, :columns]
-    return out

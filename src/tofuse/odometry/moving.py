@@ -25,6 +25,7 @@ from tofuse.kernels import moving as kernels
 from tofuse.kernels.middle import median
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
+from tofuse.recordings.frames import RangeFrame
 
 Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
@@ -252,6 +253,16 @@ def without_pixels(view: SurfaceMap, mask: Bool) -> SurfaceMap:
         else view.photo,
         pixel_variance=None if own is None else own * keep,
     )
+
+
+def at_size(mask: Bool, frame: RangeFrame) -> Bool:
+    """A mask of the prepared view at the size of the frame's image."""
+    rows, columns = frame.valid.shape
+    step = columns // mask.shape[1]
+    large = np.kron(mask, np.ones((step, step), np.bool_))
+    out = np.zeros((rows, columns), np.bool_)
+    out[: large.shape[0], : large.shape[1]] = large[:rows, :columns]
+    return out
 
 
 class MovingObjects:

@@ -52,8 +52,7 @@ def _change(found: SessionChange, names: list[str]) -> Values:
     return {
         "kind": change.kind,
         "color": "#{:02x}{:02x}{:02x}".format(*CHANGED[change.kind]),
-        "session": names[found.b],
-        "since": names[found.a],
+        "sessions": f"{names[found.a]}, then {names[found.b]}",
         "centre": ", ".join(f"{x:.2f}" for x in change.centre).replace("-", "−"),
         "size": " × ".join(words.length(float(x)) for x in change.size),
         "volume": f"{1e3 * change.volume_m3:.1f} l",

@@ -46,14 +46,19 @@ def changed(result: Reconstruction, pair: SessionPair) -> str:
 
 def evidence(pair: SessionPair) -> list[str]:
     """What speaks for an overlap: "86 % of the views", "8 registrations", ..."""
-    found = [f"{100 * pair.overlap:.0f} % of the views"]
+    found = [f"{_percent(pair.overlap)} of the views"]
     if pair.links:
         found.append(f"{pair.links} registration{'s' * (pair.links > 1)}")
     if pair.probability is not None:
         found.append(f"right with a probability of {probability(pair.probability)}")
     if pair.support is not None:
-        found.append(f"{100 * pair.support:.0f} % of what both saw agrees")
+        found.append(f"{_percent(pair.support)} of what both saw agrees")
     return found
+
+
+def _percent(share: float) -> str:
+    """Down, so that only all of it is 100 %."""
+    return f"{int(100 * share)} %"
 
 
 def probability(value: float) -> str:
