@@ -143,6 +143,7 @@ CASES = (
     Case("shares a room", FIRST, SECOND, True),
     Case("chair moved by 10 cm", FIRST, replace(SECOND, name="b-moved", chair=0.1), True),
     Case("another camera", FIRST, replace(SECOND, name="b-sr4000", camera="sr4000"), True),
+    Case("shares a doorway", FIRST, Tour("doorway", 400, 60), True),
     Case("other rooms", FIRST, Tour("c", 570, 60), False),
     Case(
         "flat of the same plan",

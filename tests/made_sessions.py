@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from made_rooms import BOXES, CAMERA, Box, at, seen
 from tofuse.fusion.options import Fusion
-from tofuse.geometry import se3
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.appearance import Appearance
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.opening import Opening
 from tofuse.registration.search import SearchOptions
@@ -57,6 +57,11 @@ def made_result(folder: Path, path: Sequence[Float64], number: int, **scene: obj
 
     `number` is for the noise, unlike that of other walks.
     """
+    return made_result_of(folder, [seen(T, 100 * number + k, **scene) for k, T in enumerate(path)])
+
+
+def made_result_of(folder: Path, frames: Sequence[RangeFrame]) -> Path:
+    """Record these frames beside `folder`, and write the result of a run into it."""
     recording = folder.with_name(f"{folder.name}-recording")
     writer = RecordingWriter(
         recording,
@@ -66,9 +71,9 @@ def made_result(folder: Path, path: Sequence[Float64], number: int, **scene: obj
         frame_rate_hz=10.0,
         amplitude_kind="range_compensated",
     )
-    for k, T in enumerate(path):
-        writer.add(replace(seen(T, 100 * number + k, **scene), index=k, timestamp=k / 10))
-    writer.finish(groundtruth=se3.inverse(path[0]) @ np.array(path))
+    for k, frame in enumerate(frames):
+        writer.add(replace(frame, index=k, timestamp=k / 10))
+    writer.finish()
     opening = Opening((recording,))
     result = reconstruct(opening.open(), quick(), threads=2)
     told = {**result.recording, "opening": opening.to_dict()}

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from made_rooms import OTHER
-from made_sessions import HERE, THERE, made_result, quick
+from made_rooms import OTHER, seen
+from made_sessions import HERE, THERE, made_result, made_result_of, quick
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.trajectory import read_tum
@@ -232,3 +232,38 @@ def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -
     assert main([*words[:-1], str(tmp_path / "new")]) == 2
     assert "--out as well" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2
+
+
+def test_parts_of_a_result_that_were_apart_stay_so_or_are_joined(results, tmp_path) -> None:
+    """A recording that goes on elsewhere after a dark frame; and the place where it went on."""
+    first, second = HERE[5:], THERE[5:]
+    frames = [
+        *(seen(T, 400 + k) for k, T in enumerate(first)),
+        *(seen(T, 420 + k, boxes=OTHER) for k, T in enumerate(second)),
+    ]
+    dark = replace(frames[0], depth=np.zeros_like(frames[0].depth))
+    mixed = made_result_of(tmp_path / "mixed", [*frames[:7], dark, *frames[7:]])
+    assert (mixed / "component-1").is_dir()
+    assert run_status(mixed) == ["tracked"] * 7 + ["lost"] + ["tracked"] * 7
+
+    found = merged(results["there"], mixed, searches=4)
+    assert found.has_pose.tolist() == [True] * 12 + [True] * 7 + [False] * 8
+    lost = found.diagnostics.frames[19]
+    assert lost.status == "lost"
+    assert "valid points" in lost.reason
+    off = se3.inverse(THERE[0]) @ np.array([*THERE, *first])
+    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[:19, :3, 3], axis=1)
+    assert error.max() < 0.005
+    assert found.sessions[1].T_main_session is not None
+    (apart,) = [c for c in found.components if not c.connected]
+    assert apart.frames == ((20, 26),)
+
+    found = merged(results["elsewhere"], mixed, searches=4)
+    assert found.has_pose.tolist() == [True] * 12 + [False] * 8 + [True] * 7
+    off = se3.inverse(THERE[0]) @ np.array([*THERE, *second])
+    error = np.linalg.norm(off[:, :3, 3] - found.trajectory[found.has_pose, :3, 3], axis=1)
+    assert error.max() < 0.005
+
+
+def run_status(folder: Path) -> list[str]:
+    return [frame["status"] for frame in json.loads((folder / "run.json").read_text())["frames"]]

@@ -41,7 +41,8 @@ from tofuse.results.types import (
 
 Float64 = NDArray[np.float64]
 
-# View pairs that are registered at most to join the same two sessions, and searches in all.
+# View pairs that are registered at most to join the same two sessions, and searches for each
+# session that is to be joined.
 _TRIES, _SEARCHES = 24, 48
 # Which probability of being right a join must have.
 _SURELY = 0.99
@@ -110,8 +111,9 @@ def merged_config(sessions: Sequence[Session]) -> Config:
     first = sessions[0].config
     default = from_method("default")
     outside = default.outside if all(s.config.outside for s in sessions) else ()
+    searches = _SEARCHES * (len(sessions) - 1)
     joining = replace(
-        default.joining, main="first", tries=_TRIES, searches=_SEARCHES, surely=_SURELY
+        default.joining, main="first", tries=_TRIES, searches=searches, surely=_SURELY
     )
     return replace(
         default,

@@ -114,42 +114,78 @@ def sessions_of(
     InputError
         If it can't be merged with any other; see `read_sessions`.
     """
-    return list(_of_result(folder, components, threads, progress))
+    return [_session(part, folder, threads, progress) for part in _read_parts(folder, components)]
 
 
-def _of_result(
-    folder: Path, components: int, threads: int | None, progress: Progress
-) -> Iterator[Session]:
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What a result says of one of its sessions.
+
+    Attributes
+    ----------
+    config
+        As plain data.
+    times
+        s, by the index of the frame in the recording; None where other sessions moved them on.
+    frames, stated
+        Indices in the recording, and what is stated of them.
+    """
+
+    name: str
+    opening: Opening
+    config: dict[str, Any]
+    times: dict[int, float] | None
+    frames: list[int]
+    stated: dict[int, StatedPose]
+
+
+def _read_parts(folder: Path, components: int) -> list[_Part]:
+    """Read what a result says; its components are numbered from `components`."""
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
     if not folder.is_dir() or not is_result(folder):
         raise InputError("holds no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")
     try:
-        stated = _stated(folder, run, components)
-        frames = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
-        parts = run.get("sessions") or [
-            {
-                "name": None,
-                "opening": run["input"].get("opening") or _of_old(run["input"]),
-                "config": run["config"],
-                "first": 0,
-                "count": max(frames) + 1,
-            }
-        ]
-        for part in parts:
-            first, count = int(part["first"]), int(part["count"])
-            mine = {k - first: t for k, t in frames.items() if first <= k < first + count}
-            own = {k - first: s for k, s in stated.items() if first <= k < first + count}
-            opening = _where_it_lies(Opening.from_dict(part["opening"], folder), folder)
-            recording = _opened(opening, mine, folder, same_clock=not run.get("sessions"))
-            config = _config(part["config"], recording, folder, threads, progress)
-            name = part["name"] or folder.name or str(folder)
-            yield Session(name, folder, opening, recording, config, own)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return list(_parts(folder, run, components))
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
             "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
         ) from error
+
+
+def _parts(folder: Path, run: Mapping[str, Any], components: int) -> Iterator[_Part]:
+    stated = _stated(folder, run, components)
+    times = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
+    if not times:
+        raise ValueError("no frames")
+    several = run.get("sessions") or []
+    alone = {
+        "name": folder.resolve().name,
+        "opening": run["input"].get("opening") or _of_old(run["input"]),
+        "config": run["config"],
+        "first": 0,
+        "count": max(times) + 1,
+    }
+    for part in several or [alone]:
+        first, count = int(part["first"]), int(part["count"])
+        mine = {k - first: t for k, t in times.items() if first <= k < first + count}
+        yield _Part(
+            str(part["name"]),
+            Opening.from_dict(part["opening"], folder / "run.json"),
+            dict(part["config"]),
+            None if several else mine,
+            list(mine),
+            {k - first: s for k, s in stated.items() if first <= k < first + count},
+        )
+
+
+def _session(part: _Part, folder: Path, threads: int | None, progress: Progress) -> Session:
+    """Open the recording of a part of a result again."""
+    opening = _where_it_lies(part.opening, folder)
+    recording = _opened(opening, part, folder)
+    config = _config(part.config, recording, folder, threads, progress)
+    return Session(part.name, folder, opening, recording, config, part.stated)
 
 
 def _of_old(told: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,9 +239,7 @@ def _where_it_lies(opening: Opening, folder: Path) -> Opening:
     return opening
 
 
-def _opened(
-    opening: Opening, frames: Mapping[int, float], folder: Path, *, same_clock: bool
-) -> Recording:
+def _opened(opening: Opening, part: _Part, folder: Path) -> Recording:
     """Open the recording of a result, and check that it still is what it was."""
     for path in (*opening.paths, *((opening.camera,) if opening.camera else ())):
         if not path.exists():
@@ -215,11 +249,11 @@ def _opened(
                 remedy="put it back there, or run `tofuse run` again where it is now",
             )
     recording = opening.open()
-    chosen = np.isin(recording.indices, list(frames))
-    same = int(chosen.sum()) == len(frames)
+    chosen = np.isin(recording.indices, part.frames)
+    same = int(chosen.sum()) == len(part.frames)
     recording = replace(recording, indices=recording.indices[chosen])
-    if same and same_clock:
-        times = np.array([frames[k] for k in recording.indices.tolist()])
+    if same and part.times is not None:
+        times = np.array([part.times[k] for k in recording.indices.tolist()])
         same = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_SAME_TIME))
     if not same:
         raise InputError(
