@@ -25,6 +25,7 @@ from tofuse.evaluation.trajectory import align, displacement
 from tofuse.geometry import se3
 from tofuse.pipeline.merging import MergeOptions, merge_files
 from tofuse.pipeline.run import Options, run
+from tofuse.results.sessions import probability
 from tofuse.results.types import Reconstruction
 from tofuse.simulation import paths
 from tofuse.simulation.effects import Effects
@@ -189,7 +190,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     wanted = {name.strip().replace("-", " ") for name in arguments.cases.split(",") if name}
-    head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "how sure")
+    head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "how sure", "changed")
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     for case in CASES:
         if wanted and case.name not in wanted:
@@ -225,7 +226,10 @@ def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
         f"{1e3 * metres:.1f} mm, {np.degrees(angle):.2f}°" if joined else "-",
         *(f"{1e3 * a:.1f} mm" if np.isfinite(a) else "-" for a in (*ates, ate)),
         f"{1e3 * result.diagnostics.accuracy.position_m:.0f} mm",
-        "-" if pair.probability is None else f"{pair.probability:.1%}, {pair.links} links",
+        "-"
+        if pair.probability is None
+        else f"{probability(pair.probability)}, {pair.links} links",
+        ", ".join(c.change.kind for c in result.changes) or "-",
     ]
     return "| " + " | ".join(cells) + " |"
 

@@ -14,6 +14,7 @@ from tofuse.evaluation.sightings import Sightings, compared
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import evenly
+from tofuse.results.sessions import AS_GOOD_AS_CERTAIN
 from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
 
 Float64 = NDArray[np.float64]
@@ -67,7 +68,7 @@ class Model:
             and any(one.has(k) for k in (join.link.i, join.link.j))
             and any(other.has(k) for k in (join.link.i, join.link.j))
         ]
-        return max(said, default=None)
+        return min(max(said), AS_GOOD_AS_CERTAIN) if said else None
 
     def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> Sightings:
         """What views of two sessions say of each other."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from tofuse.results.types import Reconstruction, SessionPair
 
-# A probability is not told more exactly.
-_AS_GOOD_AS_CERTAIN = 0.999
+# No model of probabilities is to be trusted beyond this.
+AS_GOOD_AS_CERTAIN = 0.999
 
 
 def sentences(result: Reconstruction) -> list[str]:
@@ -63,6 +63,6 @@ def _percent(share: float) -> str:
 
 def probability(value: float) -> str:
     """In words, no more exact than it can be known: "99.5 %", "over 99.9 %"."""
-    if value > _AS_GOOD_AS_CERTAIN:
-        return f"over {100 * _AS_GOOD_AS_CERTAIN:.1f} %"
+    if value >= AS_GOOD_AS_CERTAIN:
+        return f"over {100 * AS_GOOD_AS_CERTAIN:.1f} %"
     return f"{100 * value:.1f} %"
