@@ -190,7 +190,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     wanted = {name.strip().replace("-", " ") for name in arguments.cases.split(",") if name}
-    head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "how sure", "changed")
+    head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "how sure")
+    head = (*head, "changed")
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
     for case in CASES:
         if wanted and case.name not in wanted:
@@ -226,9 +227,7 @@ def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
         f"{1e3 * metres:.1f} mm, {np.degrees(angle):.2f}°" if joined else "-",
         *(f"{1e3 * a:.1f} mm" if np.isfinite(a) else "-" for a in (*ates, ate)),
         f"{1e3 * result.diagnostics.accuracy.position_m:.0f} mm",
-        "-"
-        if pair.probability is None
-        else f"{probability(pair.probability)}, {pair.links} links",
+        "-" if pair.probability is None else f"{probability(pair.probability)}, {pair.links} links",
         ", ".join(c.change.kind for c in result.changes) or "-",
     ]
     return "| " + " | ".join(cells) + " |"

@@ -338,6 +338,73 @@ def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
     assert_joined(group, three)
 
 
+def probable(first, second, p, T=None):
+    """A true link that states how probable it is."""
+    a, b = first, second
+    T = se3.inverse(PATH[a.index]) @ PATH[b.index] if T is None else T
+    link = link_of(a, b, T)
+    return replace(link, registration=replace(link.registration, probability=p))
+
+
+@pytest.fixture
+def surely(three, monkeypatch):
+    """Joins two stretches by links alone, and says how sure that is; None if it refuses."""
+    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
+
+    def joined(links, at_least=0.9):
+        groups = replace(SPARSELY, surely=at_least).join(three[:2], links)
+        found = {join.sure for group in groups for join in group.joins}
+        assert len(found) <= 1
+        return found.pop() if found else None
+
+    return joined
+
+
+def test_links_of_other_views_make_a_join_surer(three, surely) -> None:
+    a, b = three[0].views, three[1].views
+    one = surely([probable(a[-1], b[0], 0.95)])
+    assert one == pytest.approx(0.95)
+    # The same views again say little more: here the turns are 0.24 rad.
+    same = surely([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
+    odds = 19 ** (1 + 0.24 / joining.IN_SIGHT) / 2
+    assert same == pytest.approx(odds / (1 + odds), abs=0.02)
+    other = surely([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)])
+    assert other > same
+
+
+def test_who_tries_often_finds_something_by_chance(three) -> None:
+    a, b = three[0].views, three[1].views
+    right = probable(a[-1], b[0], 0.96)
+    joiner = joining._Joiner(replace(SPARSELY, surely=0.9), three[:2])
+    joiner.add(right)
+    assert joiner._sureness(*joiner._islands, [right]) == pytest.approx(0.96)
+    joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found
+    assert joiner._sureness(*joiner._islands, [right]) == pytest.approx(24 / 28)
+    joiner.decide(single=True)
+    assert len(joiner.groups()) == 2
+
+
+def test_no_single_link_is_certain(three, surely) -> None:
+    a, b = three[0].views, three[1].views
+    assert surely([probable(a[-1], b[0], 1.0)]) == pytest.approx(joining._MOST_SURE)
+    assert surely([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
+
+
+def test_the_main_group_is_the_first_one_where_asked_for(elsewhere, three) -> None:
+    strange = stretch(0, range(4), **STRANGE)
+    groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])
+    assert members(groups) == [[0], [1, 2]]
+
+
+@pytest.mark.parametrize(
+    "options", [{"tries": -1}, {"surely": 1.0}, {"surely": np.nan}, {"main": "last"}]
+)
+def test_options_of_sessions_are_checked(options) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Joining(**options)
+
+
 @pytest.mark.parametrize(
     "options", [{"searches": -1}, {"searches_per_frame": -0.1}, {"searches_per_frame": np.nan}]
 )
