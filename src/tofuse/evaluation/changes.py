@@ -38,7 +38,7 @@ Kind = Literal["appeared", "vanished"]
 _POINTS, _LEARN = 2000, 60
 # Residuals of surfaces that are the same are below this share of the depth; the quantile of their
 # absolute values that the scale is taken from, and what it is of a normal distribution.
-_SAME, _QUANTILE, _NORMAL = 0.05, 0.9, 1.6449
+_SAME, _QUANTILE, _NORMAL = 0.05, 0.5, 0.6745
 # A surface is seen again within so many standard deviations, and seen through beyond so many.
 _SEEN, _THROUGH = 3.0, 5.0
 # Probability that a view is wrong about a point for other reasons than noise, and that a point has
