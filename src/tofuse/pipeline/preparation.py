@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -59,13 +59,13 @@ class Prepared:
 class Counts:
     """How many points filters saw and removed, by name."""
 
-    seen: Counter[str] = field(default_factory=Counter)
-    removed: Counter[str] = field(default_factory=Counter)
+    seen: dict[str, int] = field(default_factory=dict)
+    removed: dict[str, int] = field(default_factory=dict)
 
     def add(self, removal: Removal) -> None:
         """Count what a filter removed of a frame."""
-        self.seen[removal.name] += removal.seen
-        self.removed[removal.name] += removal.removed
+        self.seen[removal.name] = self.seen.get(removal.name, 0) + removal.seen
+        self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
 
     @property
     def shares(self) -> dict[str, float]:
