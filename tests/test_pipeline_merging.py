@@ -24,7 +24,10 @@ from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import exit_status
 from tofuse.pipeline.sessions import read_sessions
-from tofuse.results.output import OutputFolder, run_json, write_result
+from tofuse.recordings.frames import CloudFrame
+from tofuse.recordings.native import RecordingWriter
+from tofuse.recordings.opening import Opening
+from tofuse.results.output import OutputFolder, read_run_json, run_json, write_result
 from tofuse.results.sessions import sentences
 
 TRUE = np.array([*HERE, *THERE])
@@ -194,6 +197,46 @@ def test_a_recording_that_has_changed_is_refused(results, tmp_path) -> None:
     frames = [{**f, "timestamp": f["timestamp"] + 1.0} for f in run["frames"]]
     changed_run_json(again, frames=frames)
     refused([results["here"], again], "frames that", "by now", "run `tofuse run` again")
+
+
+def test_results_of_clouds_are_refused(results, tmp_path) -> None:
+    writer = RecordingWriter(tmp_path / "clouds", None, frame_rate_hz=10.0)
+    points = np.random.default_rng(0).uniform(1, 2, (50, 3)).astype(np.float32)
+    for k in range(12):
+        writer.add(CloudFrame(k, k / 10, points))
+    writer.finish()
+    again = copied(results["there"], tmp_path)
+    run = json.loads((again / "run.json").read_text())
+    run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]
+    changed_run_json(again, input=run["input"])
+    refused([results["here"], again], "clouds", "give their clouds together")
+
+
+def test_a_result_that_knows_its_recording_by_the_path_alone(results, tmp_path) -> None:
+    """As those of earlier versions do."""
+    again = copied(results["there"], tmp_path)
+    run = json.loads((again / "run.json").read_text())
+    told = {k: run["input"][k] for k in ("path", "format", "frames")}
+    changed_run_json(again, input=told)
+    _, session = read_sessions([results["here"], again], 1, Silent())
+    assert len(session.recording) == 12
+    assert len(session.posed) == 12
+
+
+def test_recordings_may_be_joined_and_selected(results, tmp_path) -> None:
+    """What was opened is opened again: both recordings of a run, and every other frame."""
+    paths = [Path(read_run_json(results[k] / "run.json")["input"]["path"]) for k in results][:2]
+    opening = Opening(tuple(paths), every=2, start=1)
+    recording = opening.open()
+    result = reconstruct(recording, quick(), threads=2)
+    told = {**result.recording, "opening": opening.to_dict()}
+    write_result(replace(result, recording=told), OutputFolder(tmp_path / "both"))
+    sessions = read_sessions([tmp_path / "both", results["elsewhere"]], 1, Silent())
+    assert sessions[0].recording.indices.tolist() == list(range(1, 24, 2))
+    joined, firsts = merging.joined_recording(sessions)
+    assert firsts == [0, 24]
+    assert [part["frames"] for part in joined.metadata["parts"]] == [12, 12, 12]
+    assert joined.indices.tolist() == [*range(1, 24, 2), *range(24, 36)]
 
 
 @pytest.mark.parametrize(
