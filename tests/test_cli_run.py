@@ -161,6 +161,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
             "covariance",
             "unobservable",
             "component",
+            "session",
         }
         assert frame["status"] == "tracked"
         assert 0 < frame["valid_share"] <= 1
