@@ -128,6 +128,8 @@ def test_the_first_stays_the_main_one_even_if_others_are_larger(results, tmp_pat
     found = merged(results["elsewhere"], tmp_path / "pair", searches=3)
     assert [s.name for s in found.sessions] == ["elsewhere", "here", "there"]
     assert found.has_pose.tolist() == [True] * 12 + [False] * 24
+    assert "few_poses" not in {reason.code for reason in found.diagnostics.reasons}
+    assert found.diagnostics.verdict == "degraded"
     assert [s.T_main_session is None for s in found.sessions] == [False, True, True]
     assert [(p.a, p.b, p.joined, p.before) for p in found.session_pairs] == [
         (0, 1, False, False),

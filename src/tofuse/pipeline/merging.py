@@ -8,7 +8,7 @@ world stays that of the first result. What can't be joined stays apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,7 +37,9 @@ from tofuse.results.types import (
     Reason,
     Reconstruction,
     SessionRecord,
+    in_main_model,
 )
+from tofuse.results.verdict import verdict_of
 
 Float64 = NDArray[np.float64]
 
@@ -218,8 +220,9 @@ def _told(
         session_pairs=pairs,
         changes=session_changes(result, records, views),
     )
-    reasons = tuple(_named(reason, result) for reason in result.diagnostics.reasons)
-    return replace(result, diagnostics=replace(result.diagnostics, reasons=reasons))
+    reasons = tuple(_reasons(result))
+    told = replace(result.diagnostics, reasons=reasons, verdict=verdict_of(reasons))
+    return replace(result, diagnostics=told)
 
 
 def _T_main_session(
@@ -241,17 +244,29 @@ def _T_main_session(
     return align(stated, here)
 
 
-def _named(reason: Reason, result: Reconstruction) -> Reason:
-    """A reason that names the sessions which could not be joined."""
-    if reason.code != "disconnected":
-        return reason
+def _reasons(result: Reconstruction) -> Iterator[Reason]:
+    """The reasons, as they are to be told where sessions stay apart: they are named."""
     apart = [s.name for s in result.sessions if s.T_main_session is None]
-    if not apart:
-        return reason
-    names = ", ".join(apart)
-    main = ", ".join(s.name for s in result.sessions if s.T_main_session is not None)
-    text = f"No overlap could be confirmed between {main} and {names}. {reason.text}"
-    return replace(reason, text=text)
+    for reason in result.diagnostics.reasons:
+        if apart and reason.code == "few_poses" and _has_most(result):
+            continue
+        if apart and reason.code == "disconnected":
+            main = [s.name for s in result.sessions if s.T_main_session is not None]
+            text = f"No overlap could be confirmed between {' or '.join(main)} and "
+            yield replace(reason, text=f"{text}{', '.join(apart)}. {reason.text}")
+        else:
+            yield reason
+
+
+def _has_most(result: Reconstruction) -> bool:
+    """Whether the main model has most frames of the sessions that are part of it."""
+    joined = [s for s in result.sessions if s.T_main_session is not None]
+    frames = [
+        f
+        for f in result.diagnostics.frames
+        if f.status != "skipped" and any(s.has(f.index) for s in joined)
+    ]
+    return 2 * sum(in_main_model(f, result.components) for f in frames) >= len(frames)
 
 
 def check_result(folder: Path) -> None:
