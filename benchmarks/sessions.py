@@ -153,6 +153,18 @@ CASES = (
         False,
     ),
     Case(
+        "furniture of another room",
+        Tour("c", 570, 60),
+        replace(SECOND, name="b-refurnished", refurnished=True, chair=None),
+        False,
+    ),
+    Case(
+        "study of another flat",
+        FIRST,
+        replace(ALIKE, name="alike-2", first=570, beside=True),
+        False,
+    ),
+    Case(
         "room that looks alike",
         ALIKE,
         replace(ALIKE, name="alike-2", first=570, beside=True),
