@@ -13,7 +13,13 @@ def sessions(s: Subject) -> Values:
     """Return the tables of sessions and of pairs of them; empty where there is one recording."""
     records, pairs = s.result.sessions, s.result.session_pairs
     if not records:
-        return {"sessions": [], "session_pairs": [], "sessions_text": "", "changes": []}
+        return {
+            "sessions": [],
+            "session_pairs": [],
+            "sessions_text": "",
+            "changes": [],
+            "met": False,
+        }
     rows = []
     for session in records:
         mine = [f for f in s.result.diagnostics.frames if session.has(f.index)]
@@ -44,6 +50,7 @@ def sessions(s: Subject) -> Values:
         "session_pairs": told[:ROWS],
         "sessions_text": text,
         "changes": changes,
+        "met": any(pair.joined and pair.overlap > 0 for pair in pairs),
     }
 
 
