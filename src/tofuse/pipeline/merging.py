@@ -197,7 +197,7 @@ def _told(
     records = tuple(
         SessionRecord(
             session.name,
-            str(session.result),
+            str(session.result.absolute()),
             session.opening.to_dict(),
             session.config.to_dict(),
             first,
