@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from tofuse.pipeline.evaluating import Evaluation, evaluate
     from tofuse.pipeline.judging import Judgement, judge
     from tofuse.pipeline.mapper import Mapper
-    from tofuse.recordings.arrays import from_arrays
     from tofuse.pipeline.merging import merge
+    from tofuse.recordings.arrays import from_arrays
     from tofuse.recordings.frames import CloudFrame, RangeFrame
     from tofuse.recordings.open import open_recording as open  # noqa: A004
     from tofuse.recordings.recording import Recording
