@@ -216,6 +216,35 @@ def register(arguments: argparse.Namespace) -> int:
     return exit_status(result)
 
 
+def rig_calibrate(arguments: argparse.Namespace) -> int:
+    """``tofuse rig calibrate``."""
+    from tofuse.calibration.camera_json import check_new
+    from tofuse.cli import rigging
+    from tofuse.recordings.rig import write_rig
+    from tofuse.rigs.calibrate import calibrate as calibrate_rig
+
+    check_new(arguments.out, overwrite=arguments.overwrite)
+    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+        found = calibrate_rig(
+            arguments.inputs,
+            motion=arguments.motion,
+            format=arguments.format,
+            threads=arguments.threads,
+            progress=progress,
+        )
+    write_rig(arguments.out, found.rig)
+    if arguments.json:
+        emit({**found.rig.to_dict(), "how": found.how, "notes": list(found.notes)})
+        return rigging.exit_status(found)
+    console = _Output(highlight=False, soft_wrap=True)
+    for table in rigging.tables(found.rig):
+        console.print(table)
+    for note in rigging.notes(found):
+        console.print(f"[yellow]warning:[/] {_escape(note)}")
+    console.print(f"from {found.how}; see {arguments.out}", markup=False)
+    return rigging.exit_status(found)
+
+
 def judge(arguments: argparse.Namespace) -> int:
     """``tofuse judge``."""
     from tofuse.pipeline.judging import JudgeOptions, judge_files, sentence

@@ -38,6 +38,13 @@ A view is a file with one view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 
 a recording, counted from 0.
 
 """
+_EXIT_RIG = """\
+exit status:
+  0  calibrate: every camera is placed; check: no camera was moved
+  3  calibrate: the file was written, but some camera could not be placed
+     check: some camera was moved, or cannot be checked
+  2  nothing was written: one line on stderr says why
+"""
 _EXIT_REGISTER = """\
 exit status:
   0  the pose is believed
@@ -109,6 +116,7 @@ def make_parser(kind: type[Parser] = Parser) -> Parser:
     _register(commands)
     _judge(commands)
     _merge(commands)
+    _rig(commands)
     _demo(commands)
     _simulate(commands)
     _inspect(commands)
@@ -125,7 +133,12 @@ def make_parser(kind: type[Parser] = Parser) -> Parser:
 
 
 def _command(
-    commands: Any, name: str, summary: str, *, epilog: str | None = None
+    commands: Any,
+    name: str,
+    summary: str,
+    *,
+    epilog: str | None = None,
+    function: str | None = None,
 ) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
@@ -138,8 +151,8 @@ def _command(
     def call(arguments: argparse.Namespace) -> int:
         import tofuse.cli.commands as functions
 
-        function: Callable[[argparse.Namespace], int] = getattr(functions, name)
-        return function(arguments)
+        made: Callable[[argparse.Namespace], int] = getattr(functions, function or name)
+        return made(arguments)
 
     parser.set_defaults(command=call, parser=parser)
     return parser
@@ -362,6 +375,54 @@ def _merge(commands: Any) -> None:
     )
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+
+
+def _rig(commands: Any) -> None:
+    p = commands.add_parser(
+        "rig",
+        help="calibrate a rig of several cameras, or check one",
+        description="Several depth cameras that are fixed to each other.",
+        formatter_class=_Help,
+    )
+    p.set_defaults(parser=p)
+    commands = p.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    p = _command(
+        commands,
+        "calibrate",
+        "say where the cameras of a rig are",
+        epilog="Give one recording of each camera, of the same time: one image each, images of a "
+        "scene in\nwhich something moves, or a walk with the rig. The first camera is the rig's "
+        "frame.\n\n" + _EXIT_RIG,
+        function="rig_calibrate",
+    )
+    p.add_argument("inputs", nargs="+", metavar="RECORDING", help="one for each camera")
+    p.add_argument("--out", required=True, type=Path, metavar="FILE", help="the rig.json to write")
+    p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    _rig_options(p)
+    p = _command(
+        commands,
+        "check",
+        "say whether a camera of a rig was moved since it was calibrated",
+        epilog=_EXIT_RIG,
+        function="rig_check",
+    )
+    p.add_argument("rig", type=Path, metavar="RIG", help="a rig.json")
+    p.add_argument(
+        "inputs", nargs="+", metavar="RECORDING", help="new ones of its cameras, in its order"
+    )
+    _rig_options(p)
+
+
+def _rig_options(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--motion",
+        choices=("auto", "still", "moving"),
+        default="auto",
+        help="whether the cameras stood still (default: as their images say)",
+    )
+    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    p.add_argument("--format", metavar="F", help="format of the recordings, if not guessed")
 
 
 def _demo(commands: Any) -> None:

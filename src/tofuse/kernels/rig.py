@@ -1,0 +1,104 @@
+"""Residuals of one view against another one, for cameras that err in depth each by itself.
+
+As in `refinement`, source points are compared with the plane of the target where they land. Every
+point gives a row of its own, as the cameras of a rig share unknowns over many pairs of views.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE
+from tofuse.kernels.jit import kernel
+from tofuse.kernels.projection import landing
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Columns of a row: signed distance to the target's plane in m and its variance (0: the point has no
+# partner), the target's normal in the source's frame, the source's own normal, the moved point,
+# and how the residual moves with missing range of the source and of the target.
+RESIDUAL = 0
+OWN = 1
+TARGET_NORMAL = 2
+SOURCE_NORMAL = 5
+MOVED = 8
+BY_SOURCE = 11
+BY_TARGET = 12
+ROW = 13
+
+
+@kernel
+def residuals(
+    points: Float32,
+    target: Float32,
+    lookup: Float32,
+    lookup_frame: Float64,
+    T: Float64,
+    source_offset: float,
+    target_offset: float,
+    min_cosine: float,
+    out: Float64,
+) -> None:
+    """Compare points with a target, into `out` (N, ROW), which is overwritten.
+
+    Parameters
+    ----------
+    points, target, lookup, lookup_frame, T, min_cosine
+        As in `alignment.accumulate`.
+    source_offset, target_offset
+        By how much the ranges of the two cameras are too short, m.
+    """
+    rows, columns = target.shape[0], target.shape[1]
+    for k in range(points.shape[0]):
+        out[k, :] = 0.0
+        x = np.float64(points[k, POINT])
+        y = np.float64(points[k, POINT + 1])
+        z = np.float64(points[k, POINT + 2])
+        length = np.sqrt(x * x + y * y + z * z)
+        longer = source_offset / length
+        b0, b1, b2 = x / length, y / length, z / length
+        x += longer * x
+        y += longer * y
+        z += longer * z
+        q0 = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        q1 = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        q2 = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        if q2 <= 0.02:
+            continue
+        u, v, iu, _ = landing(q0 / q2, q1 / q2, lookup, lookup_frame)
+        if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
+            continue
+        pixel = target[int(v + 0.5), int(u + 0.5)]
+        distance = np.float64(pixel[DISTANCE])
+        if distance == 0:
+            continue
+        n0 = np.float64(pixel[PLANE])
+        n1 = np.float64(pixel[PLANE + 1])
+        n2 = np.float64(pixel[PLANE + 2])
+        m0 = T[0, 0] * n0 + T[1, 0] * n1 + T[2, 0] * n2
+        m1 = T[0, 1] * n0 + T[1, 1] * n1 + T[2, 1] * n2
+        m2 = T[0, 2] * n0 + T[1, 2] * n1 + T[2, 2] * n2
+        s0 = np.float64(points[k, NORMAL])
+        s1 = np.float64(points[k, NORMAL + 1])
+        s2 = np.float64(points[k, NORMAL + 2])
+        if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
+            continue
+        # Missing range moves the plane along the ray that the point fell on.
+        by_target = (n0 * q0 + n1 * q1 + n2 * q2) / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
+        along = (m0 * x + m1 * y + m2 * z) * np.float64(points[k, SIGMA])
+        row = out[k]
+        row[RESIDUAL] = n0 * q0 + n1 * q1 + n2 * q2 - distance - target_offset * by_target
+        row[OWN] = along * along + np.float64(pixel[VARIANCE])
+        row[TARGET_NORMAL] = m0
+        row[TARGET_NORMAL + 1] = m1
+        row[TARGET_NORMAL + 2] = m2
+        row[SOURCE_NORMAL] = s0
+        row[SOURCE_NORMAL + 1] = s1
+        row[SOURCE_NORMAL + 2] = s2
+        row[MOVED] = x
+        row[MOVED + 1] = y
+        row[MOVED + 2] = z
+        row[BY_SOURCE] = m0 * b0 + m1 * b1 + m2 * b2
+        row[BY_TARGET] = -by_target

@@ -1,0 +1,200 @@
+"""rig.json: several cameras that are fixed to each other."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.atomic import write_text
+from tofuse.geometry.se3 import check_pose
+from tofuse.recordings.camera_file import read_json
+
+Float64 = NDArray[np.float64]
+
+SCHEMA = 1
+FILE_NAME = "rig.json"
+# Larger clock and depth offsets are mistakes in units.
+_MOST_SECONDS, _MOST_METRES = 1e10, 10.0
+
+_REMEDY = "correct it, or write the file again by `tofuse rig calibrate`"
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """One camera of a rig.
+
+    Attributes
+    ----------
+    name
+        What it is called.
+    recording
+        The recording that it was calibrated with, as it was given.
+    T_rig_camera
+        (4, 4) where it is.
+    covariance
+        (6, 6) of the right perturbation of that, m and rad.
+    time_offset_s
+        The rig's time is the camera's timestamp plus this.
+    depth_offset_m
+        By how much its ranges are too long, compared with the first camera's.
+    """
+
+    name: str
+    recording: str
+    T_rig_camera: Float64
+    covariance: Float64
+    time_offset_s: float = 0.0
+    depth_offset_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """How far surfaces of two cameras (by name) are apart: the median in m, of so many pixels."""
+
+    a: str
+    b: str
+    median_m: float
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras that are fixed to each other; the first is the rig's frame.
+
+    Attributes
+    ----------
+    unplaced
+        Why a camera, by name, could not be placed.
+    """
+
+    cameras: tuple[RigCamera, ...]
+    disagreement: tuple[Disagreement, ...] = ()
+    unplaced: Mapping[str, str] = field(default_factory=dict)
+
+    def camera(self, name: str) -> RigCamera | None:
+        """The camera of that name; None if there is none."""
+        return next((camera for camera in self.cameras if camera.name == name), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data."""
+        data: dict[str, Any] = {
+            "schema": SCHEMA,
+            "cameras": [
+                {
+                    "name": c.name,
+                    "recording": c.recording,
+                    "T_rig_camera": c.T_rig_camera.tolist(),
+                    "covariance": c.covariance.ravel().tolist(),
+                    "time_offset_s": c.time_offset_s,
+                    "depth_offset_m": c.depth_offset_m,
+                }
+                for c in self.cameras
+            ],
+            "disagreement": [
+                {"a": d.a, "b": d.b, "median_m": d.median_m, "pixels": d.pixels}
+                for d in self.disagreement
+            ],
+        }
+        if self.unplaced:
+            data["unplaced"] = [{"name": n, "reason": r} for n, r in self.unplaced.items()]
+        return data
+
+
+def write_rig(path: str | Path, rig: Rig) -> None:
+    """Write a rig.json, whole or not at all."""
+    write_text(path, json.dumps(rig.to_dict(), indent=1) + "\n")
+
+
+def read_rig(path: str | Path) -> Rig:
+    """Read and check a rig.json.
+
+    Raises
+    ------
+    InputError
+        Naming the field that makes no sense.
+    """
+    data = read_json(path)
+    schema = data.get("schema")
+    if schema != SCHEMA or isinstance(schema, bool):
+        problem = f"schema is {schema!r}" if "schema" in data else "schema is missing"
+        raise InputError(problem, where=path, remedy=f"write {SCHEMA}, the only version there is")
+    rows = data.get("cameras")
+    if not isinstance(rows, list) or not rows:
+        raise InputError("cameras is no list of cameras", where=path, remedy=_REMEDY)
+    cameras = tuple(_camera(row, k, path) for k, row in enumerate(rows))
+    names = [camera.name for camera in cameras]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"has two cameras called {name!r}", where=path, remedy=_REMEDY)
+    if not np.allclose(cameras[0].T_rig_camera, np.eye(4), atol=1e-6):
+        raise InputError(
+            f"the first camera, {names[0]!r}, is not the identity", where=path, remedy=_REMEDY
+        )
+    found = data.get("disagreement", [])
+    if not isinstance(found, list):
+        raise InputError("disagreement is no list", where=path, remedy=_REMEDY)
+    pairs = tuple(_disagreement(row, k, names, path) for k, row in enumerate(found))
+    return Rig(cameras, pairs, _unplaced(data.get("unplaced", []), path))
+
+
+def _camera(row: object, k: int, path: str | Path) -> RigCamera:
+    at = f"cameras[{k}]"
+    if not isinstance(row, dict):
+        raise InputError(f"{at} is no object", where=path, remedy=_REMEDY)
+    name, recording = row.get("name"), row.get("recording", "")
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"{at}.name is {name!r}, no name", where=path, remedy=_REMEDY)
+    if not isinstance(recording, str):
+        raise InputError(f"{at}.recording is no path", where=path, remedy=_REMEDY)
+    T = check_pose(
+        _numbers(row.get("T_rig_camera"), (4, 4), f"{at}.T_rig_camera", path), where=path
+    )
+    C = _numbers(row.get("covariance", [0.0] * 36), (6, 6), f"{at}.covariance", path)
+    least = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
+    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or least < -1e-6 * max(np.abs(C).max(), 1e-9):
+        raise InputError(f"{at}.covariance is no covariance", where=path, remedy=_REMEDY)
+    time = _number(row.get("time_offset_s", 0.0), _MOST_SECONDS, f"{at}.time_offset_s", path)
+    depth = _number(row.get("depth_offset_m", 0.0), _MOST_METRES, f"{at}.depth_offset_m", path)
+    return RigCamera(name, recording, T, 0.5 * (C + C.T), time, depth)
+
+
+def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Disagreement:
+    at = f"disagreement[{k}]"
+    if not isinstance(row, dict) or row.get("a") not in names or row.get("b") not in names:
+        raise InputError(f"{at} names no two cameras", where=path, remedy=_REMEDY)
+    median = _number(row.get("median_m"), 1e6, f"{at}.median_m", path)
+    pixels = _number(row.get("pixels", 0), 1e15, f"{at}.pixels", path)
+    return Disagreement(str(row["a"]), str(row["b"]), median, int(pixels))
+
+
+def _unplaced(rows: object, path: str | Path) -> dict[str, str]:
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError("unplaced is no list of cameras", where=path, remedy=_REMEDY)
+    return {str(row.get("name", "")): str(row.get("reason", "")) for row in rows}
+
+
+def _numbers(value: object, shape: tuple[int, int], name: str, path: str | Path) -> Float64:
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.size != shape[0] * shape[1] or not np.isfinite(array).all():
+        count = shape[0] * shape[1]
+        raise InputError(f"{name} is not {count} finite numbers", where=path, remedy=_REMEDY)
+    return array.reshape(shape)
+
+
+def _number(value: object, most: float, name: str, path: str | Path) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} is {value!r}, no number", where=path, remedy=_REMEDY)
+    if abs(value) > most:
+        raise InputError(f"{name} is {value:g}, too large", where=path, remedy=_REMEDY)
+    return float(value)

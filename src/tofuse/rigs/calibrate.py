@@ -1,0 +1,128 @@
+"""Calibrating a rig from whatever its cameras recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse.errors import InputError
+from tofuse.kernels.threads import threads as using_threads
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.recordings.rig import Disagreement, Rig, RigCamera
+from tofuse.rigs.inputs import Camera, open_cameras
+from tofuse.rigs.still import StillRig, calibrate_still, stands_still
+
+Motion = Literal["auto", "still", "moving"]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rig as calibrated.
+
+    Attributes
+    ----------
+    rig
+        The placed cameras; those that could not be placed are in its `unplaced`.
+    how
+        "one instant", "instants" or "motion".
+    notes
+        What a person should know.
+    """
+
+    rig: Rig
+    how: str
+    notes: tuple[str, ...] = ()
+
+
+def calibrate(
+    recordings: Sequence[str | Path],
+    *,
+    motion: Motion = "auto",
+    format: str | None = None,  # noqa: A002
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Say where the cameras of a rig are, from one recording of each.
+
+    Raises
+    ------
+    InputError
+        If a recording can't be used, or no camera can be placed against the first one.
+    """
+    with using_threads(threads), threadpool_limits(1):
+        cameras = open_cameras(recordings, format)
+        return calibrate_cameras(cameras, recordings, motion, progress or Silent())
+
+
+def calibrate_cameras(
+    cameras: Sequence[Camera],
+    paths: Sequence[str | Path],
+    motion: Motion = "auto",
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate opened cameras; see `calibrate`."""
+    progress = progress or Silent()
+    progress.stage("opening")
+    if not moves(cameras, motion):
+        return _of_still(cameras, paths, calibrate_still(cameras, progress))
+    raise InputError("moving", where="a rig")
+
+
+def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
+    """Whether the rig moves.
+
+    Raises
+    ------
+    InputError
+        If some cameras move and others don't: then they are not fixed to each other.
+    """
+    if motion != "auto":
+        return motion == "moving"
+    still = [stands_still(camera) for camera in cameras]
+    if any(still) and not all(still):
+        names = [c.name for c, s in zip(cameras, still, strict=True) if s]
+        raise InputError(
+            f"{' and '.join(names)} stood still while other cameras moved",
+            where="the rig",
+            remedy="give recordings of cameras that are fixed to each other, or say what they do "
+            "by --motion still or --motion moving",
+        )
+    return not all(still)
+
+
+def _of_still(
+    cameras: Sequence[Camera], paths: Sequence[str | Path], found: StillRig
+) -> Calibration:
+    names = [camera.name for camera in cameras]
+    placed = found.placed
+    rows = tuple(
+        RigCamera(
+            names[c],
+            str(paths[c]),
+            placed.poses[k],
+            placed.covariance[k][:6, :6],
+            float(found.time_offsets[c]),
+            -float(placed.offsets[k]),
+        )
+        for k, c in enumerate(found.cameras)
+    )
+    pairs = tuple(
+        Disagreement(names[found.cameras[a]], names[found.cameras[b]], median, pixels)
+        for (a, b), (median, pixels) in placed.disagreement.items()
+    )
+    unplaced = {names[c]: reason for c, reason in sorted(found.placement.reasons.items())}
+    how = "one instant" if found.instants == 1 else f"{found.instants} instants"
+    return Calibration(Rig(rows, pairs, unplaced), how, found.notes)
+
+
+def loosest(camera: RigCamera) -> tuple[float, float]:
+    """Standard deviations of a camera's position in m and its rotation in rad, where largest."""
+    C = camera.covariance
+    both = (float(np.sqrt(max(np.linalg.eigvalsh(B)[-1], 0))) for B in (C[:3, :3], C[3:, 3:]))
+    position, rotation = both
+    return position, rotation

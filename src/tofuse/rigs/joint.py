@@ -1,0 +1,367 @@
+"""All cameras of a rig at once: their poses, and by how much their depths differ.
+
+Views of different cameras that overlap are compared both ways. As the cameras do not move against
+each other, all instants share the unknowns: a pose and a depth offset for each camera but the
+first. The covariance is that of an M-estimator whose errors are alike where surfaces are near each
+other (Conley, "GMM estimation with cross sectional dependence", 1999): errors of depth by indirect
+light, by the lens and by motion are the same for neighbouring points, in all views of a place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels import rig as kernels
+from tofuse.kernels.threads import run_chunks
+from tofuse.posegraph.refine import UNITS, Round
+from tofuse.posegraph.views import KeptView
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+# Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
+_SIZE = 7
+_UNITS = np.append(UNITS, 0.01)
+_PAIRS_A_CHUNK = 8
+# Chi-square with one degree of freedom: median; and sigmas of a distance that count at most.
+_MEDIAN_OF_SQUARES = 0.455
+_LEAST_SCALE, _MOST_SCALE = 0.7, 30.0
+_LEAST_COMPARED = 50
+# Sigma beyond which nothing is known, in units of 1 cm and 1 degree.
+_LOOSEST = 100.0
+# Regions of space in which all errors are alike, as a share of the depth.
+_REGION = 0.1
+
+
+@dataclass(frozen=True)
+class JointOptions:
+    """How the cameras of a rig are refined together.
+
+    Attributes
+    ----------
+    rounds
+        Coarse and wide to fine.
+    robust, max_angle
+        As in `ProjectiveOptions`.
+    overlap
+        Least share of a view's points that must land on surfaces of another one.
+    offset_sigma_m
+        What is known of a camera's depth offset beforehand. Makers promise about a centimetre.
+    reach
+        Errors of points this far apart are still alike (by 1/e), as a share of the depth.
+    steepness
+        As in `registration.uncertainty`.
+    settled
+        Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
+    """
+
+    rounds: tuple[Round, ...] = (Round(6, 0.03, 0.0), Round(6, 0.01, 0.0), Round(12, 0.0, 0.0))
+    robust: float = 3.5
+    max_angle: float = 0.7
+    overlap: float = 0.04
+    offset_sigma_m: float = 0.01
+    reach: float = 0.31
+    steepness: float = 0.3
+    settled: float = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera of a rig saw at an instant."""
+
+    camera: int
+    instant: int
+    kept: KeptView
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where the cameras are.
+
+    Attributes
+    ----------
+    poses
+        (K, 4, 4) T_rig_camera; the first is the identity.
+    offsets
+        (K,) by how much each camera's ranges are too short against the first one's, m.
+    covariance
+        (K, 7, 7) of the right perturbation of the pose, and of the offset; that of all cameras
+        together is `whole`.
+    whole
+        (7 (K - 1), 7 (K - 1)).
+    rms_m
+        Robust root mean square distance between surfaces.
+    disagreement
+        By pair of cameras (a, b), a < b: median distance between their surfaces in m, and how many
+        pixels were compared.
+    """
+
+    poses: Float64
+    offsets: Float64
+    covariance: Float64
+    whole: Float64
+    rms_m: float
+    disagreement: dict[tuple[int, int], tuple[float, int]] = field(default_factory=dict)
+
+
+def refine_together(
+    views: Sequence[View], poses: Float64, options: JointOptions | None = None
+) -> Placed:
+    """Move all cameras until what they see agrees.
+
+    Parameters
+    ----------
+    poses
+        (K, 4, 4) T_rig_camera to start from; the first stays.
+    """
+    system = _System(views, poses, options or JointOptions())
+    for stage in system.options.rounds:
+        for _ in range(stage.iterations):
+            if system.step(stage.slack_m) < system.options.settled:
+                break
+    return system.placed()
+
+
+def disagreements(
+    views: Sequence[View], poses: Float64, offsets: Float64 | None = None
+) -> dict[tuple[int, int], tuple[float, int]]:
+    """Median distance between the surfaces of each two cameras in m, and the pixels compared."""
+    system = _System(views, poses, JointOptions())
+    if offsets is not None:
+        system.offsets = np.asarray(offsets, float)
+    return system.disagreement(system.compare())
+
+
+class _System:
+    """The unknowns, and what is compared."""
+
+    def __init__(self, views: Sequence[View], poses: Float64, options: JointOptions) -> None:
+        self.options = options
+        self.views = views
+        self.poses = np.array(poses, float)
+        self.offsets = np.zeros(len(poses))
+        at: dict[int, list[int]] = {}
+        for k, view in enumerate(views):
+            at.setdefault(view.instant, []).append(k)
+        self.pairs = [(i, j) for one in at.values() for i in one for j in one if i != j]
+        count = len(poses)
+        self.scale = np.full((count, count), 3.0)
+        depths = [view.kept.surface.depth for view in views]
+        self.depth = float(np.median(depths)) if depths else 1.0
+
+    def compare(self) -> list[Float64]:
+        """Rows of each pair (target, source) of views: what has a partner, and is near it."""
+        rows: list[Float64] = [np.zeros((0, kernels.ROW))] * len(self.pairs)
+        cosine = float(np.cos(self.options.max_angle))
+        inverse = se3.inverse(self.poses)
+
+        def work(a: int, b: int) -> None:
+            for k in range(a, b):
+                target, source = (self.views[i] for i in self.pairs[k])
+                surface, points = target.kept.surface, source.kept.points
+                out = np.empty((len(points), kernels.ROW))
+                kernels.residuals(
+                    points,
+                    surface.target,
+                    surface.projection.lookup,
+                    surface.projection.frame,
+                    np.ascontiguousarray(inverse[target.camera] @ self.poses[source.camera]),
+                    self.offsets[source.camera],
+                    self.offsets[target.camera],
+                    cosine,
+                    out,
+                )
+                # What is further off than surfaces can be is another surface.
+                near = (out[:, kernels.OWN] > 0) & (
+                    np.abs(out[:, kernels.RESIDUAL]) < 0.1 * self.depth
+                )
+                if near.sum() >= self.options.overlap * len(points):
+                    rows[k] = out[near]
+
+        run_chunks(work, len(self.pairs), -(-len(self.pairs) // _PAIRS_A_CHUNK))
+        return rows
+
+    def rescale(self, rows: Sequence[Float64]) -> None:
+        """Take the scale of the noise between two cameras from how far their surfaces are apart."""
+        count = len(self.poses)
+        ratios: dict[tuple[int, int], list[Float64]] = {}
+        for (i, j), row in zip(self.pairs, rows, strict=True):
+            ends = self.views[i].camera, self.views[j].camera
+            ratios.setdefault(ends, []).append(row[:, kernels.RESIDUAL] ** 2 / row[:, kernels.OWN])
+        for a in range(count):
+            for b in range(count):
+                found = np.concatenate(ratios.get((a, b), [np.zeros(0)]))
+                if len(found) >= _LEAST_COMPARED:
+                    scale = np.sqrt(np.median(found) / _MEDIAN_OF_SQUARES)
+                    self.scale[a, b] = np.clip(scale, _LEAST_SCALE, _MOST_SCALE)
+
+    def jacobian(self, k: int, row: Float64) -> tuple[Float64, Float64]:
+        """(N, 14) derivatives by the source's and the target's unknowns, and half the difference
+        of those by the normals of the two."""
+        target, source = (self.views[i].camera for i in self.pairs[k])
+        p = row[:, kernels.MOVED : kernels.MOVED + 3]
+        m = row[:, kernels.TARGET_NORMAL : kernels.TARGET_NORMAL + 3]
+        s = row[:, kernels.SOURCE_NORMAL : kernels.SOURCE_NORMAL + 3]
+        T_source_target = se3.inverse(self.poses[source]) @ self.poses[target]
+        back = -se3.adjoint(T_source_target)
+        out = []
+        for normal in (0.5 * (m + s), 0.5 * (m - s)):
+            J = np.concatenate([normal, np.cross(p, normal)], 1)
+            out.append(
+                np.concatenate([J, np.zeros((len(J), 1)), J @ back, np.zeros((len(J), 1))], 1)
+            )
+        both, half = out
+        both[:, 6] = row[:, kernels.BY_SOURCE]
+        both[:, 13] = row[:, kernels.BY_TARGET]
+        return both * np.tile(_UNITS, 2), half * np.tile(_UNITS, 2)
+
+    def unknowns(self, k: int) -> Integers:
+        """(14,) places of the unknowns of a pair's cameras."""
+        target, source = (self.views[i].camera for i in self.pairs[k])
+        return np.concatenate(
+            [_SIZE * source + np.arange(_SIZE), _SIZE * target + np.arange(_SIZE)]
+        )
+
+    def step(self, slack: float) -> float:
+        """Make one Gauss-Newton step; returns by how much anything moved."""
+        rows = self.compare()
+        self.rescale(rows)
+        size = _SIZE * len(self.poses)
+        H, g = np.zeros((size, size)), np.zeros(size)
+        for k, row in enumerate(rows):
+            if not len(row):
+                continue
+            J, _ = self.jacobian(k, row)
+            w, _ = self.weights(k, row, slack)
+            at = self.unknowns(k)
+            H[np.ix_(at, at)] += (J * w[:, None]).T @ J
+            g[at] += J.T @ (w * row[:, kernels.RESIDUAL])
+        self.add_prior(H, g)
+        free = np.arange(_SIZE, size)
+        H = H[np.ix_(free, free)]
+        # Just enough that a camera which nothing holds stays.
+        H[np.diag_indices(len(H))] += 1e-3 + 1e-6 * H.diagonal()
+        step = np.zeros(size)
+        step[free] = -np.linalg.solve(H, g[free])
+        change = (step.reshape(-1, _SIZE) * _UNITS)[1:]
+        self.poses[1:] = se3.orthonormalise(self.poses[1:] @ se3.exp(change[:, :6]))
+        self.offsets[1:] += change[:, 6]
+        return float(np.abs(step).max())
+
+    def weights(self, k: int, row: Float64, slack: float) -> tuple[Float64, Float64]:
+        """Weights of Tukey's biweight over the variance, and the slope of its influence."""
+        target, source = (self.views[i].camera for i in self.pairs[k])
+        variance = row[:, kernels.OWN] * self.scale[target, source] ** 2 + slack**2
+        e2 = row[:, kernels.RESIDUAL] ** 2 / (variance * self.options.robust**2)
+        f = np.maximum(1 - e2, 0)
+        return f * f / variance, f * (1 - 5 * e2) / variance
+
+    def add_prior(self, H: Float64, g: Float64) -> None:
+        """Add what is known of the offsets beforehand, in units."""
+        at = _SIZE * np.arange(len(self.poses)) + 6
+        known = (0.01 / self.options.offset_sigma_m) ** 2
+        H[at, at] += known
+        g[at] += known * self.offsets / 0.01
+
+    def placed(self) -> Placed:
+        """Say where the cameras are, and how well that is known."""
+        rows = self.compare()
+        self.rescale(rows)
+        count, size = len(self.poses), _SIZE * len(self.poses)
+        plain, cross = np.zeros((size, size)), np.zeros((size, size))
+        noise = np.zeros((size, size))
+        places, gradients = [], []
+        squares = weight = 0.0
+        for k, row in enumerate(rows):
+            if not len(row):
+                continue
+            J, D = self.jacobian(k, row)
+            w, slope = self.weights(k, row, 0.0)
+            at = self.unknowns(k)
+            plain[np.ix_(at, at)] += (J * w[:, None]).T @ J - (D * w[:, None]).T @ D
+            cross[np.ix_(at, at)] += (J * slope[:, None]).T @ J - (D * slope[:, None]).T @ D
+            r = row[:, kernels.RESIDUAL]
+            noise[np.ix_(at, at)] += (J * (w * w * r * r)[:, None]).T @ J
+            each = np.zeros((len(row), size))
+            each[:, at] = J * (w * r)[:, None]
+            source = self.views[self.pairs[k][1]].camera
+            where = se3.transform(self.poses[source], row[:, kernels.MOVED : kernels.MOVED + 3])
+            region, summed = _by_region(where, each, _REGION * self.depth)
+            places.append(region)
+            gradients.append(summed)
+            squares += float((w * r * r).sum())
+            weight += float(w.sum())
+        C = np.full((size - _SIZE, size - _SIZE), np.nan)
+        if places:
+            C = self._covariance(
+                plain, cross, noise, np.concatenate(places), np.concatenate(gradients)
+            )
+        scaled = C * np.outer(np.tile(_UNITS, count - 1), np.tile(_UNITS, count - 1))
+        blocks = np.zeros((count, _SIZE, _SIZE))
+        for c in range(1, count):
+            own = slice(_SIZE * (c - 1), _SIZE * c)
+            blocks[c] = scaled[own, own]
+        rms = float(np.sqrt(squares / weight)) if weight else float("nan")
+        return Placed(self.poses, self.offsets, blocks, scaled, rms, self.disagreement(rows))
+
+    def _covariance(
+        self, plain: Float64, cross: Float64, noise: Float64, places: Float64, gradients: Float64
+    ) -> Float64:
+        free = np.arange(_SIZE, len(plain))
+        none = np.zeros(len(plain))
+        for matrix in (plain, cross):
+            self.add_prior(matrix, none.copy())
+        X = _slope(plain[np.ix_(free, free)], cross[np.ix_(free, free)], self.options.steepness)
+        regions, inverse = np.unique(places, axis=0, return_inverse=True)
+        g = np.zeros((len(regions), len(free)))
+        np.add.at(g, inverse.ravel(), gradients[:, free])
+        at = (regions + 0.5) * _REGION * self.depth
+        apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+        alike = np.exp(-apart / (self.options.reach * self.depth))
+        B = g.T @ alike @ g
+        B += noise[np.ix_(free, free)]
+        known = (0.01 / self.options.offset_sigma_m) ** 2
+        prior = np.zeros(len(free))
+        prior[6::_SIZE] = known
+        B += np.diag(prior)
+        values, vectors = np.linalg.eigh(0.5 * (X + X.T))
+        bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
+        C = bread @ B @ bread
+        # What nothing holds is not known, whatever the gradient there is.
+        weak = vectors[:, values < _LOOSEST**-2]
+        C += _LOOSEST**2 * weak @ weak.T
+        return 0.5 * (C + C.T)
+
+    def disagreement(self, rows: Sequence[Float64]) -> dict[tuple[int, int], tuple[float, int]]:
+        """See `disagreements`."""
+        found: dict[tuple[int, int], list[Float64]] = {}
+        for (i, j), row in zip(self.pairs, rows, strict=True):
+            a, b = sorted((self.views[i].camera, self.views[j].camera))
+            found.setdefault((a, b), []).append(np.abs(row[:, kernels.RESIDUAL]))
+        every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
+        return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
+
+
+def _by_region(where: Float64, rows: Float64, size: float) -> tuple[Float64, Float64]:
+    """Sum rows (N, n) over cubes of space: the cubes (R, 3), and their sums (R, n)."""
+    cube = np.floor(where / size)
+    regions, inverse = np.unique(cube, axis=0, return_inverse=True)
+    out = np.zeros((len(regions), rows.shape[1]))
+    np.add.at(out, inverse.ravel(), rows)
+    return regions, out
+
+
+def _slope(plain: Float64, cross: Float64, steepness: float) -> Float64:
+    """Slope of the gradient, along no direction less than a share of what it is without robust
+    weights."""
+    values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
+    root = vectors / np.sqrt(np.maximum(values, 1e-4))
+    values, turned = np.linalg.eigh(root.T @ (0.5 * (cross + cross.T)) @ root)
+    back = np.linalg.inv(root).T @ turned
+    X: Float64 = (back * np.maximum(values, steepness)) @ back.T
+    return X

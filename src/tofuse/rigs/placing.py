@@ -1,0 +1,314 @@
+"""Where the cameras of a rig are when nothing is known: poses of pairs, decided about together.
+
+Two cameras that look at the same thing from two sides share little, and one pair seldom tells which
+of many poses is right. All cameras do: a pose that is right for one pair agrees with what every
+other camera saw, and through what it saw. So each pair of views only proposes poses, found by an
+exhaustive search; sets of them are put together camera by camera, the best first, and judged by the
+agreement of all pairs at all instants. A camera is placed if no other place for it comes near.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels.threads import run_all
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.posegraph.views import KeptView
+from tofuse.registration.agreement import Comparison
+from tofuse.registration.base import PROBABLE
+from tofuse.registration.confidence import BELIEVED, Evidence
+from tofuse.registration.search import Search, SearchOptions
+from tofuse.registration.verification import comparable
+from tofuse.registration.view_pair import register_pair
+from tofuse.rigs.joint import JointOptions, View, refine_together
+
+Float64 = NDArray[np.float64]
+V = TypeVar("V")
+
+# Instants that are searched, that judge, and that settle: more of a moving scene say more.
+_SEARCHED, _JUDGED, _SETTLED = 2, 4, 2
+# Proposals of each pair; sets that are kept, and of those that are settled.
+_PROPOSALS, _BEAM, _POLISHED = 24, 12, 6
+# Rivals that tell how far the best of wrong places leads the next, and how improbable a lead must
+# be among these.
+_RIVALS, _CHANCE = 10, 0.01
+# Cameras around a thing are as far from each other as from two sides of it, and face any way; those
+# side by side see much of the same, and may be tilted.
+_AROUND = SearchOptions(mode="planar", yaw=float(np.pi), reach=1.8, planar_candidates=40)
+_BESIDE = SearchOptions(mode="full")
+# Distinct places differ by more than this share of the depth.
+_DISTINCT = 0.04
+_POINTS = 1500
+_SETTLING = JointOptions(offset_sigma_m=1e-4)
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the cameras are, as far as they can be placed.
+
+    Attributes
+    ----------
+    poses
+        T_first_camera (4, 4) by camera; the first one's is the identity.
+    probability
+        By camera, that its place is right, 0 to 1; of the others as well, but the first.
+    reasons
+        By camera that is not placed: why not.
+    """
+
+    poses: dict[int, Float64]
+    probability: dict[int, float]
+    reasons: dict[int, str]
+
+
+def place(cameras: Sequence[Sequence[SurfaceMap | None]]) -> Placement:
+    """Place cameras that stand still against each other.
+
+    Parameters
+    ----------
+    cameras
+        For each camera its views, one for each instant, None where it has none.
+    """
+    return _Placer(cameras).placement()
+
+
+@dataclass(frozen=True)
+class _Said:
+    """What the views of two cameras say of a pose: means over instants, see `Agreement`."""
+
+    score: float = 0.0
+    support: float = 0.0
+    overlap: float = 0.0
+    against: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Set:
+    """Places for some cameras, and how well all their pairs agree there."""
+
+    poses: dict[int, Float64]
+    score: float
+
+
+class _Placer:
+    def __init__(self, cameras: Sequence[Sequence[SurfaceMap | None]]) -> None:
+        self._views = cameras
+        self._depth = {
+            c: float(np.median([v.depth for v in views if v is not None]))
+            for c, views in enumerate(cameras)
+            if any(v is not None for v in views)
+        }
+        typical = min(1.0, float(np.median(list(self._depth.values()))) if self._depth else 1.0)
+        self._options = replace(
+            _AROUND,
+            distinct_m=min(_AROUND.distinct_m, _DISTINCT * typical),
+            agreement=replace(_AROUND.agreement, floor_m=_AROUND.agreement.floor_m * typical),
+        )
+        self._compared: dict[tuple[int, int], list[Comparison]] = {}
+        self._proposals: dict[tuple[int, int], Float64] = {}
+        self._kept = self._settling_views()
+        for a, b in itertools.combinations(sorted(self._depth), 2):
+            self._search(a, b)
+
+    def _settling_views(self) -> list[View]:
+        instants = range(max(map(len, self._views), default=0))
+        full = [m for m in instants if all(self._views[c][m] is not None for c in self._depth)]
+        some = _evenly(full or list(instants), _SETTLED)
+        return [
+            View(c, m, KeptView.of(view, _POINTS))
+            for m in some
+            for c, views in enumerate(self._views)
+            if (view := views[m]) is not None
+        ]
+
+    def _search(self, a: int, b: int) -> None:
+        """Propose poses of camera b in the frame of a."""
+        both = [
+            (first, second)
+            for first, second in zip(self._views[a], self._views[b], strict=True)
+            if first is not None and second is not None and comparable(first.depth, second.depth)
+        ]
+        self._compared[a, b] = [
+            Comparison.of(s, t, self._options.agreement) for t, s in _evenly(both, _JUDGED)
+        ]
+        found = [self._found(t, s) for t, s in _evenly(both, _SEARCHED)]
+        poses = np.concatenate([np.zeros((0, 4, 4)), *found])
+        scores = np.array([self._at(a, b, T).score for T in poses])
+        kept: list[Float64] = []
+        for k in np.argsort(-scores, kind="stable"):
+            if scores[k] > 0 and all(self._options.differ(poses[k], other) for other in kept):
+                kept.append(poses[k])
+        self._proposals[a, b] = np.array(kept[:_PROPOSALS]).reshape(-1, 4, 4)
+
+    def _found(self, target: SurfaceMap, source: SurfaceMap) -> Float64:
+        """Poses T_target_source (N, 4, 4) that a pair of views proposes."""
+        near = register_pair(source, target)
+        poses = [] if near is None else [near.T_target_source]
+        for options in (self._options, _BESIDE):
+            search = Search.of(source, target, options)
+            match = None if search is None else search.everywhere()
+            if match is not None:
+                poses += [candidate.T_target_source for candidate in match.candidates]
+        return np.array(poses).reshape(-1, 4, 4)
+
+    def _at(self, a: int, b: int, T_a_b: Float64) -> _Said:
+        """What all instants say of the pose of b in the frame of a."""
+        if (a, b) not in self._compared:
+            a, b, T_a_b = b, a, se3.inverse(T_a_b)
+        all_said = [compared.at(T_a_b) for compared in self._compared[a, b]]
+        if not all_said:
+            return _Said()
+        rows = [(s.score, s.support, s.overlap, s.violation + s.clash) for s in all_said]
+        return _Said(*(float(mean) for mean in np.mean(rows, axis=0)))
+
+    def _proposed(self, a: int, b: int) -> Float64:
+        """Poses (N, 4, 4) of b in the frame of a."""
+        if a < b:
+            return self._proposals[a, b]
+        return np.asarray(se3.inverse(self._proposals[b, a]), np.float64)
+
+    def _gain(self, poses: Mapping[int, Float64], camera: int, T: Float64) -> float:
+        """By how much a camera at T agrees with the others that have a place."""
+        return sum(
+            self._at(c, camera, se3.inverse(at) @ T).score for c, at in poses.items() if c != camera
+        )
+
+    def _places(self, poses: Mapping[int, Float64], camera: int) -> list[Float64]:
+        """Where a camera may be, by what it shares with each of those that have a place."""
+        return [poses[c] @ T for c in poses if c != camera for T in self._proposed(c, camera)]
+
+    def _grown(self, sets: Sequence[_Set]) -> list[_Set]:
+        """Sets with one camera more, the best first."""
+        jobs = [
+            (known, camera, T)
+            for known in sets
+            for camera in self._depth
+            if camera not in known.poses
+            for T in self._places(known.poses, camera)
+        ]
+        gains = run_all([partial(self._gain, known.poses, camera, T) for known, camera, T in jobs])
+        grown = [
+            _Set({**known.poses, camera: T}, known.score + gain)
+            for (known, camera, T), gain in zip(jobs, gains, strict=True)
+            if gain > 0
+        ]
+        best = self._distinct(grown, _BEAM)
+        settled = run_all([partial(self._settle, one) for one in best[:_POLISHED]])
+        return self._distinct([*settled, *best[_POLISHED:]], _BEAM)
+
+    def _distinct(self, sets: Sequence[_Set], most: int) -> list[_Set]:
+        kept: list[_Set] = []
+        for one in sorted(sets, key=lambda s: -s.score):
+            if all(self._differ(one.poses, other.poses) for other in kept):
+                kept.append(one)
+                if len(kept) == most:
+                    break
+        return kept
+
+    def _differ(self, a: Mapping[int, Float64], b: Mapping[int, Float64]) -> bool:
+        return a.keys() != b.keys() or any(self._options.differ(a[c], b[c]) for c in a)
+
+    def _settle(self, one: _Set) -> _Set:
+        """Align all cameras of a set with each other."""
+        order = sorted(one.poses)
+        row = {c: k for k, c in enumerate(order)}
+        views = [replace(v, camera=row[v.camera]) for v in self._kept if v.camera in row]
+        poses = refine_together(views, np.stack([one.poses[c] for c in order]), _SETTLING).poses
+        moved = dict(zip(order, poses, strict=True))
+        score = self._score(moved)
+        return _Set(moved, score) if score > one.score else one
+
+    def _score(self, poses: Mapping[int, Float64]) -> float:
+        return sum(
+            self._at(a, b, se3.inverse(poses[a]) @ poses[b]).score
+            for a, b in itertools.combinations(sorted(poses), 2)
+        )
+
+    def placement(self) -> Placement:
+        """Put sets together, and keep of the best one the cameras that have no other place."""
+        sets = [_Set({0: np.eye(4)}, 0.0)] if 0 in self._depth else []
+        probability: dict[int, float] = {}
+        reasons: dict[int, str] = {}
+        rivals: list[_Set] = sets
+        while sets:
+            rivals, sets = sets, self._grown(sets)
+        best = rivals[0] if rivals else _Set({}, 0.0)
+        poses = dict(best.poses)
+        while len(poses) > 1:
+            found = {c: self._belief(poses, c, rivals) for c in poses if c}
+            probability.update({c: belief for c, (belief, _) in found.items()})
+            weakest = min(found, key=lambda c: found[c][0])
+            if not found[weakest][1]:
+                break
+            reasons[weakest] = found[weakest][1]
+            del poses[weakest]
+        for c in range(len(self._views)):
+            if c not in poses and c not in reasons:
+                reasons[c] = "no other camera sees the same"
+        return Placement(poses, probability, reasons)
+
+    def _belief(
+        self, poses: Mapping[int, Float64], camera: int, rivals: Sequence[_Set]
+    ) -> tuple[float, str]:
+        """Probability that the place of a camera is right, and why it is not believed, if so.
+
+        What other pairs see is other surface, so that support and lead add up over pairs. Whether
+        a lead is more than chance is told by the rivals: of places that are all wrong the i-th
+        best leads the next by an exponentially distributed gap with mean b / i, whatever the tail
+        of their scores is like (Renyi, 1953; Weissman, 1978).
+        """
+        others = {c: T for c, T in poses.items() if c != camera}
+        at = poses[camera]
+        said = [self._at(c, camera, se3.inverse(T) @ at) for c, T in others.items()]
+        score = sum(s.score for s in said)
+        elsewhere = self._places(others, camera)
+        gains = run_all([partial(self._gain, others, camera, T) for T in elsewhere])
+        total = self._score(poses)
+        found = list(zip(gains, elsewhere, strict=True)) + [
+            (score - (total - other.score), other.poses[camera])
+            for other in rivals
+            if other.poses.keys() == poses.keys()
+        ]
+        apart: list[Float64] = [at]
+        scores: list[float] = []
+        for gain, T in sorted(found, key=lambda pair: -pair[0]):
+            if gain > 0 and all(self._options.differ(T, other) for other in apart):
+                apart.append(T)
+                scores.append(gain)
+        rival = scores[0] if scores else 0.0
+        overlap = max(sum(s.overlap for s in said), 1e-9)
+        evidence = Evidence(
+            support=min(sum(s.support for s in said), 1.0),
+            contradiction=sum(s.against for s in said) / overlap,
+            margin=score - rival,
+        )
+        gaps = -np.diff(scores[: _RIVALS + 1]) * np.arange(2, len(scores[: _RIVALS + 1]) + 1)
+        usual = float(gaps.mean()) if len(gaps) else rival
+        chance = float(np.exp(-max(score - rival, 0.0) / usual)) if usual > 0 else 0.0
+        probability = min(evidence.probability, 1 - chance)
+        if evidence.probability >= BELIEVED:
+            return evidence.probability, ""
+        if evidence.probability < PROBABLE:
+            return probability, evidence.objection()
+        if chance > _CHANCE:
+            return probability, (
+                f"another place fits nearly as well, less {max(score - rival, 0.0):.1%} of the "
+                f"points: a lead that chance gives in {chance:.0%} of the cases"
+            )
+        return 1 - chance, ""
+
+
+def _evenly(items: Sequence[V], count: int) -> list[V]:
+    """At most so many of the items, evenly spread."""
+    if len(items) <= count:
+        return list(items)
+    at = np.linspace(0, len(items) - 1, count).round().astype(int)
+    return [items[k] for k in at]
