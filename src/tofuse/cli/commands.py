@@ -245,6 +245,33 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     return rigging.exit_status(found)
 
 
+def rig_check(arguments: argparse.Namespace) -> int:
+    """``tofuse rig check``."""
+    from tofuse.cli import rigging
+    from tofuse.recordings.rig import read_rig
+    from tofuse.rigs.calibrate import check
+
+    stated = read_rig(arguments.rig)
+    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+        found, cameras = check(
+            stated,
+            arguments.inputs,
+            motion=arguments.motion,
+            format=arguments.format,
+            threads=arguments.threads,
+            progress=progress,
+        )
+    if arguments.json:
+        emit(rigging.check_json(cameras))
+        return rigging.check_status(cameras)
+    console = _Output(highlight=False, soft_wrap=True)
+    for line in rigging.check_lines(cameras):
+        console.print(line, markup=False)
+    for note in found.notes:
+        console.print(f"[yellow]warning:[/] {_escape(note)}")
+    return rigging.check_status(cameras)
+
+
 def judge(arguments: argparse.Namespace) -> int:
     """``tofuse judge``."""
     from tofuse.pipeline.judging import JudgeOptions, judge_files, sentence

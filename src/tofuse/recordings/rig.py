@@ -155,7 +155,7 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     if not isinstance(recording, str):
         raise InputError(f"{at}.recording is no path", where=path, remedy=_REMEDY)
     T = check_pose(
-        _numbers(row.get("T_rig_camera"), (4, 4), f"{at}.T_rig_camera", path), where=path
+        _numbers(row.get("T_rig_camera"), (4, 4), f"{at}.T_rig_camera", path), where=str(path)
     )
     C = _numbers(row.get("covariance", [0.0] * 36), (6, 6), f"{at}.covariance", path)
     least = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])

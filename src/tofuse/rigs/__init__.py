@@ -1,1 +1,1 @@
-"""Several depth cameras that are fixed to each other: where they are, and what they see together."""
+"""Several depth cameras that are fixed to each other: where they are, what they see together."""

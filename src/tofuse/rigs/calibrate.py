@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +14,9 @@ from tofuse.errors import InputError
 from tofuse.kernels.threads import threads as using_threads
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.rig import Disagreement, Rig, RigCamera
+from tofuse.rigs.check import Moved, compare
 from tofuse.rigs.inputs import Camera, open_cameras
+from tofuse.rigs.moving import MovingRig, calibrate_moving
 from tofuse.rigs.still import StillRig, calibrate_still, stands_still
 
 Motion = Literal["auto", "still", "moving"]
@@ -29,7 +31,7 @@ class Calibration:
     rig
         The placed cameras; those that could not be placed are in its `unplaced`.
     how
-        "one instant", "instants" or "motion".
+        "one instant", so many "instants", or "a walk".
     notes
         What a person should know.
     """
@@ -70,7 +72,55 @@ def calibrate_cameras(
     progress.stage("opening")
     if not moves(cameras, motion):
         return _of_still(cameras, paths, calibrate_still(cameras, progress))
-    raise InputError("moving", where="a rig")
+    return _of_moving(cameras, paths, calibrate_moving(cameras, progress))
+
+
+def check(
+    rig: Rig,
+    recordings: Sequence[str | Path],
+    *,
+    motion: Motion = "auto",
+    format: str | None = None,  # noqa: A002
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[Calibration, list[Moved]]:
+    """Calibrate a rig anew, from one recording of each camera in the rig's order, and compare.
+
+    Raises
+    ------
+    InputError
+        If a recording can't be used, or there are not as many as cameras.
+    """
+    with using_threads(threads), threadpool_limits(1):
+        cameras = cameras_of(rig, recordings, format)
+        found = calibrate_cameras(cameras, recordings, motion, progress or Silent())
+    return found, compare(rig, found.rig)
+
+
+def cameras_of(
+    rig: Rig,
+    recordings: Sequence[str | Path],
+    format: str | None = None,  # noqa: A002
+) -> list[Camera]:
+    """Open recordings of a rig's cameras, given in its order.
+
+    Raises
+    ------
+    InputError
+        If there are not as many as cameras, or one can't be opened.
+    """
+    if len(recordings) != len(rig.cameras):
+        names = ", ".join(camera.name for camera in rig.cameras)
+        raise InputError(
+            f"has {len(rig.cameras)} cameras ({names}), and {len(recordings)} recordings are given",
+            where="the rig",
+            remedy="give one recording for each, in this order",
+        )
+    opened = open_cameras(recordings, format)
+    return [
+        replace(camera, name=stated.name)
+        for camera, stated in zip(opened, rig.cameras, strict=True)
+    ]
 
 
 def moves(cameras: Sequence[Camera], motion: Motion) -> bool:
@@ -118,6 +168,23 @@ def _of_still(
     unplaced = {names[c]: reason for c, reason in sorted(found.placement.reasons.items())}
     how = "one instant" if found.instants == 1 else f"{found.instants} instants"
     return Calibration(Rig(rows, pairs, unplaced), how, found.notes)
+
+
+def _of_moving(
+    cameras: Sequence[Camera], paths: Sequence[str | Path], found: MovingRig
+) -> Calibration:
+    names = [camera.name for camera in cameras]
+    rows = [RigCamera(names[0], str(paths[0]), np.eye(4), np.zeros((6, 6)))]
+    rows += [
+        RigCamera(names[k], str(paths[k]), fit.T_a_b, fit.covariance, fit.time_offset_s)
+        for k, fit in sorted(found.fits.items())
+    ]
+    pairs = tuple(
+        Disagreement(names[a], names[b], median, pixels)
+        for (a, b), (median, pixels) in found.disagreement.items()
+    )
+    unplaced = {names[k]: reason for k, reason in sorted(found.reasons.items())}
+    return Calibration(Rig(tuple(rows), pairs, unplaced), "a walk", found.notes)
 
 
 def loosest(camera: RigCamera) -> tuple[float, float]:

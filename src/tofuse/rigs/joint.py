@@ -32,6 +32,8 @@ _PAIRS_A_CHUNK = 8
 _MEDIAN_OF_SQUARES = 0.455
 _LEAST_SCALE, _MOST_SCALE = 0.7, 30.0
 _LEAST_COMPARED = 50
+# What is further off than this share of the depth is another surface.
+_OTHER_SURFACE = 0.1
 # Sigma beyond which nothing is known, in units of 1 cm and 1 degree.
 _LOOSEST = 100.0
 # Regions of space in which all errors are alike, as a share of the depth.
@@ -137,6 +139,26 @@ def disagreements(
     return system.disagreement(system.compare())
 
 
+def distances_between(target: KeptView, source: KeptView, T_target_source: Float64) -> Float64:
+    """(N,) distances in m between the surfaces of two views, where both see the same."""
+    rows = np.empty((len(source.points), kernels.ROW))
+    surface, options = target.surface, JointOptions()
+    kernels.residuals(
+        source.points,
+        surface.target,
+        surface.projection.lookup,
+        surface.projection.frame,
+        np.ascontiguousarray(T_target_source),
+        0.0,
+        0.0,
+        float(np.cos(options.max_angle)),
+        rows,
+    )
+    far = np.abs(rows[:, kernels.RESIDUAL])
+    near = (rows[:, kernels.OWN] > 0) & (far < _OTHER_SURFACE * surface.depth)
+    return np.asarray(far[near], np.float64)
+
+
 class _System:
     """The unknowns, and what is compared."""
 
@@ -178,7 +200,7 @@ class _System:
                 )
                 # What is further off than surfaces can be is another surface.
                 near = (out[:, kernels.OWN] > 0) & (
-                    np.abs(out[:, kernels.RESIDUAL]) < 0.1 * self.depth
+                    np.abs(out[:, kernels.RESIDUAL]) < _OTHER_SURFACE * self.depth
                 )
                 if near.sum() >= self.options.overlap * len(points):
                     rows[k] = out[near]

@@ -16,7 +16,7 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.models import CameraModel, camera_model
 from tofuse.simulation import scene as scenes
 from tofuse.simulation.effects import Effects
-from tofuse.simulation.paths import Path, look_at
+from tofuse.simulation.paths import Path, look_at, rotation
 from tofuse.simulation.record import Plan
 
 Float64 = NDArray[np.float64]
@@ -129,3 +129,32 @@ def _recorded(made: Plan, mount: Mount, frame: RangeFrame) -> RangeFrame:
         along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
         depth = np.where(depth > 0, depth + mount.depth_offset_m * along, 0).astype(np.float32)
     return replace(frame, depth=depth)
+
+
+def wander(
+    centre: SequenceOf[float], radii: SequenceOf[float], seconds: float, tilt_rad: float = 0.25
+) -> Path:
+    """A rig carried round a room: along an ellipse, turning once, tilted to and fro.
+
+    Parameters
+    ----------
+    centre, radii
+        (3,) and (2,) of the ellipse, m.
+    seconds
+        Of one round.
+    tilt_rad
+        By how much it is tilted about its line of sight, and up and down.
+    """
+    middle = np.asarray(centre, float)
+
+    def path(t: float) -> Float64:
+        u = 2 * np.pi * t / seconds
+        around = [radii[0] * np.cos(u), radii[1] * np.sin(u), 0.12 * np.sin(2.3 * u)]
+        at = np.add(middle, around)
+        heading = u + 0.5 * np.sin(1.7 * u)
+        ahead = np.add(at, [np.cos(heading), np.sin(heading), 0.0])
+        T = look_at(at, ahead)
+        tilts = tilt_rad * np.array([np.sin(3.1 * u + 0.4), 0.0, np.sin(2.3 * u)])
+        return np.asarray(T @ rotation([tilts[0], 0, 0]) @ rotation([0, 0, tilts[2]]), np.float64)
+
+    return path

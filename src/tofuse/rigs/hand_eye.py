@@ -1,0 +1,271 @@
+"""How two trajectories of one rig fit together: hand-eye calibration with free-running clocks.
+
+Camera a moves by A while camera b, fixed to it, moves by B: A X = X B, with X = T_a_b (Tsai and
+Lenz, 1989). Relative motions give a first X; then all poses at once are fitted by X, by the motion
+Y between the two worlds, and by what has to be added to b's timestamps: T_a X = Y T_b. Errors of
+trajectories last for a while, and the covariance counts them so (Newey and West, 1987).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.rigs.clocks import Lag, lag_between
+
+Float64 = NDArray[np.float64]
+
+# 1 cm, 1 degree, and 1 ms: so that unknowns can be compared.
+_UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+_TIME_UNIT = 1e-3
+# Poses are interpolated over gaps of so many intervals; fewer than so many common ones say nothing.
+_GAP, _LEAST = 3.5, 12
+# Motions A and B are taken over these shares of the common time.
+_SPANS = (0.02, 0.05, 0.1, 0.2, 0.35)
+_ITERATIONS, _SETTLED = 30, 1e-4
+# Residuals beyond so many sigmas count nothing (Tukey's biweight); least sigma of a pose.
+_ROBUST, _LEAST_SIGMA = 4.7, 0.02
+_NORMAL_MEDIAN = 0.6745
+# Sigma beyond which nothing is known, in units.
+_LOOSEST = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A camera's own trajectory: times (N,), s, ascending, and T_world_camera (N, 4, 4)."""
+
+    times: Float64
+    poses: Float64
+
+    @classmethod
+    def of(cls, times: Float64, poses: Float64) -> Track:
+        """Of the frames that have a pose."""
+        known = np.isfinite(poses[:, 0, 0])
+        return cls(times[known], poses[known])
+
+    @property
+    def interval(self) -> float:
+        """Typical time between poses, s."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+
+    def at(self, times: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+        """Poses at other times, and whether they are known there."""
+        right = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        before, after = self.times[right - 1], self.times[right]
+        gap = after - before
+        share = (times - before) / np.maximum(gap, 1e-12)
+        known = (share >= 0) & (share <= 1) & (gap <= _GAP * self.interval)
+        T = se3.interpolate(self.poses[right - 1], self.poses[right], np.clip(share, 0, 1))
+        return T, known
+
+    def turning(self) -> tuple[Float64, Float64]:
+        """Times (M,) and speed of rotation in rad/s between neighbouring poses."""
+        gap = np.diff(self.times)
+        near = gap <= _GAP * self.interval
+        turned = np.asarray(se3.angle(se3.inverse(self.poses[:-1]) @ self.poses[1:]))
+        middle = 0.5 * (self.times[:-1] + self.times[1:])
+        return middle[near], (turned / np.maximum(gap, 1e-12))[near]
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """How a second camera b is fixed to a first one, a.
+
+    Attributes
+    ----------
+    T_a_b, covariance
+        (4, 4), and (6, 6) of its right perturbation.
+    T_world_other
+        (4, 4) from b's world to a's.
+    time_offset_s, time_sigma_s
+        To be added to b's timestamps.
+    poses
+        How many common poses there were.
+    sigma
+        (6,) robust standard deviation of the residuals, m and rad.
+    """
+
+    T_a_b: Float64
+    covariance: Float64
+    T_world_other: Float64
+    time_offset_s: float
+    time_sigma_s: float
+    poses: int
+    sigma: Float64
+
+
+def clock_of(a: Track, b: Track) -> Lag | None:
+    """What to add to b's timestamps, by when the rig turns; see `lag_between`."""
+    return lag_between(*a.turning(), *b.turning())
+
+
+def hand_eye(a: Track, b: Track, time_offset_s: float, *, one_world: bool = False) -> HandEye:
+    """Fit two trajectories of a rig.
+
+    Parameters
+    ----------
+    time_offset_s
+        To start from.
+    one_world
+        Whether both trajectories are in one world frame already.
+
+    Raises
+    ------
+    RegistrationError
+        If there are too few common poses.
+    """
+    X, Y = _start(a, b, time_offset_s, one_world=one_world)
+    return _Fit(a, b, one_world).solve(X, Y, time_offset_s)
+
+
+def _common(a: Track, b: Track, offset: float) -> tuple[Float64, Float64, Float64]:
+    """Times of a's poses at which b's are known too, and both poses."""
+    T_b, known = b.at(a.times - offset)
+    if known.sum() < _LEAST:
+        raise RegistrationError(
+            f"only {known.sum()} poses of both cameras are of one time",
+            remedy="record all cameras at the same time",
+        )
+    return a.times[known], a.poses[known], T_b[known]
+
+
+def _start(a: Track, b: Track, offset: float, *, one_world: bool) -> tuple[Float64, Float64]:
+    """X and Y by Tsai and Lenz, from motions over several spans."""
+    _, T_a, T_b = _common(a, b, offset)
+    if one_world:
+        return _mean(se3.inverse(T_a) @ T_b), np.eye(4)
+    motions_a, motions_b = [], []
+    for share in _SPANS:
+        step = max(1, round(share * len(T_a)))
+        motions_a.append(se3.inverse(T_a[:-step]) @ T_a[step:])
+        motions_b.append(se3.inverse(T_b[:-step]) @ T_b[step:])
+    A, B = np.concatenate(motions_a), np.concatenate(motions_b)
+    u, v = se3.so3_log(A[:, :3, :3]), se3.so3_log(B[:, :3, :3])
+    # Small angles only: near pi the axis flips.
+    small = np.linalg.norm(u, axis=1) < 2.5
+    U, _, Vt = np.linalg.svd(u[small].T @ v[small])
+    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    M = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    d = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
+    # Along a direction that no motion tells, cameras are taken to be near each other.
+    t = np.linalg.solve(M.T @ M + 1e-4 * len(A) * np.eye(3), M.T @ d)
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = R, t
+    return X, _mean(T_a @ X @ se3.inverse(T_b))
+
+
+def _mean(poses: Float64) -> Float64:
+    """Mean of poses (N, 4, 4) that are near each other, against outliers."""
+    middle = poses[len(poses) // 2]
+    for _ in range(10):
+        away = se3.log(se3.inverse(middle) @ poses)
+        middle = middle @ se3.exp(np.median(away, axis=0))
+    return np.asarray(se3.orthonormalise(middle), np.float64)
+
+
+class _Fit:
+    """Gauss-Newton over X, Y and the clock, with robust weights."""
+
+    def __init__(self, a: Track, b: Track, one_world: bool) -> None:
+        self.a, self.b, self.one_world = a, b, one_world
+        span = min(a.interval, b.interval)
+        self.half = 0.5 * span  # for the derivative by time
+
+    def residuals(self, X: Float64, Y: Float64, offset: float) -> Float64:
+        """(N, 6) log((T_a X)^-1 Y T_b), where both are known."""
+        _, T_a, T_b = _common(self.a, self.b, offset)
+        return np.asarray(se3.log(se3.inverse(T_a @ X) @ Y @ T_b), np.float64)
+
+    def solve(self, X: Float64, Y: Float64, offset: float) -> HandEye:
+        """Iterate until nothing moves."""
+        for _ in range(_ITERATIONS):
+            J, e, _ = self.linear(X, Y, offset)
+            sigma = _sigma(e)
+            w = _weights(e, sigma)
+            H = np.einsum("nij,ni,nik->jk", J, w / sigma**2, J)
+            g = np.einsum("nij,ni,ni->j", J, w / sigma**2, e)
+            H += np.diag(1e-9 * H.diagonal() + 1e-6)
+            step = -np.linalg.solve(H, g)
+            X = se3.orthonormalise(X @ se3.exp(step[:6] * _UNITS))
+            if not self.one_world:
+                Y = se3.orthonormalise(Y @ se3.exp(step[6:12] * _UNITS))
+            offset += float(np.clip(step[-1] * _TIME_UNIT, -self.half, self.half))
+            if np.abs(step).max() < _SETTLED:
+                break
+        J, e, times = self.linear(X, Y, offset)
+        sigma = _sigma(e)
+        C = _covariance(J, e, times, sigma)
+        units = np.outer(_UNITS, _UNITS)
+        return HandEye(
+            X, C[:6, :6] * units, Y, offset, float(np.sqrt(C[-1, -1])) * _TIME_UNIT, len(e),
+            sigma * _UNITS,
+        )  # fmt: skip
+
+    def linear(self, X: Float64, Y: Float64, offset: float) -> tuple[Float64, Float64, Float64]:
+        """Derivatives (N, 6, 13) or (N, 6, 7), residuals (N, 6) in units, and their times."""
+        times, T_a, T_b = _common(self.a, self.b, offset)
+        e = se3.log(se3.inverse(T_a @ X) @ Y @ T_b)
+        right = se3.jacobian_inverse(e)
+        left = se3.jacobian_inverse(-e)
+        by_x = -left
+        columns = [by_x * _UNITS]
+        if not self.one_world:
+            columns.append(right @ se3.adjoint(se3.inverse(T_b)) * _UNITS)
+        # b's motion by time: the later its clock is put, the earlier the pose.
+        ahead, known_ahead = self.b.at(times - offset + self.half)
+        behind, known_behind = self.b.at(times - offset - self.half)
+        speed = se3.log(se3.inverse(behind) @ ahead) / (2 * self.half)
+        speed = np.where((known_ahead & known_behind)[:, None], speed, 0.0)
+        columns.append((-(right @ speed[..., None])) * _TIME_UNIT)
+        J = np.concatenate(columns, axis=2) / _UNITS[:, None]
+        return np.asarray(J, np.float64), np.asarray(e / _UNITS, np.float64), times
+
+
+def _sigma(e: Float64) -> Float64:
+    """(6,) robust standard deviation of residuals, alike for the axes of each kind."""
+    each = np.median(np.abs(e), axis=0) / _NORMAL_MEDIAN
+    both = [np.sqrt((each[:3] ** 2).mean())] * 3 + [np.sqrt((each[3:] ** 2).mean())] * 3
+    return np.maximum(both, _LEAST_SIGMA)
+
+
+def _weights(e: Float64, sigma: Float64) -> Float64:
+    """(N, 6) Tukey's biweight by the whole residual of a pose."""
+    share = ((e / sigma) ** 2).mean(1) / _ROBUST**2
+    return np.repeat((np.maximum(1 - share, 0) ** 2)[:, None], 6, axis=1)
+
+
+def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float64:
+    """Covariance of the unknowns, in units, with errors that last for a while."""
+    w = _weights(e, sigma) / sigma**2
+    H = np.einsum("nij,ni,nik->jk", J, w, J)
+    g = np.einsum("nij,ni,ni->nj", J, w, e)
+    lasting = _lasting(e / sigma, times)
+    apart = np.abs(times[:, None] - times[None])
+    alike = np.maximum(1 - apart / (2 * lasting), 0.0)  # Bartlett's window: never negative
+    B = g.T @ alike @ g
+    # The fit has taken up as much of it as there are unknowns for what is independent.
+    independent = max((times[-1] - times[0]) / lasting, 1.0) * 6
+    B *= independent / max(independent - H.shape[0], 1.0)
+    values, vectors = np.linalg.eigh(H)
+    bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
+    weak = vectors[:, values < _LOOSEST**-2]
+    C = bread @ B @ bread + _LOOSEST**2 * weak @ weak.T
+    return np.asarray(0.5 * (C + C.T), np.float64)
+
+
+def _lasting(e: Float64, times: Float64) -> float:
+    """How long an error lasts, s: integral of the autocorrelation of the residuals."""
+    interval = float(np.median(np.diff(times)))
+    centred = e - e.mean(0)
+    power = float((centred**2).sum())
+    total, most = 0.5, max(len(e) // 4, 1)
+    for k in range(1, most):
+        share = float((centred[:-k] * centred[k:]).sum()) / max(power, 1e-12)
+        if share <= 0:
+            break
+        total += share
+    return 2 * total * interval

@@ -1,0 +1,249 @@
+"""A rig that moves: each camera is tracked by itself, and the rig is what fits their trajectories.
+
+No two cameras need to see the same at the same time. What they see of the same place at different
+times counts in one refinement of all views, once the trajectories are in one world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, RegistrationError
+from tofuse.geometry import se3
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.refine import RefineOptions, refine
+from tofuse.posegraph.refinement import followed
+from tofuse.posegraph.views import KeptView
+from tofuse.results.types import Reconstruction
+from tofuse.rigs.hand_eye import HandEye, Track, clock_of, hand_eye
+from tofuse.rigs.inputs import Camera
+from tofuse.rigs.joint import distances_between
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+# Views of each camera that are refined together, and their points.
+_VIEWS, _POINTS = 70, 1500
+# Clocks that differ by more are not of one rig, s, unless the cameras turned alike.
+_SAME_CLOCK_S = 0.5
+# A place that is known worse than this share of the depth, or so many rad, is none.
+_LOOSE_SHARE, _LOOSE_RAD = 0.05, float(np.radians(4.0))
+_OPTIONS = RefineOptions(neighbours=16)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingRig:
+    """What a walk with a rig tells of its cameras.
+
+    Attributes
+    ----------
+    results
+        What each camera made of the walk by itself.
+    tracks
+        Trajectories of the cameras in one world, by camera; of those that are not placed, in their
+        own.
+    fits
+        How each camera but the first is fixed to the first, by camera.
+    reasons
+        By camera that is not placed: why not.
+    disagreement
+        By pair of cameras (a, b), a < b: median distance between what they saw of the same places,
+        at any time, in m, and how many pixels were compared.
+    notes
+        What a person should know.
+    """
+
+    results: tuple[Reconstruction, ...]
+    tracks: dict[int, Track]
+    fits: dict[int, HandEye]
+    reasons: dict[int, str]
+    disagreement: dict[tuple[int, int], tuple[float, int]]
+    notes: tuple[str, ...]
+
+
+def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig:
+    """Track each camera, fit the trajectories to each other, and refine all views together.
+
+    Raises
+    ------
+    InputError
+        If the first camera has no trajectory.
+    """
+    results, tracks = [], []
+    for camera in cameras:
+        progress.stage(f"tracking {camera.name}")
+        result = reconstruct(camera.recording, progress=Silent())
+        results.append(result)
+        tracks.append(Track.of(result.timestamps, result.trajectory))
+    if len(tracks[0].times) < 2:
+        raise InputError(
+            "has no trajectory",
+            where=cameras[0].recording.path,
+            remedy="give the camera that tracks best first",
+        )
+    progress.stage("fitting trajectories")
+    fits: dict[int, HandEye] = {}
+    reasons: dict[int, str] = {}
+    notes: list[str] = []
+    for k in range(1, len(cameras)):
+        try:
+            offset = _clock(cameras, tracks, k, notes)
+            fits[k] = hand_eye(tracks[0], tracks[k], offset)
+        except RegistrationError as error:
+            reasons[k] = str(error)
+    progress.stage("refining")
+    together = _Together.of(cameras, tracks, fits)
+    moved = together.refined()
+    for k in list(fits):
+        fits[k] = hand_eye(moved[0], moved[k], fits[k].time_offset_s, one_world=together.kept)
+        why = _too_loose(fits[k], together.depth)
+        if why:
+            reasons[k] = why
+            del fits[k]
+    placed = {0, *fits}
+    return MovingRig(
+        tuple(results),
+        {k: moved.get(k, tracks[k]) for k in range(len(cameras))},
+        fits,
+        reasons,
+        {ends: found for ends, found in together.disagreement().items() if set(ends) <= placed},
+        tuple(notes),
+    )
+
+
+def _clock(cameras: Sequence[Camera], tracks: Sequence[Track], k: int, notes: list[str]) -> float:
+    """What to add to the timestamps of camera k, to start from.
+
+    Raises
+    ------
+    RegistrationError
+        If neither its turning nor its timestamps tell.
+    """
+    lag = clock_of(tracks[0], tracks[k]) if len(tracks[k].times) > 1 else None
+    if lag is not None and lag.certain:
+        if abs(lag.seconds) > _SAME_CLOCK_S:
+            notes.append(
+                f"the clock of {cameras[k].name} differs by {lag.seconds:.3f} s from that of "
+                f"{cameras[0].name}, as they turn"
+            )
+        return lag.seconds
+    if len(tracks[k].times) < 2:
+        raise RegistrationError("has no trajectory", remedy="see how it is tracked by itself")
+    first, last = tracks[0].times[[0, -1]]
+    if min(last, tracks[k].times[-1]) - max(first, tracks[k].times[0]) <= 0:
+        raise RegistrationError(
+            f"its timestamps begin {tracks[k].times[0] - first:+.1f} s after those of "
+            f"{cameras[0].name} and don't overlap with them, and it did not turn alike",
+            remedy="record all cameras at the same time, and turn the rig",
+        )
+    if lag is not None and lag.correlation < 0.5:
+        raise RegistrationError(
+            f"it did not turn as {cameras[0].name} did",
+            remedy="record all cameras at the same time, fixed to each other",
+        )
+    notes.append(
+        f"{cameras[k].name}: how the rig turns does not tell its clock; its timestamps are taken "
+        f"to be those of {cameras[0].name}"
+    )
+    return 0.0
+
+
+def _too_loose(fit: HandEye, depth: float) -> str:
+    """Why a place is not known well enough; empty if it is."""
+    position, rotation = (
+        float(np.sqrt(max(np.linalg.eigvalsh(fit.covariance[part, part])[-1], 0)))
+        for part in (slice(3), slice(3, 6))
+    )
+    if position <= _LOOSE_SHARE * depth and rotation <= _LOOSE_RAD:
+        return ""
+    return (
+        f"the motion leaves its place open ({1000 * position:.0f} mm, "
+        f"{np.degrees(rotation):.1f} deg); turn the rig about two axes"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """Views of one camera: which poses of its track they are of."""
+
+    at: Integers
+    views: tuple[KeptView, ...]
+
+
+class _Together:
+    """Views of all cameras in the world of the first one."""
+
+    def __init__(
+        self, tracks: dict[int, Track], kept: dict[int, _Kept], fits: dict[int, HandEye]
+    ) -> None:
+        self.tracks, self._kept = tracks, kept
+        self.kept = False
+        self._fits = fits
+        views = [v for k in sorted(kept) for v in kept[k].views]
+        self.depth = float(np.median([v.surface.depth for v in views])) if views else 1.0
+        self._pairs = np.zeros((0, 2), np.intp)
+        self._poses = np.zeros((0, 4, 4))
+
+    @classmethod
+    def of(
+        cls, cameras: Sequence[Camera], tracks: Sequence[Track], fits: dict[int, HandEye]
+    ) -> _Together:
+        """Prepare views of the cameras that fit."""
+        world = {0: tracks[0]}
+        for k, fit in fits.items():
+            world[k] = replace(tracks[k], poses=fit.T_world_other @ tracks[k].poses)
+        kept = {}
+        for k, track in world.items():
+            at, views = [], []
+            for p in np.unique(np.linspace(0, len(track.times) - 1, _VIEWS).round().astype(int)):
+                row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
+                frame = cameras[k].image(row)
+                if frame is not None:
+                    at.append(p)
+                    views.append(KeptView.of(cameras[k].surface(frame), _POINTS))
+            kept[k] = _Kept(np.array(at, np.intp), tuple(views))
+        return cls(world, kept, fits)
+
+    def refined(self) -> dict[int, Track]:
+        """Tracks in one world after all views were refined together, unless that did not help."""
+        order = sorted(self._kept)
+        views = [v for k in order for v in self._kept[k].views]
+        poses = np.concatenate([self.tracks[k].poses[self._kept[k].at] for k in order])
+        first = poses[0]
+        done = refine(views, np.asarray(se3.inverse(first) @ poses), _OPTIONS)
+        count = len(views)
+        before, after = done.before.of_views(count), done.after.of_views(count)
+        camera = np.repeat(order, [len(self._kept[k].views) for k in order])
+        # One world only where views of both cameras of a pair were compared.
+        across = {tuple(sorted(ends)) for ends in camera[done.pairs].tolist()}
+        joined = all((0, k) in across for k in order if k)
+        self._pairs, self._poses = done.pairs, first @ done.poses
+        self._camera = camera
+        if after.mean() < before.mean() or not joined:
+            self._poses = poses
+            return dict(self.tracks)
+        self.kept = True
+        start, moved = 0, {}
+        for k in order:
+            own = self._kept[k]
+            new = self._poses[start : start + len(own.views)]
+            start += len(own.views)
+            moved[k] = replace(self.tracks[k], poses=followed(self.tracks[k].poses, own.at, new))
+        return moved
+
+    def disagreement(self) -> dict[tuple[int, int], tuple[float, int]]:
+        """See `MovingRig`."""
+        views = [v for k in sorted(self._kept) for v in self._kept[k].views]
+        found: dict[tuple[int, int], list[Float64]] = {}
+        for i, j in self._pairs:
+            a, b = sorted((int(self._camera[i]), int(self._camera[j])))
+            if a != b:
+                T = se3.inverse(self._poses[i]) @ self._poses[j]
+                found.setdefault((a, b), []).append(distances_between(views[i], views[j], T))
+        every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
+        return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
