@@ -18,7 +18,7 @@ _OVERLAP, _LEAST_SAMPLES = 0.5, 12
 # Samples of the lag for each of the faster signal's.
 _FINE = 4
 # A peak counts if another one, further away than its width, reaches at most this share of it.
-_RIVAL, _LEAST_CORRELATION = 0.9, 0.5
+_RIVAL, _LEAST_CORRELATION = 0.8, 0.7
 _MOST_LAGS = 200_000
 
 

@@ -3,7 +3,8 @@
 Camera a moves by A while camera b, fixed to it, moves by B: A X = X B, with X = T_a_b (Tsai and
 Lenz, 1989). Relative motions give a first X; then all poses at once are fitted by X, by the motion
 Y between the two worlds, and by what has to be added to b's timestamps: T_a X = Y T_b. Errors of
-trajectories last for a while, and the covariance counts them so (Newey and West, 1987).
+trajectories last for a while: the covariance takes them for a process of first order, whose
+correlation time is that of the residuals.
 """
 
 from __future__ import annotations
@@ -186,8 +187,8 @@ class _Fit:
             J, e, _ = self.linear(X, Y, offset)
             sigma = _sigma(e)
             w = _weights(e, sigma)
-            H = np.einsum("nij,ni,nik->jk", J, w / sigma**2, J)
-            g = np.einsum("nij,ni,ni->j", J, w / sigma**2, e)
+            H = _product(J, w / sigma**2, J)
+            g = _product(J, w / sigma**2, e[..., None])[:, 0]
             H += np.diag(1e-9 * H.diagonal() + 1e-6)
             step = -np.linalg.solve(H, g)
             X = se3.orthonormalise(X @ se3.exp(step[:6] * _UNITS))
@@ -241,15 +242,17 @@ def _weights(e: Float64, sigma: Float64) -> Float64:
 def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float64:
     """Covariance of the unknowns, in units, with errors that last for a while."""
     w = _weights(e, sigma) / sigma**2
-    H = np.einsum("nij,ni,nik->jk", J, w, J)
-    g = np.einsum("nij,ni,ni->nj", J, w, e)
-    lasting = _lasting(e / sigma, times)
-    apart = np.abs(times[:, None] - times[None])
-    alike = np.maximum(1 - apart / (2 * lasting), 0.0)  # Bartlett's window: never negative
-    B = g.T @ alike @ g
-    # The fit has taken up as much of it as there are unknowns for what is independent.
-    independent = max((times[-1] - times[0]) / lasting, 1.0) * 6
-    B *= independent / max(independent - H.shape[0], 1.0)
+    H = _product(J, w, J)
+    lasting = _lasting(e / sigma, times, H.shape[0] / 6)
+    alike = np.exp(-2 * np.abs(times[:, None] - times[None]) / lasting)
+    # The fit has taken up as much of the errors as there are unknowns for what is independent.
+    independent = 6 * max((times[-1] - times[0]) / lasting, 1.0)
+    left = max(independent - H.shape[0], 6.0)
+    # And as many as are left tell how large errors are: the ellipsoids are those of Student's t.
+    more = independent / left * left / (left - 2)
+    weighed = J * (w * sigma)[..., None]
+    spread = np.tensordot(alike, weighed, 1)
+    B = more * np.tensordot(weighed, spread, ((0, 1), (0, 1)))
     values, vectors = np.linalg.eigh(H)
     bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
     weak = vectors[:, values < _LOOSEST**-2]
@@ -257,15 +260,26 @@ def _covariance(J: Float64, e: Float64, times: Float64, sigma: Float64) -> Float
     return np.asarray(0.5 * (C + C.T), np.float64)
 
 
-def _lasting(e: Float64, times: Float64) -> float:
-    """How long an error lasts, s: integral of the autocorrelation of the residuals."""
+def _product(J: Float64, w: Float64, K: Float64) -> Float64:
+    """Sum of J^T w K over all residuals."""
+    out = np.tensordot(J * w[..., None], K, ((0, 1), (0, 1)))
+    return np.asarray(out, np.float64)
+
+
+def _lasting(e: Float64, times: Float64, taken: float) -> float:
+    """How long an error lasts, s: integral of the autocorrelation of the residuals.
+
+    What a fit with so many unknowns for each axis (`taken`) has taken up is missing in it: at all
+    times about `taken` independent errors of those that there are.
+    """
     interval = float(np.median(np.diff(times)))
-    centred = e - e.mean(0)
-    power = float((centred**2).sum())
-    total, most = 0.5, max(len(e) // 4, 1)
-    for k in range(1, most):
-        share = float((centred[:-k] * centred[k:]).sum()) / max(power, 1e-12)
+    power = float((e**2).sum())
+    shares = []
+    for k in range(1, max(len(e) // 4, 2)):
+        share = float((e[:-k] * e[k:]).sum()) / max(power, 1e-12)
         if share <= 0:
             break
-        total += share
-    return 2 * total * interval
+        shares.append(share)
+    first = 1 + 2 * sum(shares)
+    missing = min(taken * first / len(e), 0.5)
+    return float(1 + 2 * sum((s + missing) / (1 + missing) for s in shares)) * interval

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.errors import InputError
+from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.views import KeptView
@@ -21,7 +23,7 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.still import average_of, motion_between
 from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import Placed, View, refine_together
+from tofuse.rigs.joint import Placed, View, distances_between, refine_together
 from tofuse.rigs.placing import Placement, place
 
 Float64 = NDArray[np.float64]
@@ -35,6 +37,9 @@ _INSTANTS, _AVERAGED = 60, 48
 _POINTS, _LEAST_POINTS, _ALL_POINTS = 6000, 1500, 60_000
 # Images of an instant are no further apart than this share of the time between images.
 _SAME_INSTANT = 0.6
+# Lags that are tried to either side, in images; instants at which; and the distance, as a share of
+# the depth, beyond which surfaces are different ones.
+_LAGS, _ASKED, _FAR = 6, 10, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,19 +94,111 @@ def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
     progress.stage("instants")
     offsets, instants = _instants(cameras, notes)
     progress.stage("placing")
-    placement = place([[None if v is None else v for v in row] for row in instants])
+    placement = place(instants)
     order = tuple(sorted(placement.poses))
     progress.stage("refining")
+    placed = refine_together(
+        _views(instants, order), np.stack([placement.poses[c] for c in order])
+    )
     count = max((len(row) for row in instants), default=0)
-    points = int(np.clip(_ALL_POINTS / max(count, 1), _LEAST_POINTS, _POINTS))
-    views = [
+    if count > 1:
+        progress.stage("clocks")
+        finer = _finer_offsets(cameras, order, placed, offsets, notes)
+        if (finer != offsets).any():
+            offsets = finer
+            at = _common_times(cameras, offsets)
+            instants = [_at_times(c, o, at) for c, o in zip(cameras, offsets, strict=True)]
+            placed = refine_together(_views(instants, order), placed.poses)
+    return StillRig(placement, placed, order, offsets, count, tuple(notes))
+
+
+def _views(instants: Sequence[Sequence[SurfaceMap | None]], order: Sequence[int]) -> list[View]:
+    """The views of the placed cameras, numbered in their order."""
+    count = max((len(row) for row in instants), default=1)
+    points = int(np.clip(_ALL_POINTS / count, _LEAST_POINTS, _POINTS))
+    return [
         View(k, m, KeptView.of(view, points))
         for k, c in enumerate(order)
         for m, view in enumerate(instants[c])
         if view is not None
     ]
-    placed = refine_together(views, np.stack([placement.poses[c] for c in order]))
-    return StillRig(placement, placed, order, offsets, count, tuple(notes))
+
+
+def _finer_offsets(
+    cameras: Sequence[Camera],
+    order: Sequence[int],
+    placed: Placed,
+    offsets: Float64,
+    notes: list[str],
+) -> Float64:
+    """Time offsets (K,) with which what moves is at the same place for all placed cameras.
+
+    Camera by camera, its images are compared with those of the first one and of those before it at
+    several lags, a frame apart; the distance between surfaces is least where the lag is right, and
+    grows with its square nearby.
+    """
+    out = offsets.copy()
+    at = _common_times(cameras, offsets)
+    at = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), _ASKED)).round().astype(int))]
+    known = {0: [_kept(v) for v in _at_times(cameras[order[0]], out[order[0]], at)]}
+    for k, c in enumerate(order):
+        if k == 0:
+            continue
+        times = cameras[c].recording.timestamps
+        interval = float(np.median(np.diff(times)))
+        rows: dict[int, KeptView | None] = {}
+        costs, lags = [], []
+        for shift in range(-_LAGS, _LAGS + 1):
+            found: list[Float64] = []
+            apart: list[float] = []
+            for m, t in enumerate(at):
+                row = int(np.abs(times + out[c] - t).argmin()) + shift
+                if not 0 <= row < len(times):
+                    continue
+                if row not in rows:
+                    frame = cameras[c].image(row)
+                    rows[row] = None if frame is None else _kept(cameras[c].surface(frame))
+                view = rows[row]
+                for other, theirs in known.items():
+                    target = theirs[m]
+                    if view is not None and target is not None:
+                        T = se3.inverse(placed.poses[other]) @ placed.poses[k]
+                        far = distances_between(target, view, T)
+                        found.append(np.minimum(far, _FAR * target.surface.depth))
+                        apart.append(float(times[row] + out[c] - t))
+            every = np.concatenate([np.zeros(0), *found])
+            costs.append(float(every.mean()) if len(every) >= _LEAST_POINTS else np.nan)
+            lags.append(float(np.mean(apart)) if apart else np.nan)
+        lag = _least(np.array(lags), np.array(costs))
+        if lag is None:
+            notes.append(f"{cameras[c].name}: what moves does not tell its clock")
+        elif abs(lag) > 0.02 * interval:
+            out[c] -= lag
+        known[k] = [_kept(v) for v in _at_times(cameras[c], out[c], at)]
+    return out
+
+
+def _kept(surface: SurfaceMap | None) -> KeptView | None:
+    return None if surface is None else KeptView.of(surface, _LEAST_POINTS)
+
+
+def _least(lags: Float64, costs: Float64) -> float | None:
+    """Where costs are least, between samples; None where that is at an end, or they don't tell."""
+    good = np.isfinite(costs)
+    if good.sum() < 5:
+        return None
+    lags, costs = lags[good], costs[good]
+    best = int(np.argmin(costs))
+    if not 1 <= best < len(costs) - 1:
+        return None
+    near = slice(max(best - 2, 0), best + 3)
+    bend, slope, level = np.polyfit(lags[near] - lags[best], costs[near], 2)
+    left = costs[near] - np.polyval([bend, slope, level], lags[near] - lags[best])
+    deep = float(costs[near].max() - costs[best])
+    if bend <= 0 or deep < 4 * float(np.sqrt((left**2).mean())):
+        return None
+    step = float(np.clip(-0.5 * slope / bend, lags[best - 1] - lags[best], lags[best + 1] - lags[best]))
+    return float(lags[best] + step)
 
 
 def _instants(
@@ -115,18 +212,20 @@ def _instants(
         return offsets, [list(row) for row in averaged]
     offsets = _time_offsets(cameras, notes)
     at = _common_times(cameras, offsets)
-    rows: list[list[SurfaceMap | None]] = []
-    for camera, offset in zip(cameras, offsets, strict=True):
-        times = camera.recording.timestamps + offset
-        near = np.abs(times[None] - at[:, None]).argmin(1)
-        apart = np.abs(times[near] - at)
-        interval = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
-        row: list[SurfaceMap | None] = []
-        for k, far in zip(near, apart, strict=True):
-            frame = camera.image(int(k)) if far <= _SAME_INSTANT * interval else None
-            row.append(None if frame is None else camera.surface(frame))
-        rows.append(row)
-    return offsets, rows
+    return offsets, [_at_times(c, o, at) for c, o in zip(cameras, offsets, strict=True)]
+
+
+def _at_times(camera: Camera, offset: float, at: Float64) -> list[SurfaceMap | None]:
+    """Views of a camera at the rig's times; None where it has none."""
+    times = camera.recording.timestamps + offset
+    near = np.abs(times[None] - at[:, None]).argmin(1)
+    apart = np.abs(times[near] - at)
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    row: list[SurfaceMap | None] = []
+    for k, far in zip(near, apart, strict=True):
+        frame = camera.image(int(k)) if far <= _SAME_INSTANT * interval else None
+        row.append(None if frame is None else camera.surface(frame))
+    return row
 
 
 def _something_moves(camera: Camera) -> bool:
@@ -157,18 +256,38 @@ def _common_times(cameras: Sequence[Camera], offsets: Float64) -> Float64:
 
 
 def _time_offsets(cameras: Sequence[Camera], notes: list[str]) -> Float64:
-    """What to add to each camera's timestamps, from how much of each view changes when."""
-    signals = [_activity(camera) for camera in cameras]
+    """What to add to each camera's timestamps, to begin with.
+
+    Timestamps that overlap are believed as far as that; others are compared by when how much of
+    each view changes.
+
+    Raises
+    ------
+    InputError
+        If neither tells.
+    """
     offsets = np.zeros(len(cameras))
+    first = cameras[0].recording.timestamps
+    signal = None
     for k in range(1, len(cameras)):
-        lag = lag_between(*signals[0], *signals[k])
-        if lag is not None and lag.certain:
-            offsets[k] = lag.seconds
-        else:
-            notes.append(
-                f"{cameras[k].name}: when things move does not tell its clock; its timestamps are "
-                f"taken to be those of {cameras[0].name}"
+        own = cameras[k].recording.timestamps
+        shared = min(first[-1], own[-1]) - max(first[0], own[0])
+        if shared > 0.2 * min(np.ptp(first), np.ptp(own)):
+            continue
+        signal = _activity(cameras[0]) if signal is None else signal
+        lag = lag_between(*signal, *_activity(cameras[k]))
+        if lag is None or not lag.certain:
+            raise InputError(
+                f"begins {own[0] - first[0]:+.1f} s after {cameras[0].name} by its clock, when "
+                f"that had ended, and nothing that both see move tells what the clocks differ by",
+                where=cameras[k].recording.path,
+                remedy="give recordings of the same time",
             )
+        offsets[k] = lag.seconds
+        notes.append(
+            f"the clock of {cameras[k].name} differs by {lag.seconds:.2f} s from that of "
+            f"{cameras[0].name}, by when things move"
+        )
     return offsets
 
 

@@ -1,0 +1,107 @@
+"""Trajectories of one rig with clocks of their own: synchronised, and fitted to each other."""
+
+import numpy as np
+import pytest
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.rigs.clocks import lag_between
+from tofuse.rigs.hand_eye import Track, clock_of, hand_eye
+from tofuse.simulation.paths import rotation
+from tofuse.simulation.rig import wander
+
+OFFSET = 0.0123
+
+
+def mounted() -> np.ndarray:
+    T = rotation([0.05, 2.1, 0.03])
+    T[:3, 3] = [0.09, 0.02, -0.14]
+    return T
+
+
+def tracks(
+    seed: int = 0, path=None, millimetres: float = 2.0, degrees: float = 0.07
+) -> tuple[Track, Track]:
+    """Two cameras with errors that last half a second, one at 30.03 Hz, one at 30.14."""
+    rng = np.random.default_rng([seed, 7])
+    path = path or wander((0, 0, 1.2), (0.9, 0.5), 9.0)
+    out = []
+    for rate, offset, T in ((30.03, 0.0, np.eye(4)), (30.14, OFFSET, mounted())):
+        times = np.arange(240) / rate + 0.4 - offset
+        poses = np.stack([path(t + offset) @ T for t in times])
+        poses = se3.inverse(poses[0]) @ poses
+        errors = rng.normal(size=(240, 6))
+        keep = np.exp(-1 / 15)
+        for k in range(1, 240):
+            errors[k] = keep * errors[k - 1] + np.sqrt(1 - keep**2) * errors[k]
+        scale = np.array([millimetres * 1e-3] * 3 + [np.radians(degrees)] * 3)
+        out.append(Track(times, poses @ se3.exp(errors * scale)))
+    return out[0], out[1]
+
+
+def test_clocks_are_told_by_when_the_rig_turns() -> None:
+    a, b = tracks()
+    lag = clock_of(a, b)
+    assert lag is not None
+    assert lag.certain
+    assert lag.seconds == pytest.approx(OFFSET, abs=0.004)
+
+
+def test_clocks_that_start_hours_apart_are_synchronised() -> None:
+    a, b = tracks()
+    b = Track(b.times + 7200.0, b.poses)
+    lag = clock_of(a, b)
+    assert lag is not None
+    assert lag.seconds == pytest.approx(OFFSET - 7200.0, abs=0.004)
+
+
+def test_signals_that_have_nothing_in_common_tell_no_lag() -> None:
+    rng = np.random.default_rng(1)
+    times = np.arange(300) / 30
+    lag = lag_between(times, rng.normal(size=300), times, rng.normal(size=300))
+    assert lag is not None
+    assert not lag.certain
+
+
+def test_hand_eye_finds_pose_and_clock() -> None:
+    a, b = tracks()
+    found = hand_eye(a, b, 0.0)
+    off = se3.inverse(found.T_a_b) @ mounted()
+    assert np.linalg.norm(off[:3, 3]) < 0.003
+    assert np.degrees(se3.angle(off)) < 0.15
+    assert found.time_offset_s == pytest.approx(OFFSET, abs=0.002)
+
+
+def test_without_errors_hand_eye_is_exact() -> None:
+    a, b = tracks(millimetres=0.0, degrees=0.0)
+    found = hand_eye(a, b, 0.0)
+    off = se3.inverse(found.T_a_b) @ mounted()
+    # What is left is the interpolation between frames.
+    assert np.linalg.norm(off[:3, 3]) < 0.0003
+    assert found.time_offset_s == pytest.approx(OFFSET, abs=0.0003)
+
+
+def test_covariance_covers() -> None:
+    squares = []
+    for seed in range(100):
+        a, b = tracks(seed)
+        found = hand_eye(a, b, OFFSET)
+        e = se3.log(se3.inverse(found.T_a_b) @ mounted())
+        squares.append(e @ np.linalg.solve(found.covariance, e))
+    inside = np.mean(np.array(squares) < 12.592)  # 95 % of chi-square with 6 degrees
+    assert 0.88 <= inside <= 0.995
+
+
+def test_a_turn_about_one_axis_leaves_the_height_open() -> None:
+    a, b = tracks(path=lambda t: rotation([0, 0.7 * t + 0.3 * np.sin(2 * t), 0]))
+    found = hand_eye(a, b, 0.0)
+    # Along the axis of the turn, in b's frame.
+    axis = found.T_a_b[:3, :3].T @ [0.0, 1.0, 0.0]
+    sigma = np.sqrt(axis @ found.covariance[:3, :3] @ axis)
+    assert sigma > 0.1
+
+
+def test_recordings_of_different_times_are_refused() -> None:
+    a, b = tracks()
+    with pytest.raises(RegistrationError, match="of one time"):
+        hand_eye(a, Track(b.times + 100, b.poses), 0.0)
