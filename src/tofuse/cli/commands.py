@@ -40,8 +40,16 @@ def run(arguments: argparse.Namespace) -> int:
     from tofuse.errors import InputError
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
+    from tofuse.recordings.open import is_rig_folder
+    from tofuse.recordings.rig import FILE_NAME, read_rig
 
     options = run_options(arguments)
+    if arguments.rig is None and len(arguments.inputs) == 1 and is_rig_folder(arguments.inputs[0]):
+        folder = Path(arguments.inputs[0])
+        arguments.rig = folder / FILE_NAME
+        arguments.inputs = [str(folder / c.name) for c in read_rig(arguments.rig).cameras]
+    if arguments.rig is not None:
+        return _run_rig(arguments, options)
     if arguments.into is not None:
         return _run_into(arguments, options)
     if arguments.view:
@@ -117,6 +125,22 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
         merged = merge_files([into, options.out], map_options, progress)
     tell(merged, into, as_json=arguments.json)
     return exit_status(merged)
+
+
+def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
+    """``tofuse run --rig``."""
+    from tofuse.errors import InputError
+    from tofuse.pipeline.run import exit_status
+    from tofuse.rigs.run import run_rig
+
+    for name in ("view", "into", "loops", "guess", "object", "average_still", "camera", "topic"):
+        if getattr(arguments, name):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("means nothing for a rig", where=option, remedy="leave it out")
+    with progress_for(as_json=arguments.json) as progress:
+        found = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
+    tell(found.result, arguments.out, as_json=arguments.json)
+    return exit_status(found.result)
 
 
 def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:

@@ -182,6 +182,12 @@ def _run(commands: Any) -> None:
         metavar="LENGTH",
         help="resolution of the model, as 5mm (default: what the camera resolves)",
     )
+    p.add_argument(
+        "--rig",
+        type=Path,
+        metavar="FILE",
+        help="a rig.json: each INPUT is one camera of it, in its order",
+    )
     _processing(p)
     g = p.add_argument_group("watch it in the browser")
     g.add_argument(

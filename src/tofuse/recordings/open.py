@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.files.reading import input_error, is_folder, list_folder
+from tofuse.files.reading import input_error, is_file, is_folder, list_folder
 from tofuse.files.trajectory_formats import TimedPoses, read_poses
 from tofuse.parts import discover, known, name_of
 from tofuse.recordings.reader import SURE, Reader, ReaderOptions, Sniff
 from tofuse.recordings.recording import Recording, Source
+from tofuse.recordings.rig import FILE_NAME, read_rig
+from tofuse.recordings.rig_source import RigSource
 from tofuse.recordings.sources import JoinedSource, LimitedSource
 
 Float64 = NDArray[np.float64]
@@ -52,7 +54,8 @@ def open_recording(
     ----------
     paths
         Files or folders; several are joined in the order given. A folder of native or SR4000
-        recordings is one recording, joined in name order.
+        recordings is one recording, joined in name order; with a rig.json beside them they are the
+        cameras of a rig, one image of each in turn.
     format
         Name of a reader, where guessing isn't wanted.
     camera
@@ -72,6 +75,13 @@ def open_recording(
         raise InputError("no recording was given", remedy="give a path")
     _check_depths(min_depth, max_depth)
     options = ReaderOptions(None if camera is None else Path(camera), topic)
+    if len(paths) == 1 and is_rig_folder(paths[0]):
+        source = _rig_source(Path(paths[0]), format, options)
+        if min_depth is not None or max_depth is not None:
+            raise InputError(
+                "have no meaning for a rig", where="min_depth, max_depth", remedy="leave them out"
+            )
+        return Recording.of(source, str(paths[0]), "rig")
     found = [item for path in paths for item in _resolve(Path(path), format)]
     sources = [item.reader.open(item.path, options) for item in found]
     source: Source = sources[0]
@@ -84,6 +94,37 @@ def open_recording(
         )
     names = dict.fromkeys(name_of(item.reader) for item in found)
     return Recording.of(source, " ".join(map(str, paths)), "+".join(names))
+
+
+def is_rig_folder(path: str | Path) -> bool:
+    """Whether a path is a folder of recordings of a rig's cameras, with a rig.json beside them."""
+    path = Path(path)
+    return is_folder(path) and is_file(path / FILE_NAME)
+
+
+def _rig_source(
+    folder: Path,
+    format: str | None,  # noqa: A002
+    options: ReaderOptions,
+) -> RigSource:
+    """The recordings in a rig's folder, each in a folder called as its camera."""
+    rig = read_rig(folder / FILE_NAME)
+    recordings = []
+    for camera in rig.cameras:
+        path = folder / camera.name
+        if not path.exists():
+            raise InputError(
+                f"has no recording of the camera {camera.name!r}",
+                where=folder,
+                remedy=f"put it into {path}, or take the camera out of {FILE_NAME}",
+            )
+        found = _resolve(path, format)
+        if len(found) > 1:
+            raise InputError("holds several recordings", where=path, remedy="leave one")
+        source = found[0].reader.open(found[0].path, options)
+        _check_usable(source, path)
+        recordings.append(Recording.of(source, path, name_of(found[0].reader)))
+    return RigSource(rig, recordings)
 
 
 @dataclass(frozen=True)

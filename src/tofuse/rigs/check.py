@@ -2,8 +2,8 @@
 
 Under the hypothesis that nothing moved, the motion xi of a camera from where the file has it to
 where it is found is normal with the sum of both covariances, and xi^T C^-1 xi is chi-square with
-six degrees of freedom. As a moved first camera would move all others, each camera is also asked
-whether all others agree about it: the one camera whose motion explains everything is named.
+six degrees of freedom. A first camera that was moved would seem to move all others: where most
+seem to have moved, they are compared with another one.
 """
 
 from __future__ import annotations
@@ -81,8 +81,9 @@ def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
     knocked: dict[str, Moved] = {}
     if len(shared) > 1:
         # Each camera is asked: of how many tests, the level is kept for all together.
-        limit = level / max(len(shared) - 1, 1)
-        knocked = _without_moved(shared, found, limit)
+        limit = level / (len(shared) - 1)
+        reference = _reference(shared, found, limit)
+        knocked = {c.name: _moved(c, reference, found, limit) for c in shared}
     for camera in stated.cameras:
         if camera.name in knocked:
             out.append(knocked[camera.name])
@@ -92,16 +93,19 @@ def compare(stated: Rig, found: Rig, level: float = LEVEL) -> list[Moved]:
     return out
 
 
-def _without_moved(shared: Sequence[RigCamera], found: Rig, limit: float) -> dict[str, Moved]:
-    """Take away the camera whose motion explains most, as long as there is something to explain."""
-    reference = _reference(shared, found, limit)
-    return {c.name: _moved(c, reference, found, limit) for c in shared}
-
-
 def _reference(shared: Sequence[RigCamera], found: Rig, limit: float) -> RigCamera:
-    """The camera from which the fewest others have moved: the first, unless that was moved."""
-    counts = [sum(_moved(c, reference, found, limit).moved for c in shared) for reference in shared]
-    return shared[int(np.argmin(counts))]
+    """The camera that the others are compared with.
+
+    The first, unless more than half of the others seem to have moved from it: then it was the first
+    that was moved, and the one is taken from which the fewest have.
+    """
+
+    def moved(reference: RigCamera) -> int:
+        return sum(_moved(c, reference, found, limit).moved for c in shared)
+
+    if 2 * moved(shared[0]) <= len(shared) - 1 or len(shared) < 3:
+        return shared[0]
+    return min(shared, key=moved)
 
 
 def _moved(camera: RigCamera, reference: RigCamera, found: Rig, limit: float) -> Moved:

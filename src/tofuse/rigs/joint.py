@@ -34,8 +34,12 @@ _LEAST_SCALE, _MOST_SCALE = 0.7, 30.0
 _LEAST_COMPARED = 50
 # What is further off than this share of the depth is another surface.
 _OTHER_SURFACE = 0.1
-# Sigma beyond which nothing is known, in units of 1 cm and 1 degree.
-_LOOSEST = 100.0
+# Sigma beyond which the data is not trusted to hold a direction, and what it is given then, in
+# units of 1 cm and 1 degree.
+_HELD, _LOOSEST = 3.0, 30.0
+# Windows of plane fits overlap: so many pixels share one value of noise (half the smallest window;
+# covariances of simulated boards then cover, see tests).
+_SHARED_NOISE = 12.0
 # Regions of space in which all errors are alike, as a share of the depth.
 _REGION = 0.1
 
@@ -308,7 +312,7 @@ class _System:
             plain[np.ix_(at, at)] += (J * w[:, None]).T @ J - (D * w[:, None]).T @ D
             cross[np.ix_(at, at)] += (J * slope[:, None]).T @ J - (D * slope[:, None]).T @ D
             r = row[:, kernels.RESIDUAL]
-            noise[np.ix_(at, at)] += (J * (w * w * r * r)[:, None]).T @ J
+            noise[np.ix_(at, at)] += self._shared(k) * (J * (w * w * r * r)[:, None]).T @ J
             each = np.zeros((len(row), size))
             each[:, at] = J * (w * r)[:, None]
             source = self.views[self.pairs[k][1]].camera
@@ -331,6 +335,14 @@ class _System:
         rms = float(np.sqrt(squares / weight)) if weight else float("nan")
         return Placed(self.poses, self.offsets, blocks, scaled, rms, self.disagreement(rows))
 
+    def _shared(self, k: int) -> float:
+        """How many residuals of a pair share one value of noise.
+
+        Windows of neighbouring pixels overlap, and the pair is compared both ways.
+        """
+        kept = self.views[self.pairs[k][1]].kept
+        return 2 * max(1.0, _SHARED_NOISE * len(kept.points) / max(kept.surface.pixels, 1))
+
     def _covariance(
         self, plain: Float64, cross: Float64, noise: Float64, places: Float64, gradients: Float64
     ) -> Float64:
@@ -351,12 +363,12 @@ class _System:
         prior = np.zeros(len(free))
         prior[6::_SIZE] = known
         B += np.diag(prior)
-        values, vectors = np.linalg.eigh(0.5 * (X + X.T))
-        bread = (vectors / np.maximum(values, _LOOSEST**-2)) @ vectors.T
-        C = bread @ B @ bread
-        # What nothing holds is not known, whatever the gradient there is.
-        weak = vectors[:, values < _LOOSEST**-2]
-        C += _LOOSEST**2 * weak @ weak.T
+        # What the data holds no better than this it does not hold: there is the noise of normals.
+        P = plain[np.ix_(free, free)]
+        values, vectors = np.linalg.eigh(0.5 * (P + P.T))
+        weak, held = vectors[:, values < _HELD**-2], vectors[:, values >= _HELD**-2]
+        bread = held @ np.linalg.inv(held.T @ X @ held) @ held.T
+        C = bread @ B @ bread + _LOOSEST**2 * weak @ weak.T
         return 0.5 * (C + C.T)
 
     def disagreement(self, rows: Sequence[Float64]) -> dict[tuple[int, int], tuple[float, int]]:
@@ -382,7 +394,7 @@ def _slope(plain: Float64, cross: Float64, steepness: float) -> Float64:
     """Slope of the gradient, along no direction less than a share of what it is without robust
     weights."""
     values, vectors = np.linalg.eigh(0.5 * (plain + plain.T))
-    root = vectors / np.sqrt(np.maximum(values, 1e-4))
+    root = vectors / np.sqrt(np.maximum(values, _HELD**-2))
     values, turned = np.linalg.eigh(root.T @ (0.5 * (cross + cross.T)) @ root)
     back = np.linalg.inv(root).T @ turned
     X: Float64 = (back * np.maximum(values, steepness)) @ back.T

@@ -218,13 +218,17 @@ class _Placer:
 
     def _settle(self, one: _Set) -> _Set:
         """Align all cameras of a set with each other."""
-        order = sorted(one.poses)
-        row = {c: k for k, c in enumerate(order)}
-        views = [replace(v, camera=row[v.camera]) for v in self._kept if v.camera in row]
-        poses = refine_together(views, np.stack([one.poses[c] for c in order]), _SETTLING).poses
-        moved = dict(zip(order, poses, strict=True))
+        moved = self._aligned(one.poses)
         score = self._score(moved)
         return _Set(moved, score) if score > one.score else one
+
+    def _aligned(self, poses: Mapping[int, Float64]) -> dict[int, Float64]:
+        """The same cameras where their views agree best, nearby."""
+        order = sorted(poses)
+        row = {c: k for k, c in enumerate(order)}
+        views = [replace(v, camera=row[v.camera]) for v in self._kept if v.camera in row]
+        moved = refine_together(views, np.stack([poses[c] for c in order]), _SETTLING).poses
+        return dict(zip(order, moved, strict=True))
 
     def _score(self, poses: Mapping[int, Float64]) -> float:
         return sum(
@@ -255,6 +259,27 @@ class _Placer:
                 reasons[c] = "no other camera sees the same"
         return Placement(poses, probability, reasons)
 
+    def _rivals(
+        self, poses: Mapping[int, Float64], camera: int, found: Sequence[tuple[float, Float64]]
+    ) -> list[float]:
+        """Scores of other places for a camera, descending, each with what it leads to.
+
+        What settles where the camera is already is no other place.
+        """
+        at = poses[camera]
+        apart: list[Float64] = [at]
+        scores: list[float] = []
+        for gain, T in sorted(found, key=lambda pair: -pair[0]):
+            if len(scores) > _RIVALS or gain <= 0:
+                break
+            if not all(self._options.differ(T, other) for other in apart):
+                continue
+            apart.append(T)
+            moved = self._aligned({**poses, camera: T})
+            if self._options.differ(at, moved[camera]):
+                scores.append(gain)
+        return scores
+
     def _belief(
         self, poses: Mapping[int, Float64], camera: int, rivals: Sequence[_Set]
     ) -> tuple[float, str]:
@@ -277,12 +302,7 @@ class _Placer:
             for other in rivals
             if other.poses.keys() == poses.keys()
         ]
-        apart: list[Float64] = [at]
-        scores: list[float] = []
-        for gain, T in sorted(found, key=lambda pair: -pair[0]):
-            if gain > 0 and all(self._options.differ(T, other) for other in apart):
-                apart.append(T)
-                scores.append(gain)
+        scores = self._rivals({**others, camera: at}, camera, found)
         rival = scores[0] if scores else 0.0
         overlap = max(sum(s.overlap for s in said), 1e-9)
         evidence = Evidence(

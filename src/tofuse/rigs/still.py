@@ -97,9 +97,7 @@ def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
     placement = place(instants)
     order = tuple(sorted(placement.poses))
     progress.stage("refining")
-    placed = refine_together(
-        _views(instants, order), np.stack([placement.poses[c] for c in order])
-    )
+    placed = refine_together(_views(instants, order), np.stack([placement.poses[c] for c in order]))
     count = max((len(row) for row in instants), default=0)
     if count > 1:
         progress.stage("clocks")
@@ -197,7 +195,9 @@ def _least(lags: Float64, costs: Float64) -> float | None:
     deep = float(costs[near].max() - costs[best])
     if bend <= 0 or deep < 4 * float(np.sqrt((left**2).mean())):
         return None
-    step = float(np.clip(-0.5 * slope / bend, lags[best - 1] - lags[best], lags[best + 1] - lags[best]))
+    step = float(
+        np.clip(-0.5 * slope / bend, lags[best - 1] - lags[best], lags[best + 1] - lags[best])
+    )
     return float(lags[best] + step)
 
 

@@ -1,0 +1,115 @@
+"""The recordings of a rig's cameras as one: instant by instant, each instant camera by camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.recordings.recording import Recording
+from tofuse.recordings.rig import Rig
+
+Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
+
+# Images of one instant are no further apart than this share of the time between images.
+_SAME_INSTANT = 0.6
+
+
+class RigSource:
+    """Images of all cameras in the order of time, with depths as the first camera measures them.
+
+    Parameters
+    ----------
+    rig
+        Its cameras are those of the recordings, in their order.
+    recordings
+        One for each camera.
+
+    Attributes
+    ----------
+    instant, camera
+        (N,) of each frame: which instant, and which camera.
+    """
+
+    reference: Float64 | None = None
+    odometry: Float64 | None = None
+    gravity: Float64 | None = None
+
+    def __init__(self, rig: Rig, recordings: Sequence[Recording]) -> None:
+        self.rig = rig
+        self._recordings = list(recordings)
+        rows = self._rows()
+        if not len(rows):
+            raise InputError(
+                "no images of its cameras are of one time",
+                where="the rig",
+                remedy="give recordings of the same time, or calibrate the clocks anew",
+            )
+        self.instant, self.camera, self._row = rows.T
+        self.timestamps = np.array(
+            [
+                float(recordings[c].timestamps[row]) + rig.cameras[c].time_offset_s
+                for _, c, row in rows
+            ]
+        )
+        self.warnings: list[str] = [
+            f"{camera.name}: {warning}"
+            for camera, recording in zip(rig.cameras, recordings, strict=True)
+            for warning in recording.warnings
+        ]
+        self.metadata: dict[str, Any] = {
+            key: value
+            for key, value in recordings[0].metadata.items()
+            if all(r.metadata.get(key) == value for r in recordings)
+        }
+        self.metadata["cameras"] = [camera.name for camera in rig.cameras]
+
+    def _rows(self) -> Integers:
+        """(N, 3) instant, camera and position in its recording, of each frame."""
+        times = [
+            recording.timestamps + camera.time_offset_s
+            for recording, camera in zip(self._recordings, self.rig.cameras, strict=True)
+        ]
+        single = all(len(t) == 1 for t in times)
+        rows: list[tuple[int, int, int]] = []
+        instant = 0
+        for k, t in enumerate(times[0]):
+            found = [(0, k)]
+            for c, own in enumerate(times[1:], 1):
+                near = int(np.abs(own - t).argmin())
+                interval = float(np.median(np.diff(own))) if len(own) > 1 else 0.0
+                if single or abs(own[near] - t) <= _SAME_INSTANT * interval:
+                    found.append((c, near))
+            if len(found) == len(times):
+                rows += [(instant, c, row) for c, row in found]
+                instant += 1
+        return np.array(rows, np.intp).reshape(-1, 3)
+
+    @property
+    def T_rig_camera(self) -> Float64:
+        """(N, 4, 4) of each frame."""
+        return np.stack([self.rig.cameras[c].T_rig_camera for c in self.camera])
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        camera = int(self.camera[index])
+        frame = self._recordings[camera][int(self._row[index])]
+        if isinstance(frame, RangeFrame):
+            frame = with_range_added(frame, -self.rig.cameras[camera].depth_offset_m)
+        return replace(frame, index=index, timestamp=float(self.timestamps[index]))
+
+
+def with_range_added(frame: RangeFrame, metres: float) -> RangeFrame:
+    """An image whose ranges are longer by so many metres."""
+    if metres == 0:
+        return frame
+    along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
+    depth = np.where(frame.valid, np.maximum(frame.depth + metres * along, 0), 0)
+    return replace(frame, depth=np.nan_to_num(depth).astype(np.float32))
