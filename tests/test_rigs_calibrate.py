@@ -20,13 +20,23 @@ from tofuse.rigs.calibrate import calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
 from tofuse.simulation.rig import around, relative
 
-# Three cameras, neighbours 40 degrees apart.
-STANDS = [around((0, 0, 0.2), 1.3, 1.3, 1, np.pi + k * np.radians(40))[0] for k in range(3)]
+# A room: floor, three walls, and boards in front of these.
+ROOM = (
+    ((0.0, 0.0, 1.0), 0.0, 9.0),
+    ((1.0, 0.0, 0.0), 1.7, 9.0),
+    ((0.0, 1.0, 0.0), 1.9, 9.0),
+    ((0.5, -0.85, 0.0), 2.0, 9.0),
+    ((0.7, 0.2, 0.6), 0.55, 0.35),
+    ((0.75, -0.5, 0.3), 0.75, 0.25),
+    ((0.4, 0.7, 0.1), 0.9, 0.3),
+)
+# Three cameras, neighbours 25 degrees apart.
+STANDS = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + (k - 1) * np.radians(25))[0] for k in range(3)]
 
 
 def images(k: int, count: int = 1, offset: float = 0.0) -> list[RangeFrame]:
     rng = np.random.default_rng([k, 9])
-    frames = [looked_at(STANDS[k], rng, offset) for _ in range(count)]
+    frames = [looked_at(STANDS[k], rng, offset, ROOM) for _ in range(count)]
     return [RangeFrame(i, i / 30, CAMERA, frame.depth, "z", None) for i, frame in enumerate(frames)]
 
 
@@ -70,9 +80,9 @@ def test_images_of_a_still_scene_become_one() -> None:
 
 def test_a_camera_can_not_stand_still_while_another_moves() -> None:
     rng = np.random.default_rng(0)
-    turned = [around((0.05 * i, 0, 0.2), 1.3, 1.3, 1, np.pi + 0.12 * i)[0] for i in range(8)]
+    turned = [around((0.4, 0, 0.5), 1.6, 0.5, 1, np.pi + 0.12 * i)[0] for i in range(8)]
     frames = [
-        RangeFrame(i, i / 30, CAMERA, looked_at(T, rng, 0.0).depth, "z", None)
+        RangeFrame(i, i / 30, CAMERA, looked_at(T, rng, 0.0, ROOM).depth, "z", None)
         for i, T in enumerate(turned)
     ]
     with pytest.raises(InputError, match="cam0 stood still while other cameras moved"):

@@ -28,13 +28,15 @@ BOARDS = (
 )
 
 
-def looked_at(T_room_camera: np.ndarray, rng: np.random.Generator, offset: float) -> RangeFrame:
+def looked_at(
+    T_room_camera: np.ndarray, rng: np.random.Generator, offset: float, boards=BOARDS
+) -> RangeFrame:
     rays = np.concatenate([CAMERA.rays().astype(float), np.ones((96, 128, 1))], 2)
     lengths = np.linalg.norm(rays, axis=2)
     directions = rays @ T_room_camera[:3, :3].T
     origin = T_room_camera[:3, 3]
     z = np.full((96, 128), np.inf)
-    for normal, d, half in BOARDS:
+    for normal, d, half in boards:
         n = np.array(normal) / np.linalg.norm(normal)
         facing = directions @ n
         with np.errstate(divide="ignore"):
