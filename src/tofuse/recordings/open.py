@@ -76,12 +76,12 @@ def open_recording(
     _check_depths(min_depth, max_depth)
     options = ReaderOptions(None if camera is None else Path(camera), topic)
     if len(paths) == 1 and is_rig_folder(paths[0]):
-        source = _rig_source(Path(paths[0]), format, options)
+        rig = _rig_source(Path(paths[0]), format, options)
         if min_depth is not None or max_depth is not None:
             raise InputError(
                 "have no meaning for a rig", where="min_depth, max_depth", remedy="leave them out"
             )
-        return Recording.of(source, str(paths[0]), "rig")
+        return Recording.of(rig, str(paths[0]), "rig")
     found = [item for path in paths for item in _resolve(Path(path), format)]
     sources = [item.reader.open(item.path, options) for item in found]
     source: Source = sources[0]

@@ -31,6 +31,8 @@ _ITERATIONS, _SETTLED = 30, 1e-4
 # Residuals beyond so many sigmas count nothing (Tukey's biweight); least sigma of a pose.
 _ROBUST, _LEAST_SIGMA = 4.7, 0.02
 _NORMAL_MEDIAN = 0.6745
+# Upper 95 % bound, in standard errors.
+_UPPER = 1.64
 # Sigma beyond which nothing is known, in units.
 _LOOSEST = 100.0
 
@@ -270,7 +272,8 @@ def _lasting(e: Float64, times: Float64, taken: float) -> float:
     """How long an error lasts, s: integral of the autocorrelation of the residuals.
 
     What a fit with so many unknowns for each axis (`taken`) has taken up is missing in it: at all
-    times about `taken` independent errors of those that there are.
+    times about `taken` independent errors of those that there are. A time taken too short states
+    errors that are too small, so it is its upper 95 % bound (by Bartlett's standard error).
     """
     interval = float(np.median(np.diff(times)))
     power = float((e**2).sum())
@@ -281,5 +284,5 @@ def _lasting(e: Float64, times: Float64, taken: float) -> float:
             break
         shares.append(share)
     first = 1 + 2 * sum(shares)
-    missing = min(taken * first / len(e), 0.5)
+    missing = min(taken * first / len(e) + _UPPER * np.sqrt(first / e.size), 0.5)
     return float(1 + 2 * sum((s + missing) / (1 + missing) for s in shares)) * interval

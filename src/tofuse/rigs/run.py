@@ -169,8 +169,8 @@ def _walked(rig: Rig, cameras: Sequence[Camera], times: Float64, progress: Progr
         if both.any():
             stacked.append(_middle(said[0][both] @ se3.inverse(other[both])) @ other)
     mean = _means(stacked)
-    known = np.flatnonzero(np.isfinite(mean[:, 0, 0]))
-    return np.asarray(se3.inverse(mean[known[0]]) @ mean, np.float64) if len(known) else mean
+    rows = np.flatnonzero(np.isfinite(mean[:, 0, 0]))
+    return np.asarray(se3.inverse(mean[rows[0]]) @ mean, np.float64) if len(rows) else mean
 
 
 def _middle(poses: Float64) -> Float64:
