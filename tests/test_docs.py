@@ -184,7 +184,9 @@ def commands() -> dict[str, argparse.ArgumentParser]:
 
 
 def options(parser: argparse.ArgumentParser) -> set[str]:
-    return {option for a in parser._actions for option in a.option_strings} - {"-h", "--help"}
+    nested = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    own = {option for a in parser._actions for option in a.option_strings} - {"-h", "--help"}
+    return own.union(*(options(p) for a in nested for p in a.choices.values()))
 
 
 @pytest.mark.parametrize("command", sorted(commands()))

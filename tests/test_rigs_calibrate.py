@@ -140,6 +140,21 @@ def test_a_knocked_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture
     assert [line.split()[0] for line in said if "moved by" in line] == ["cam2"]
 
 
+def test_a_rig_that_contradicts_the_images_is_marked(tmp_path: Path) -> None:
+    folder = written(tmp_path / "rig", 1)
+    cameras = [str(folder / f"cam{k}") for k in range(3)]
+    knocked = relative(STANDS)
+    knocked[1] = knocked[1] @ se3.exp([0.03, 0, 0, 0, 0, 0])
+    rows = [RigCamera(f"cam{k}", "", T, 1e-8 * np.eye(6)) for k, T in enumerate(knocked)]
+    write_rig(tmp_path / "rig.json", Rig(tuple(rows)))
+    out = tmp_path / "model"
+    main(["run", "--rig", str(tmp_path / "rig.json"), *cameras, "--out", str(out)])
+    reasons = json.loads((out / "run.json").read_text())["reasons"]
+    (said,) = (r["text"] for r in reasons if r["code"] == "rig_changed")
+    assert "cam1 by" in said
+    assert "cam2" not in said
+
+
 def test_a_rig_folder_without_one_camera_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

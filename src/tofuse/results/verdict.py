@@ -28,6 +28,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "implausible_depth": ("degraded", "Depths are implausible for this camera."),
     "weak_registration": ("degraded", "Frames have too few correspondences."),
     "not_converged": ("degraded", "Registrations stopped before they converged."),
+    "rig_changed": ("degraded", "A camera of the rig is not where its rig.json says."),
     "uncertain_poses": ("degraded", "Poses may be off by more than the tolerance."),
     "calibration_alarm": ("degraded", "Loop-closure errors are larger than noise explains."),
     "unchecked_drift": ("degraded", "No loop closure checks the accumulated drift."),
@@ -48,6 +49,7 @@ REASONS: dict[str, tuple[str, str]] = {
 
 # What a person can do about each reason, where there is something to do.
 ADVICE: dict[str, str] = {
+    "rig_changed": "Calibrate the rig anew: tofuse rig calibrate.",
     "few_poses": "Record again with smaller steps between frames, or use every frame.",
     "images_disagree": "Look at the model from above: walls that appear twice show where it broke.",
     "lost_frames": "Move more slowly there, and keep corners and furniture in view.",

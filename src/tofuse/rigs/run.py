@@ -22,20 +22,27 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
 from tofuse.posegraph.nearby import Nearby
 from tofuse.posegraph.refinement import NoRefinement
+from tofuse.posegraph.views import KeptView
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, read_rig
 from tofuse.recordings.rig_source import RigSource
 from tofuse.results.output import OutputFolder, write_result
-from tofuse.results.types import Reconstruction
+from tofuse.results.types import Reason, Reconstruction
+from tofuse.results.verdict import ranked, verdict_of
 from tofuse.rigs.calibrate import Motion, cameras_of, moves
+from tofuse.rigs.check import Moved, compare
 from tofuse.rigs.hand_eye import Track
 from tofuse.rigs.inputs import Camera
+from tofuse.rigs.joint import View, refine_together
 
 Float64 = NDArray[np.float64]
 
 # No place is looked for again: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
 TRAJECTORY = "rig_trajectory.txt"
+# Of a view that tells whether its camera is where the rig says.
+_POINTS = 6000
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +135,11 @@ def reconstruct_rig(
     instants, first = np.unique(source.instant[recording.indices], return_index=True)
     times = recording.timestamps[first]
     poses = np.tile(np.eye(4), (len(instants), 1, 1))
+    knocked: list[Moved] = []
     if moves(cameras, motion):
         poses = _walked(rig, cameras, times, progress)
+    else:
+        knocked = _knocked(rig, cameras, recording)
     at = np.searchsorted(instants, source.instant[recording.indices])
     of_frames = poses[at] @ source.T_rig_camera[recording.indices]
     given = replace(
@@ -141,7 +151,43 @@ def reconstruct_rig(
         self_calibration=False,
     )
     result = reconstruct(with_odometry(recording, of_frames), given, seed=seed, progress=progress)
-    return RigResult(result, times, poses)
+    return RigResult(_marked(result, knocked), times, poses)
+
+
+def _knocked(rig: Rig, cameras: Sequence[Camera], recording: Recording) -> list[Moved]:
+    """Cameras that are not where the rig says, as far as their views can be aligned from there."""
+    source = recording.source
+    assert isinstance(source, RigSource)
+    first = np.flatnonzero(source.instant == source.instant[recording.indices[0]])
+    views = []
+    for index in first:
+        frame = source.read(int(index))
+        if isinstance(frame, RangeFrame):
+            c = int(source.camera[index])
+            views.append(View(c, 0, KeptView.of(cameras[c].surface(frame), _POINTS)))
+    stated = np.stack([camera.T_rig_camera for camera in rig.cameras])
+    placed = refine_together(views, stated)
+    found = tuple(
+        replace(camera, T_rig_camera=T, covariance=C[:6, :6])
+        for camera, T, C in zip(rig.cameras, placed.poses, placed.covariance, strict=True)
+    )
+    return [moved for moved in compare(rig, Rig(found)) if moved.moved]
+
+
+def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
+    """The result with what the images say against the rig."""
+    if not knocked:
+        return result
+    d = result.diagnostics
+    said = ", ".join(
+        f"{m.name} by {1000 * m.distance_m:.0f} mm and {np.degrees(m.angle_rad):.1f} degrees"
+        for m in knocked
+    )
+    text = f"Cameras are not where the rig says: {said}."
+    everything = ((d.frames[0].index, d.frames[-1].index),)
+    reasons = ranked((*d.reasons, Reason("rig_changed", everything, text)))
+    verdict = verdict_of(reasons)
+    return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
 def _walked(rig: Rig, cameras: Sequence[Camera], times: Float64, progress: Progress) -> Float64:
