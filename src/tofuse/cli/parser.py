@@ -38,12 +38,17 @@ A view is a file with one view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 
 a recording, counted from 0.
 
 """
-_EXIT_RIG = """\
+_EXIT_CALIBRATE = """\
 exit status:
-  0  calibrate: every camera is placed; check: no camera was moved
-  3  calibrate: the file was written, but some camera could not be placed
-     check: some camera was moved, or cannot be checked
+  0  every camera is placed
+  3  the file was written, but some camera could not be placed
   2  nothing was written: one line on stderr says why
+"""
+_EXIT_CHECK = """\
+exit status:
+  0  no camera was moved
+  3  some camera was moved, or cannot be checked
+  2  nothing could be checked: one line on stderr says why
 """
 _EXIT_REGISTER = """\
 exit status:
@@ -398,7 +403,7 @@ def _rig(commands: Any) -> None:
         "say where the cameras of a rig are",
         epilog="Give one recording of each camera, of the same time: one image each, images of a "
         "scene in\nwhich something moves, or a walk with the rig. The first camera is the rig's "
-        "frame.\n\n" + _EXIT_RIG,
+        "frame.\n\n" + _EXIT_CALIBRATE,
         function="rig_calibrate",
     )
     p.add_argument("inputs", nargs="+", metavar="RECORDING", help="one for each camera")
@@ -409,7 +414,7 @@ def _rig(commands: Any) -> None:
         commands,
         "check",
         "say whether a camera of a rig was moved since it was calibrated",
-        epilog=_EXIT_RIG,
+        epilog=_EXIT_CHECK,
         function="rig_check",
     )
     p.add_argument("rig", type=Path, metavar="RIG", help="a rig.json")

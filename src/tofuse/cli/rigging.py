@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig
 from tofuse.results.output import plain
 from tofuse.rigs.calibrate import Calibration, loosest
@@ -16,21 +17,26 @@ from tofuse.rigs.check import Moved
 
 def tables(rig: Rig) -> list[Table]:
     """Where the cameras are, and how far surfaces of each two of them are apart."""
-    where = Table("camera", "x y z (m)", "turned (deg)", "known to (mm, deg)", box=None)
-    where.add_column("clock (ms)", justify="right")
-    where.add_column("depth (mm)", justify="right")
+    where = Table(box=None)
+    for title in ("camera", "x y z (m)"):
+        where.add_column(title, no_wrap=True)
+    for title in ("deg", "± mm", "± deg", "clock ms", "depth mm"):
+        where.add_column(title, justify="right", no_wrap=True)
     for camera in rig.cameras:
         T = camera.T_rig_camera
-        cosine = np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)
         metres, radians = loosest(camera)
+        values = (
+            f"{np.degrees(float(se3.angle(T))):.2f}",
+            f"{1000 * metres:.2g}",
+            f"{np.degrees(radians):.2g}",
+            f"{1000 * camera.time_offset_s:+.1f}",
+            f"{1000 * camera.depth_offset_m:+.1f}",
+        )
         first = camera is rig.cameras[0]
         where.add_row(
             camera.name,
-            " ".join(f"{x:+.4f}" for x in T[:3, 3]),
-            f"{np.degrees(np.arccos(cosine)):.2f}",
-            "-" if first else f"{1000 * metres:.2g}, {np.degrees(radians):.2g}",
-            "-" if first else f"{1000 * camera.time_offset_s:+.1f}",
-            "-" if first else f"{1000 * camera.depth_offset_m:+.1f}",
+            " ".join(f"{x:+.3f}" for x in T[:3, 3]),
+            *(("-",) * len(values) if first else values),
         )
     pairs = Table("surfaces of", "and", "are apart (mm)", "pixels", box=None)
     for found in rig.disagreement:
