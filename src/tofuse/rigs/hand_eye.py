@@ -9,7 +9,7 @@ correlation time is that of the residuals.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,6 +123,28 @@ def hand_eye(a: Track, b: Track, time_offset_s: float, *, one_world: bool = Fals
     """
     X, Y = _start(a, b, time_offset_s, one_world=one_world)
     return _Fit(a, b, one_world).solve(X, Y, time_offset_s)
+
+
+def combined(a: HandEye, b: HandEye) -> HandEye:
+    """The mean of two estimates by their covariances: of how a rig moves, and of what it sees.
+
+    Where they differ by more than these allow, it is as much less certain (Birge, 1932).
+    """
+    apart = se3.log(se3.inverse(a.T_a_b) @ b.T_a_b)
+    both = a.covariance + b.covariance
+    ratio = float(apart @ np.linalg.pinv(both, hermitian=True) @ apart) / len(apart)
+    share = a.covariance @ np.linalg.pinv(both, hermitian=True)
+    C = a.covariance - share @ a.covariance
+    variances = np.array([a.time_sigma_s**2, b.time_sigma_s**2]) + 1e-18
+    known = float((1 / variances).sum())
+    offset = (a.time_offset_s / variances[0] + b.time_offset_s / variances[1]) / known
+    return replace(
+        b,
+        T_a_b=np.asarray(se3.orthonormalise(a.T_a_b @ se3.exp(share @ apart)), np.float64),
+        covariance=np.asarray(0.5 * (C + C.T) * max(ratio, 1.0), np.float64),
+        time_offset_s=float(offset),
+        time_sigma_s=float(known**-0.5),
+    )
 
 
 def _common(a: Track, b: Track, offset: float) -> tuple[Float64, Float64, Float64]:

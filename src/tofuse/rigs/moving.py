@@ -20,7 +20,7 @@ from tofuse.posegraph.refine import RefineOptions, refine
 from tofuse.posegraph.refinement import followed
 from tofuse.posegraph.views import KeptView
 from tofuse.results.types import Reconstruction
-from tofuse.rigs.hand_eye import HandEye, Track, clock_of, hand_eye
+from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import distances_between
 
@@ -100,7 +100,10 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> MovingRig
     together = _Together.of(cameras, tracks, fits)
     moved = together.refined()
     for k in list(fits):
-        fits[k] = hand_eye(moved[0], moved[k], fits[k].time_offset_s, one_world=together.kept)
+        offset = fits[k].time_offset_s
+        fits[k] = hand_eye(moved[0], moved[k], offset)
+        if together.kept:
+            fits[k] = combined(fits[k], hand_eye(moved[0], moved[k], offset, one_world=True))
         why = _too_loose(fits[k], together.depth)
         if why:
             reasons[k] = why

@@ -1,0 +1,32 @@
+"""Five Azure Kinects from unknown poses, one image each."""
+
+import json
+
+import numpy as np
+
+from tofuse.geometry import se3
+from tofuse.posegraph.views import KeptView
+from tofuse.rigs.calibrate import calibrate_cameras
+from tofuse.rigs.inputs import open_cameras
+from tofuse.rigs.joint import View, disagreements
+
+
+def test_surfaces_agree_better_than_under_the_reference_poses(shared_data) -> None:
+    folder = shared_data / "azure_kinect_rig"
+    paths = sorted(p for p in folder.iterdir() if p.is_dir())
+    cameras = open_cameras(paths)
+    rig = calibrate_cameras(cameras, paths).rig
+    assert not rig.unplaced
+    reference = json.loads((folder / "reference_T_world_camera.json").read_text())
+    T = np.array([np.reshape(reference[camera.name], (4, 4)) for camera in cameras])
+    T = se3.inverse(T[0]) @ T
+    # COLMAP's poses are good to 1 or 2 cm and about a degree.
+    off = se3.inverse(np.array([c.T_rig_camera for c in rig.cameras])) @ T
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.04
+    assert np.degrees(se3.angle(off)).max() < 1.5
+    views = [
+        View(k, 0, KeptView.of(camera.surface(camera.images(1)[0]), 4000))
+        for k, camera in enumerate(cameras)
+    ]
+    under_reference = [median for median, _ in disagreements(views, T).values()]
+    assert np.median([d.median_m for d in rig.disagreement]) < 0.25 * np.median(under_reference)
