@@ -7,7 +7,7 @@ instant shows it from all sides at once, and all instants count together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,8 @@ _INSTANTS, _AVERAGED = 60, 48
 _POINTS, _LEAST_POINTS, _ALL_POINTS = 6000, 1500, 60_000
 # Images of an instant are no further apart than this share of the time between images.
 _SAME_INSTANT = 0.6
+# Standard deviation of a clock, in frames: images are paired to within half of one.
+_CLOCK = 0.3
 # Lags that are tried to either side, in images; instants at which; and the distance, as a share of
 # the depth, beyond which surfaces are different ones.
 _LAGS, _ASKED, _FAR = 6, 10, 0.03
@@ -107,7 +109,29 @@ def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
             at = _common_times(cameras, offsets)
             instants = [_at_times(c, o, at) for c, o in zip(cameras, offsets, strict=True)]
             placed = refine_together(_views(instants, order), placed.poses)
+        placed = _with_clock_errors(cameras, order, placed, offsets, instants)
     return StillRig(placement, placed, order, offsets, count, tuple(notes))
+
+
+def _with_clock_errors(
+    cameras: Sequence[Camera],
+    order: Sequence[int],
+    placed: Placed,
+    offsets: Float64,
+    instants: Sequence[Sequence[SurfaceMap | None]],
+) -> Placed:
+    """Add to the covariances what clocks leave open: how far poses move if one is a frame late."""
+    at = _common_times(cameras, offsets)
+    blocks = placed.covariance.copy()
+    for c in order[1:]:
+        interval = float(np.median(np.diff(cameras[c].recording.timestamps)))
+        late = list(instants)
+        late[c] = _at_times(cameras[c], offsets[c] + interval, at)
+        moved = refine_together(_views(late, order), placed.poses).poses
+        for k in range(1, len(order)):
+            xi = _CLOCK * se3.log(se3.inverse(placed.poses[k]) @ moved[k])
+            blocks[k, :6, :6] += np.outer(xi, xi)
+    return replace(placed, covariance=blocks)
 
 
 def _views(instants: Sequence[Sequence[SurfaceMap | None]], order: Sequence[int]) -> list[View]:
