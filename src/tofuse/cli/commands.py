@@ -260,7 +260,7 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**found.rig.to_dict(), "how": found.how, "notes": list(found.notes)})
         return rigging.exit_status(found)
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     for table in rigging.tables(found.rig):
         console.print(table)
     for note in rigging.notes(found):
@@ -288,7 +288,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit(rigging.check_json(cameras))
         return rigging.check_status(cameras)
-    console = _Output(highlight=False, soft_wrap=True)
+    console = Output(highlight=False, soft_wrap=True)
     for line in rigging.check_lines(cameras):
         console.print(line, markup=False)
     for note in found.notes:

@@ -14,7 +14,18 @@ from tofuse.cli.parser import Parser, make_parser
 from tofuse.errors import InputError
 
 # What a batch decides itself, and what is for somebody who watches.
-_NOT_HERE = {"out", "overwrite", "into", "rig", "json", "view", "port", "no-open", "threads", "help"}
+_NOT_HERE = {
+    "out",
+    "overwrite",
+    "into",
+    "rig",
+    "json",
+    "view",
+    "port",
+    "no-open",
+    "threads",
+    "help",
+}
 _YES, _NO = {"true", "yes", "1", "x"}, {"false", "no", "0"}
 
 
