@@ -166,7 +166,7 @@ def own_processes(workers: int, folder: Path) -> Iterator[tuple[str, Pids]]:
         while not ended.is_set():
             running[number] = subprocess.Popen([*dask, "worker", *words, *local], **told)
             if ended.is_set():
-                running[number].terminate()
+                running[number].kill()
             running[number].wait()
 
     keepers = [threading.Thread(target=keep, args=(k,)) for k in range(workers)]
@@ -185,7 +185,7 @@ def own_processes(workers: int, folder: Path) -> Iterator[tuple[str, Pids]]:
         scheduler.terminate()
         scheduler.wait()
         for process in list(running.values()):
-            process.terminate()
+            process.kill()  # without its scheduler a worker may wait for ever to say goodbye
         for keeper in keepers:
             if keeper.ident is not None:
                 keeper.join()

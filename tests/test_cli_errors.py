@@ -422,11 +422,11 @@ def test_what_no_room_foresaw_is_still_one_line(capfd, monkeypatch) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO), "some/file")
 
     monkeypatch.setattr(reading, "read_text", fail)
-    monkeypatch.setattr("tofuse.files.trajectory_formats.read_poses", fail)
+    monkeypatch.setattr("tofuse.pipeline.evaluating.read_poses", fail)
     refuses(capfd, "evaluate", "a", "b", says=("some/file", os.strerror(errno.EIO)))
 
     def too_much(*_args: object, **_options: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("tofuse.files.trajectory_formats.read_poses", too_much)
+    monkeypatch.setattr("tofuse.pipeline.evaluating.read_poses", too_much)
     refuses(capfd, "evaluate", "a", "b", says=("out of memory", "--every"))

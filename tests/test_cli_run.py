@@ -341,7 +341,7 @@ def test_a_blank_frame_in_the_middle_is_lost(recording, tmp_path, capsys) -> Non
 def test_one_frame_is_a_fine_run(room_recording, tmp_path) -> None:
     run(room_recording, "--out", tmp_path / "out", "--end", 1)
     data = run_json(tmp_path / "out")
-    assert [r["code"] for r in data["reasons"]] == ["single_frame"]
+    assert [r["code"] for r in data["reasons"]] == ["single_frame", "correction_left_out"]
     # Nothing was registered, so nothing is known of the accuracy.
     assert data["verdict"] == "degraded"
     assert data["accuracy"] == {
@@ -433,7 +433,7 @@ def test_json_lines_end_with_the_result(room_recording, tmp_path, capfd) -> None
     done = capfd.readouterr()
     assert done.err == ""
     lines = [json.loads(line) for line in done.out.splitlines()]
-    assert {line["event"] for line in lines} == {"stage", "frame", "result"}
+    assert {line["event"] for line in lines} == {"stage", "frame", "note", "result"}
     assert [line["index"] for line in lines if line["event"] == "frame"] == [0, 2, 4, 6]
     last = lines[-1]
     assert last["event"] == "result"
@@ -448,9 +448,11 @@ def test_logs_are_quiet_and_notes_come_once(recording, tmp_path, capfd) -> None:
     (recording / "camera.json").write_text(json.dumps(camera | {"colour_of_case": "grey"}))
     run(recording, "--out", tmp_path / "out", "--every", 4)
     done = capfd.readouterr()
-    assert done.err.count("\n") == 1
-    assert done.err.startswith("note: ")
-    assert "colour_of_case" in done.err
+    notes = done.err.splitlines()
+    assert all(note.startswith("note: ") for note in notes)
+    assert sum("colour_of_case" in note for note in notes) == 1
+    assert sum("multipath is left out" in note for note in notes) == 1
+    assert len(notes) == 2
     # Each reason, and what can be done about it.
     assert len(done.out.splitlines()) <= 4 + 2 * len(run_json(tmp_path / "out")["reasons"])
     assert "\x1b" not in done.out

@@ -204,8 +204,10 @@ def test_views_in_no_order_are_told_of_once() -> None:
 
 def test_every_reason_has_a_case() -> None:
     # Whether there is a surface is no question of trust: fusion tells. What is wrong with the
-    # recording itself is found before it is run; that its camera was corrected, after.
+    # recording itself is found before it is run; that its camera was corrected, or is not where its
+    # rig says, after.
     elsewhere = {"no_surface", "faulty_recording", "self_calibrated", "correction_left_out"}
+    elsewhere |= {"rig_changed"}
     assert set(CASES) == set(REASONS) - elsewhere
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from tofuse._version import __version__
 
 if TYPE_CHECKING:
-    from tofuse.api.result import Result, load, reconstruct
+    from tofuse.api.result import Result, load, merge, reconstruct
     from tofuse.errors import InputError, OutputError, RegistrationError, TofuseError
     from tofuse.fusion.cloud import Cloud
     from tofuse.fusion.mesh import Mesh
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from tofuse.pipeline.evaluating import Evaluation, evaluate
     from tofuse.pipeline.judging import Judgement, judge
     from tofuse.pipeline.mapper import Mapper
-    from tofuse.pipeline.merging import merge
     from tofuse.recordings.arrays import from_arrays
     from tofuse.recordings.frames import CloudFrame, RangeFrame
     from tofuse.recordings.open import open_recording as open  # noqa: A004
@@ -66,7 +65,7 @@ _HOMES = {
     "inspect": "tofuse.inspection.inspect",
     "judge": "tofuse.pipeline.judging",
     "load": "tofuse.api.result",
-    "merge": "tofuse.pipeline.merging",
+    "merge": "tofuse.api.result",
     "open": "tofuse.recordings.open",
     "reconstruct": "tofuse.api.result",
     "register": "tofuse.registration.register",

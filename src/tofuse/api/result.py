@@ -20,6 +20,7 @@ from tofuse.cli.progress import TerminalProgress
 from tofuse.errors import InputError
 from tofuse.pipeline.config import Config, changed, from_method
 from tofuse.pipeline.evaluating import Evaluation, evaluate
+from tofuse.pipeline.merging import merge as merge_results
 from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import reconstruct as reconstruct_recording
 from tofuse.pipeline.reconstruct import view_kind
@@ -238,13 +239,52 @@ def reconstruct(
         If no frame can be read, or none has enough valid points for a pose; or if a filter can't
         learn what it has to.
     """
-    shown: AbstractContextManager[Progress | None]
-    shown = TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
-    with shown as seen:
+    with _shown(progress) as seen:
         found = reconstruct_recording(
             recording, config, seed=seed, threads=threads, loops=loops, progress=seen
         )
     return Result.of(found, recording)
+
+
+def merge(
+    results: Sequence[str | Path],
+    *,
+    tolerance_m: float | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | bool | None = None,
+) -> Result:
+    """Put the results of several runs into one map, in the world of the first.
+
+    Parameters
+    ----------
+    results
+        Output folders of ``tofuse run`` or ``tofuse merge``; at least two sessions. Their
+        recordings must be where they were.
+    tolerance_m
+        As of `Config`; that of the first result unless given.
+    seed, threads, progress
+        As of `reconstruct`.
+
+    Returns
+    -------
+    A result as of a run, with `sessions` and `session_pairs`. What can't be joined to the first one
+    is a component with a model of its own.
+
+    Raises
+    ------
+    InputError
+        If something is no result, or its recording is gone or has changed.
+    """
+    with _shown(progress) as seen:
+        found = merge_results(
+            results, tolerance_m=tolerance_m, seed=seed, threads=threads, progress=seen
+        )
+    return Result.of(found)
+
+
+def _shown(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
+    return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
 
 
 def load(folder: str | Path) -> Result:

@@ -49,6 +49,7 @@ def learnt(
     InputError
         If the recording does not show what a filter has to learn.
     """
+    asked = config
     filters_learn = any(f.learns for f in (*config.filters, *config.model_filters))
     # BLAS sums differ with its number of threads; ours don't.
     with use_threads(threads), threadpool_limits(1):
@@ -57,6 +58,11 @@ def learnt(
         for item in config.corrections:
             if item.on_trial:
                 config = _tried(config, item, recording, progress or Silent())
+        left_out = sum(c.left_out for c in config.corrections)
+        if filters_learn and left_out > sum(c.left_out for c in asked.corrections):
+            # They have to learn from images as they will be.
+            unlearnt = replace(config, filters=asked.filters, model_filters=asked.model_filters)
+            config = _taught(unlearnt, recording)
         odometry = config.odometry
         if isinstance(odometry, Keyframes | GivenPoses) and odometry.surface.falloff is None:
             falloff = 0.0

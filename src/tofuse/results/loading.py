@@ -30,6 +30,8 @@ from tofuse.results.types import (
     Reason,
     Reconstruction,
     SelfCalibration,
+    SessionPair,
+    SessionRecord,
 )
 
 Float64 = NDArray[np.float64]
@@ -104,6 +106,8 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         run["threads"],
         _mesh(folder / "mesh.ply"),
         tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
+        tuple(_session(each) for each in run.get("sessions", ())),
+        tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
     )
 
 
@@ -111,7 +115,13 @@ def _frame(data: dict[str, Any]) -> FrameRecord:
     C = data["covariance"]
     unobservable = np.array(data["unobservable"], float).reshape(-1, 6)
     known = {"covariance": None if C is None else np.array(C, float).reshape(6, 6)}
-    return FrameRecord(**{**data, **known, "unobservable": unobservable})
+    stated = {name: data[name] for name in data if name != "session"}
+    return FrameRecord(**{**stated, **known, "unobservable": unobservable})
+
+
+def _session(data: dict[str, Any]) -> SessionRecord:
+    T = data["T_main_session"]
+    return SessionRecord(**{**data, "T_main_session": None if T is None else np.array(T, float)})
 
 
 def _part(data: dict[str, Any]) -> GraphPart:
