@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse._version import __version__
 from tofuse.errors import InputError
 from tofuse.files.e57 import write_e57
 from tofuse.files.glb import write_glb, write_gltf
@@ -24,6 +25,7 @@ Float64 = NDArray[np.float64]
 
 # From x right, y down, z forward into glTF's x right, y up, z towards the viewer.
 _R_GLTF_WORLD = np.diag([1.0, -1.0, -1.0])
+_GENERATOR = f"tofuse {__version__}"
 _SCALARS = {"views": "frames that saw the point", "sigma": "standard deviation in m"}
 
 
@@ -34,14 +36,20 @@ class Shape:
     `faces` (M, 3) is None for a cloud; `scalars` are columns (N,) by name.
     """
 
-    points: Float64
+    points: Float64 | NDArray[np.float32]
     normals: NDArray[np.float32] | None
     color: NDArray[np.uint8] | None
     scalars: Mapping[str, ArrayLike]
     faces: NDArray[np.int32] | None = None
 
-    def save(self, path: str | Path) -> None:
-        """Write it in the format of the suffix; glTF and STL stand with y up.
+    def save(self, path: str | Path, R_up_world: Float64 = _R_GLTF_WORLD) -> None:
+        """Write it in the format of the suffix.
+
+        Parameters
+        ----------
+        R_up_world
+            (3, 3) from the world into axes with y up, in which glTF, OBJ and STL stand; those of
+            the first camera unless given.
 
         Raises
         ------
@@ -58,7 +66,7 @@ class Shape:
                 where=path,
                 remedy=f"use one of {', '.join(formats)}",
             )
-        write(self, path)
+        write(self, path, R_up_world)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` or `trimesh.PointCloud`, in the world frame."""
@@ -90,12 +98,12 @@ class Shape:
             setattr(out, f"{prefix}colors", vector(self.color / 255.0))
         return out
 
-    def _upright(self) -> dict[str, Any]:
-        normals = None if self.normals is None else self.normals @ _R_GLTF_WORLD
+    def turned(self, R: Float64) -> dict[str, Any]:
+        """Arrays of the mesh in other axes, as writers of meshes take them."""
         return {
-            "points": self.points @ _R_GLTF_WORLD,
+            "points": self.points @ R.T,
             "faces": self.faces,
-            "normals": normals,
+            "normals": None if self.normals is None else self.normals @ R.T,
             "color": self.color,
         }
 
@@ -107,7 +115,7 @@ def _library(name: str) -> Any:
         raise InputError("is not installed", where=name, remedy=f"pip install {name}") from error
 
 
-def _ply(shape: Shape, path: str | Path) -> None:
+def _ply(shape: Shape, path: str | Path, _: Float64) -> None:
     write_ply(
         path,
         shape.points,
@@ -118,32 +126,37 @@ def _ply(shape: Shape, path: str | Path) -> None:
     )
 
 
-def _stl(shape: Shape, path: str | Path) -> None:
-    upright = shape._upright()
-    write_stl(path, upright["points"], upright["faces"])
+def _stl(shape: Shape, path: str | Path, R: Float64) -> None:
+    turned = shape.turned(R)
+    write_stl(path, turned["points"], turned["faces"])
 
 
-def _las(shape: Shape, path: str | Path) -> None:
+def _las(shape: Shape, path: str | Path, _: Float64) -> None:
     scalars = {name: (np.asarray(v), _SCALARS[name]) for name, v in shape.scalars.items()}
-    write_las(path, shape.points, color=shape.color, scalars=scalars)
+    if shape.normals is not None:
+        scalars |= {
+            f"normal {a}": (shape.normals[:, k], "away from the surface")
+            for k, a in enumerate("xyz")
+        }
+    write_las(path, shape.points, color=shape.color, scalars=scalars, software=_GENERATOR)
 
 
-def _pcd(shape: Shape, path: str | Path) -> None:
+def _pcd(shape: Shape, path: str | Path, _: Float64) -> None:
     scalars = {name: np.asarray(v) for name, v in shape.scalars.items()}
     write_pcd(path, shape.points, normals=shape.normals, color=shape.color, scalars=scalars)
 
 
-def _e57(shape: Shape, path: str | Path) -> None:
+def _e57(shape: Shape, path: str | Path, _: Float64) -> None:
     scalars = {name: np.asarray(v) for name, v in shape.scalars.items()}
     write_e57(path, shape.points, normals=shape.normals, color=shape.color, scalars=scalars)
 
 
-_Write = Callable[[Shape, str | Path], None]
+_Write = Callable[[Shape, str | Path, Float64], None]
 _MESHES: dict[str, _Write] = {
-    ".glb": lambda shape, path: write_glb(path, **shape._upright()),
-    ".gltf": lambda shape, path: write_gltf(path, **shape._upright()),
+    ".glb": lambda shape, path, R: write_glb(path, **shape.turned(R), generator=_GENERATOR),
+    ".gltf": lambda shape, path, R: write_gltf(path, **shape.turned(R), generator=_GENERATOR),
     ".ply": _ply,
-    ".obj": lambda shape, path: write_obj(path, **shape._upright()),
+    ".obj": lambda shape, path, R: write_obj(path, **shape.turned(R)),
     ".stl": _stl,
 }
 _CLOUDS: dict[str, _Write] = {".ply": _ply, ".pcd": _pcd, ".las": _las, ".e57": _e57}

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.trajectory import read_tum
 from tofuse.odometry.base import Status
 from tofuse.odometry.given import GivenPoses, StatedPose
 from tofuse.odometry.keyframes import Keyframes
@@ -25,8 +24,8 @@ from tofuse.recordings.recording import Recording
 from tofuse.results.output import (
     RECORDING,
     component_name,
-    frames_in_main_model,
     is_result,
+    main_poses,
     read_run_json,
 )
 
@@ -219,14 +218,7 @@ def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, 
 def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
     """(4, 4) T_world_camera by index, of the frames in the main model of a folder."""
     run = read_run_json(folder / "run.json") if run is None else run
-    indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
-    _, poses = read_tum(folder / "trajectory.txt")
-    if len(indices) != len(poses):
-        raise InputError(
-            f"says that {len(indices)} frames have a pose, and trajectory.txt holds {len(poses)}",
-            where=folder / "run.json",
-            remedy="copy the whole folder, or run again",
-        )
+    indices, poses = main_poses(folder, run)
     return dict(zip(indices, poses, strict=True))
 
 

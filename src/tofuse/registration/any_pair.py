@@ -26,7 +26,7 @@ from tofuse.registration.viewpoint import as_image, viewpoint_of
 Float64 = NDArray[np.float64]
 
 FEWEST_POINTS = 10
-# Views as they were recorded, far apart: light by way of other surfaces is in them, and bends each
+# Views as they were recorded, far apart: multipath is in them, and bends each
 # of them otherwise. See docs/uncertainty.md for how these were found.
 _AS_RECORDED = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
 # Poses that shapes propose, at most.

@@ -4,7 +4,7 @@ As for images (`registration.uncertainty`) the covariance is that of an M-estima
 (Huber 1981, ch. 6): X the slope of the gradient, from the product of both views' normals, in which
 their noise cancels, and B the covariance of the gradient. Where clouds come from and what is wrong
 with them is not known, so that B is learnt from the residuals at the final pose alone. Both clouds
-are bent against each other, by light by way of other surfaces, an error over range, or by points
+are bent against each other, by multipath, an error over range, or by points
 that stand for surfaces they are not quite on: a random field of displacements, whose parts along
 any axis have the covariance ``s^2 exp(-d / l)`` over the distance d. On top of it is noise. A
 residual is the displacement along its normal, plus noise.

@@ -6,21 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse._version import __version__
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder
-from tofuse.files.e57 import write_e57
-from tofuse.files.glb import write_gltf
-from tofuse.files.las import write_las
-from tofuse.files.obj import write_obj
-from tofuse.files.pcd import write_pcd
-from tofuse.files.ply import Ply, read_ply
+from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
+from tofuse.fusion.exchange import Shape
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.results.output import is_result, read_run_json
@@ -35,21 +29,19 @@ class _Result:
     folder: Path
 
     @cached_property
-    def cloud(self) -> Ply:
-        return read_ply(self.folder / "cloud.ply")
-
-    @cached_property
-    def scalars(self) -> dict[str, NDArray[Any]]:
-        """Columns of the cloud that say how far each point is to be trusted."""
-        return {name: self.cloud.vertex[name] for name in _SCALARS if name in self.cloud.vertex}
+    def cloud(self) -> Shape:
+        """The cloud, with columns that say how far each point is to be trusted."""
+        ply = read_ply(self.folder / "cloud.ply")
+        scalars = {name: ply.vertex[name] for name in _SCALARS if name in ply.vertex}
+        return Shape(ply.points, ply.normals, ply.color, scalars)
 
     @cached_property
     def trajectory(self) -> tuple[Float64, Float64]:
         return read_tum(self.folder / "trajectory.txt")
 
     @cached_property
-    def mesh(self) -> dict[str, Any]:
-        """Arrays of the mesh, upright."""
+    def mesh(self) -> tuple[Shape, Float64]:
+        """The mesh, and the rotation (3, 3) that makes it upright."""
         path = self.folder / "mesh.ply"
         if not path.is_file():
             raise InputError(
@@ -64,13 +56,7 @@ class _Result:
         mesh = Mesh(
             ply.points, faces, normals, ply.color, nothing.astype(np.float32), nothing, np.zeros(3)
         )
-        R = upright(mesh, self.trajectory[1])
-        return {
-            "points": mesh.vertices @ R.T,
-            "faces": faces,
-            "normals": normals @ R.T,
-            "color": mesh.color,
-        }
+        return mesh.shape(), upright(mesh, self.trajectory[1])
 
     @cached_property
     def frame_numbers(self) -> NDArray[np.intp]:
@@ -81,41 +67,16 @@ class _Result:
         return index[associate(self.trajectory[0], times, limit=1e-6)]
 
 
-_SCALARS = {"views": "frames that saw the point", "sigma": "standard deviation in m"}
+_SCALARS = ("views", "sigma")
 
 
-def _pcd(result: _Result, path: Path) -> None:
-    cloud = result.cloud
-    write_pcd(path, cloud.points, normals=cloud.normals, color=cloud.color, scalars=result.scalars)
+def _cloud(result: _Result, path: Path) -> None:
+    result.cloud.save(path)
 
 
-def _las(result: _Result, path: Path) -> None:
-    scalars = {name: (values, _SCALARS[name]) for name, values in result.scalars.items()}
-    normals = result.cloud.normals
-    if normals is not None:
-        scalars |= {
-            f"normal {a}": (normals[:, k], "away from the surface") for k, a in enumerate("xyz")
-        }
-    write_las(
-        path,
-        result.cloud.points,
-        color=result.cloud.color,
-        scalars=scalars,
-        software=f"tofuse {__version__}",
-    )
-
-
-def _e57(result: _Result, path: Path) -> None:
-    cloud = result.cloud
-    write_e57(path, cloud.points, normals=cloud.normals, color=cloud.color, scalars=result.scalars)
-
-
-def _obj(result: _Result, path: Path) -> None:
-    write_obj(path, **result.mesh)
-
-
-def _gltf(result: _Result, path: Path) -> None:
-    write_gltf(path, **result.mesh, generator=f"tofuse {__version__}")
+def _mesh(result: _Result, path: Path) -> None:
+    shape, R_up_world = result.mesh
+    shape.save(path, R_up_world)
 
 
 def _kitti(result: _Result, path: Path) -> None:
@@ -128,11 +89,11 @@ def _log(result: _Result, path: Path) -> None:
 
 # The file that each format makes, and how.
 FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
-    "pcd": ("cloud.pcd", _pcd),
-    "las": ("cloud.las", _las),
-    "e57": ("cloud.e57", _e57),
-    "obj": ("mesh.obj", _obj),
-    "gltf": ("mesh.gltf", _gltf),
+    "pcd": ("cloud.pcd", _cloud),
+    "las": ("cloud.las", _cloud),
+    "e57": ("cloud.e57", _cloud),
+    "obj": ("mesh.obj", _mesh),
+    "gltf": ("mesh.gltf", _mesh),
     "kitti": ("trajectory.kitti.txt", _kitti),
     "log": ("trajectory.log", _log),
 }

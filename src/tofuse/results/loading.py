@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.ply import read_ply
-from tofuse.files.trajectory import read_tum
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
@@ -19,8 +18,8 @@ from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.posegraph.outside import OutsideRecord
 from tofuse.results.output import (
     component_name,
-    frames_in_main_model,
     is_result,
+    main_poses,
     read_run_json,
 )
 from tofuse.results.types import (
@@ -68,15 +67,8 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
     frames = tuple(_frame(each) for each in run["frames"])
     row = {frame.index: k for k, frame in enumerate(frames)}
     trajectory = np.full((len(frames), 4, 4), np.nan)
-    _, poses = read_tum(folder / "trajectory.txt")
-    posed = [row[frame["index"]] for frame in frames_in_main_model(run)]
-    if len(posed) != len(poses):
-        raise InputError(
-            f"says that {len(posed)} frames have a pose, and trajectory.txt holds {len(poses)}",
-            where=folder / "run.json",
-            remedy="copy the whole folder, or run again",
-        )
-    trajectory[posed] = poses
+    indices, poses = main_poses(folder, run)
+    trajectory[[row[index] for index in indices]] = poses
     diagnostics = Diagnostics(
         run["verdict"],
         tuple(

@@ -23,7 +23,7 @@ from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
-from tofuse.files.trajectory import write_tum
+from tofuse.files.trajectory import read_tum, write_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.fusion.upright import T_up_world, upright
@@ -645,6 +645,25 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
     if not isinstance(data, dict) or data.get("schema") != 1:
         raise InputError("is not a run.json of schema 1", where=path)
     return data
+
+
+def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
+    """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a folder.
+
+    Raises
+    ------
+    InputError
+        If its `run.json`, read before, and its `trajectory.txt` are of different runs.
+    """
+    indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
+    _, poses = read_tum(folder / "trajectory.txt")
+    if len(indices) != len(poses):
+        raise InputError(
+            f"says that {len(indices)} frames have a pose, and trajectory.txt holds {len(poses)}",
+            where=folder / "run.json",
+            remedy="copy the whole folder, or run again",
+        )
+    return indices, poses
 
 
 def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:

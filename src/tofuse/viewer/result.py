@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.ply import Ply, read_ply
-from tofuse.files.trajectory import read_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
-from tofuse.results.output import frames_in_main_model, is_result, read_run_json
+from tofuse.results.output import is_result, main_poses, read_run_json
 from tofuse.viewer.kept import read_kept
 
 Float32 = NDArray[np.float32]
@@ -126,14 +125,7 @@ def read_result(folder: Path) -> Result:
             "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"
         )
     run = read_run_json(folder / "run.json")
-    posed = [frame["index"] for frame in frames_in_main_model(run)]
-    _, poses = read_tum(folder / "trajectory.txt")
-    if len(posed) != len(poses):
-        raise InputError(
-            f"says that {len(posed)} frames have a pose, and trajectory.txt holds {len(poses)}",
-            where=folder / "run.json",
-            remedy="copy the whole folder, or run again",
-        )
+    posed, poses = main_poses(folder, run)
     after = dict(zip(posed, poses, strict=True))
     cloud = Layer.of(read_ply(folder / "cloud.ply"))
     mesh = Layer.of(read_ply(folder / "mesh.ply")) if (folder / "mesh.ply").is_file() else None
