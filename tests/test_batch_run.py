@@ -366,7 +366,7 @@ def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
         (["--memory", "much"], "no amount of memory"),
         (["--only", "b"], "there is no job b"),
-        (["--wrkers=2"], "--wrkers is not known, --workers is"),
+        (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],
 )
 def test_bad_words_are_told_in_a_line(words, said, tmp_path: Path, capsys) -> None:

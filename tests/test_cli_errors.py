@@ -228,8 +228,8 @@ def test_a_folder_that_cannot_be_made(recording, tmp_path, capfd, monkeypatch) -
 
 RUN = ("run", "REC", "--out", "OUT")
 USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
-    "no command": ((), ("COMMAND",), "tofuse: "),
     "unknown command": (("fuse",), ("'fuse'",), "tofuse: "),
+    "misspelt command": (("rnu",), ("'rnu' (did you mean run?)",), "tofuse: "),
     "no input": (("run", "--out", "OUT"), ("INPUT",), "tofuse run: "),
     "no out": (("run", "REC"), ("--out",), "tofuse run: "),
     "unknown option": ((*RUN, "--fast"), ("--fast",), "tofuse"),
@@ -250,7 +250,7 @@ USAGE: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     ),
     "misspelt option": (
         (*RUN, "--maxdepth", "3"),
-        ("--maxdepth", "--max-depth"),
+        ("--maxdepth", "did you mean --max-depth?"),
         "tofuse run: ",
     ),
     "one word too many": (("demo", "room"), ("room",), "tofuse demo: "),
@@ -315,6 +315,15 @@ def test_bad_usage(name, recording, tmp_path, capfd, monkeypatch) -> None:
     words, says, prefix = USAGE[name]
     refuses(capfd, *words, says=says, prefix=prefix)
     assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("words", [[], ["rig"]])
+def test_no_command_shows_the_help(words, capsys) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    said, complaint = capsys.readouterr()
+    assert stopped.value.code == 0
+    assert said.startswith("usage: tofuse") and "commands:" in said and not complaint
 
 
 CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {

@@ -45,7 +45,7 @@ def told(command: Callable[[], int]) -> int:
         print(f"tofuse: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("tofuse: interrupted; nothing that was there before has changed", file=sys.stderr)
+        print("tofuse: interrupted; existing files are unchanged", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # The reader of our output went away (`tofuse ... | head`): not an error of ours.

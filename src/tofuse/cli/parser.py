@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,30 +24,30 @@ exit status:
 """
 
 _EXIT_BATCH = """\
-LIST is a text of one path or glob a line, or a table (.csv, .toml) with a column `recording`
-and options of `tofuse run` as further ones; see docs/batch.md. The same command goes on where
-an earlier one was stopped.
+LIST is a text file with one path or glob per line, or a table (.csv, .toml) with a column
+`recording` and further columns for options of `tofuse run`; see docs/batch.md. Run the same
+command again to resume.
 
 exit status:
-  0  every recording has a result, and every readable frame of them a pose
-  3  there are results, but some recording has none, or some readable frame no pose
+  0  every recording has a result, and every readable frame has a pose
+  3  some recording has no result, or some readable frame has no pose
   2  there is no result: one line on stderr says why
 """
 _VIEWS = """\
-A view is a file with one view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
-a recording, counted from 0.
+A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
+a recording, counting from 0.
 
 """
 _EXIT_CALIBRATE = """\
 exit status:
-  0  every camera is placed
-  3  the file was written, but some camera could not be placed
+  0  the pose of every camera was found
+  3  the file was written, but the pose of some camera could not be found
   2  nothing was written: one line on stderr says why
 """
 _EXIT_CHECK = """\
 exit status:
-  0  no camera was moved
-  3  some camera was moved, or cannot be checked
+  0  no camera has moved
+  3  some camera has moved, or cannot be checked
   2  nothing could be checked: one line on stderr says why
 """
 _EXIT_REGISTER = """\
@@ -59,8 +59,8 @@ exit status:
 
 
 _SESSIONS = """\
-A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must be where it
-was. The first one's world stays. What can't be joined is kept apart, and named.
+A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it
+was. The first result defines the world frame. What cannot be joined stays a separate component.
 
 """
 _EXIT_MERGE = """\
@@ -82,18 +82,33 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
-        """Parse; the command itself says which of its words it does not know."""
+        """Parse; each command reports its own unknown options. No command at all is ``--help``."""
         found, unknown = self.parse_known_args(args, namespace)
+        if not hasattr(found, "command") and not unknown:
+            found.parser.print_help()
+            sys.exit(0)
         if unknown:
             command: Parser = getattr(found, "parser", self)
             command.refuse(unknown)
         return found
 
     def refuse(self, unknown: Sequence[str]) -> NoReturn:
-        """Say what is not known, and which option is nearest to it."""
+        """Report an unknown option, and the one that was probably meant."""
         word = unknown[0].partition("=")[0]
-        near = get_close_matches(word, self._option_string_actions, 1)
-        self.error(f"{word} is not known" + (f", {near[0]} is" if near else ""))
+        self.error(f"unknown option {word}" + _meant(word, self._option_string_actions))
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            choices = [str(choice) for choice in action.choices]
+            name = action.metavar or "/".join(action.option_strings) or action.dest
+            kind = "unknown command" if name == "COMMAND" else f"{name}: unknown value"
+            hint = _meant(str(value), choices) or f" (one of {', '.join(choices)})"
+            raise argparse.ArgumentError(None, f"{kind} {value!r}{hint}")
+
+
+def _meant(word: str, known: Iterable[str]) -> str:
+    near = get_close_matches(word, list(known), 1)
+    return f" (did you mean {near[0]}?)" if near else ""
 
 
 class _Help(argparse.HelpFormatter):
@@ -109,13 +124,14 @@ def make_parser(kind: type[Parser] = Parser) -> Parser:
     """Return the parser of the whole command line, of a kind that may deal with errors its way."""
     parser = kind(
         prog="tofuse",
-        description="Turn recordings of Time-of-Flight cameras into one 3D model and the "
-        "camera's trajectory, and say how far the result can be trusted.",
-        epilog="To begin: `tofuse demo`. `tofuse COMMAND --help` tells more of each.",
+        description="Reconstruct a 3D model and the camera trajectory from recordings of "
+        "Time-of-Flight cameras, and state how accurate they are.",
+        epilog="Start with `tofuse demo`. `tofuse COMMAND --help` describes each command.",
         formatter_class=_Help,
     )
     parser.add_argument("--version", action="version", version=f"tofuse {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    parser.set_defaults(parser=parser)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _run(commands)
     _batch(commands)
     _register(commands)
@@ -167,54 +183,54 @@ def _run(commands: Any) -> None:
     p = _command(commands, "run", "reconstruct a recording", epilog=_EXIT)
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the result")
-    p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
     p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     p.add_argument(
         "--into",
         type=Path,
         metavar="RESULT",
-        help="an earlier result that becomes a map of both, if they overlap (see `tofuse merge`)",
+        help="merge the recording into the map of an existing result, if they overlap",
     )
     p.add_argument(
-        "--texture", action="store_true", help="a texture on the surface, in mesh.glb and mesh.obj"
+        "--texture", action="store_true", help="texture the surface, in mesh.glb and mesh.obj"
     )
     p.add_argument(
-        "--faces", type=_count, metavar="N", help="at most so many triangles (default: all)"
+        "--faces", type=_count, metavar="N", help="maximum number of triangles (default: all)"
     )
     p.add_argument(
         "--voxel",
         type=_length,
         metavar="LENGTH",
-        help="resolution of the model, as 5mm (default: what the camera resolves)",
+        help="resolution of the model, e.g. 5mm (default: from the camera's resolution)",
     )
     p.add_argument(
         "--rig",
         type=Path,
         metavar="FILE",
-        help="a rig.json: each INPUT is one camera of it, in its order",
+        help="a rig.json; each INPUT is one of its cameras, in the same order",
     )
     _processing(p)
-    g = p.add_argument_group("watch it in the browser")
+    g = p.add_argument_group("live view in the browser")
     g.add_argument(
-        "--view", action="store_true", help="show the model while it grows, and then the result"
+        "--view", action="store_true", help="show the reconstruction live, and then the result"
     )
     _page(g)
-    g = p.add_argument_group("what to read")
+    g = p.add_argument_group("input")
     _source(g)
     _selection(g)
     g.add_argument(
         "--average-still",
         action="store_true",
-        help="make one better frame of each stretch in which nothing moves",
+        help="average static stretches into one frame each",
     )
-    g.add_argument("--min-depth", type=_metres, metavar="M", help="drop points nearer than this")
-    g.add_argument("--max-depth", type=_metres, metavar="M", help="drop points beyond this")
+    g.add_argument("--min-depth", type=_metres, metavar="M", help="discard points closer than this")
+    g.add_argument("--max-depth", type=_metres, metavar="M", help="discard points farther than this")
 
 
 def _source(p: Any) -> None:
-    p.add_argument("--format", metavar="F", help="format of INPUT, if it can't be guessed")
-    p.add_argument("--camera", type=Path, metavar="FILE", help="a camera.json to use instead")
-    p.add_argument("--topic", metavar="T", help="topic of a bag, if the guess is wrong")
+    p.add_argument("--format", metavar="F", help="input format, if not recognised")
+    p.add_argument("--camera", type=Path, metavar="FILE", help="use this camera.json instead of the recording's")
+    p.add_argument("--topic", metavar="T", help="topic of a ROS bag, if the default is wrong")
 
 
 def _selection(p: Any) -> None:
@@ -224,88 +240,88 @@ def _selection(p: Any) -> None:
 
 
 def _processing(p: argparse.ArgumentParser) -> None:
-    g = p.add_argument_group("how to reconstruct")
+    g = p.add_argument_group("reconstruction")
     g.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
     g.add_argument(
-        "--config", type=Path, metavar="FILE", help="options from a .toml, or an earlier run.json"
+        "--config", type=Path, metavar="FILE", help="options from a .toml file, or from the run.json of an earlier result"
     )
     g.add_argument(
         "--guess",
         choices=("identity", "previous", "odometry"),
-        help="where each registration starts",
+        help="initial guess of each registration",
     )
     g.add_argument(
         "--prior",
         choices=("auto", "none", "device"),
         default="auto",
-        help="what counts beside the images, as far as it agrees with them: gravity and a phone's "
-        "own poses (auto, the default), nothing (none), or also odometry (device)",
+        help="priors beside the images, as far as they agree with them: gravity and a phone's "
+        "own poses (auto, the default), none, or odometry as well (device)",
     )
     g.add_argument(
-        "--loops", type=Path, metavar="FILE", help="loops known beforehand, one `i j` a line"
+        "--loops", type=Path, metavar="FILE", help="known loop closures, one `i j` per line"
     )
     g.add_argument(
         "--object",
         action="store_true",
-        help="a turned object before a still background, which is learnt unless cut off",
+        help="turntable mode: an object turns in front of a static camera",
     )
     g.add_argument(
         "--unwrap",
         action="store_true",
-        help="bring back what lies beyond the range after which the camera's phase repeats",
+        help="unwrap phase beyond the camera's ambiguity range",
     )
     g.add_argument(
         "--tolerance",
         type=_length,
         metavar="LENGTH",
-        help='accuracy of a "good" result, as 30mm (0.5 %% of the model, at least 10mm)',
+        help='accuracy required of a "good" result, e.g. 30mm (0.5 %% of the model, at least 10mm)',
     )
     _seed(g)
     g.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
 
 
 def _seed(p: Any) -> None:
-    p.add_argument("--seed", type=_seed_number, metavar="N", help="seed of all randomness (0)")
+    p.add_argument("--seed", type=_seed_number, metavar="N", help="random seed (0)")
 
 
 def _batch(commands: Any) -> None:
     p = _command(
-        commands, "batch", "reconstruct many recordings, as jobs of their own", epilog=_EXIT_BATCH
+        commands, "batch", "reconstruct many recordings, each as a separate job", epilog=_EXIT_BATCH
     )
-    p.add_argument("list", type=Path, metavar="LIST", help="which recordings, and their options")
+    p.add_argument("list", type=Path, metavar="LIST", help="the recordings, with their options")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the results")
     p.add_argument(
         "--overwrite",
         action="store_true",
-        help="replace results of other options; those of the same are kept all the same",
+        help="replace results made with other options; up-to-date results are kept",
     )
     p.add_argument("--json", action="store_true", help="jobs and outcome as JSON lines")
-    p.add_argument("--only", action="append", metavar="NAME", help="this job; may be repeated")
+    p.add_argument("--only", action="append", metavar="NAME", help="run only this job; may be repeated")
     p.add_argument(
-        "--print-jobs", action="store_true", help="do nothing but print a command for each job"
+        "--print-jobs", action="store_true", help="only print one command per job"
     )
-    g = p.add_argument_group("who works")
+    g = p.add_argument_group("workers")
     who = g.add_mutually_exclusive_group()
     who.add_argument(
-        "--workers", type=_count, metavar="N", help="jobs at a time, on this machine (1)"
+        "--workers", type=_count, metavar="N", help="parallel jobs on this machine (1)"
     )
     who.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a Dask cluster: tcp://HOST:8786, or its file"
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://HOST:8786, or its scheduler file"
     )
     g.add_argument(
         "--threads",
         type=_count,
         metavar="N",
-        help="threads of each job (this machine: all cores, shared by the jobs; Dask: 1)",
+        help="threads per job (default: all cores shared by the jobs; on Dask: 1)",
     )
     g.add_argument(
-        "--memory", type=_bytes, metavar="SIZE", help="what a job needs, as 4GB (not limited)"
+        "--memory", type=_bytes, metavar="SIZE", help="memory per job, e.g. 4GB (not limited)"
     )
     g.add_argument(
         "--retries",
         type=_seed_number,
         metavar="N",
-        help="begin a job again so often whose process was killed (3)",
+        help="how often a job whose process was killed is restarted (3)",
     )
 
 
@@ -313,16 +329,16 @@ def _register(commands: Any) -> None:
     p = _command(
         commands, "register", "register two files or frames", epilog=_VIEWS + _EXIT_REGISTER
     )
-    p.add_argument("source", metavar="SOURCE", help="the view that is moved")
-    p.add_argument("target", metavar="TARGET", help="the view that stays")
+    p.add_argument("source", metavar="SOURCE", help="the view to be transformed")
+    p.add_argument("target", metavar="TARGET", help="the view that stays fixed")
     p.add_argument(
-        "--guess", type=Path, metavar="FILE", help="T_target_source to start from (none)"
+        "--guess", type=Path, metavar="FILE", help="initial guess of T_target_source (none)"
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the result (none)")
-    p.add_argument("--overwrite", action="store_true", help="replace an earlier one in --out")
-    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing one in --out")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
-    g = p.add_argument_group("what to read")
+    g = p.add_argument_group("input")
     _source(g)
 
 
@@ -330,27 +346,27 @@ def _judge(commands: Any) -> None:
     p = _command(
         commands,
         "judge",
-        "say how accurate poses from anywhere are, without a reference",
+        "assess poses from any source, without a reference",
         epilog="exit status: 0, judged; 3, the depth images contradict the poses; 2, bad input",
     )
-    p.add_argument("recording", metavar="RECORDING", help="images of a depth camera")
+    p.add_argument("recording", metavar="RECORDING", help="range images")
     p.add_argument(
         "trajectory",
         type=Path,
         metavar="TRAJECTORY",
-        help="a trajectory of any known format, or a result",
+        help="a trajectory in any supported format, or a result",
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the refined result (none)")
-    p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
-    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
     p.add_argument(
         "--tolerance",
         type=_length,
         metavar="LENGTH",
-        help="accuracy of good poses, as 30mm (0.5 %% of the model, at least 10mm)",
+        help="accuracy required of good poses, e.g. 30mm (0.5 %% of the model, at least 10mm)",
     )
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
-    g = p.add_argument_group("what to read")
+    g = p.add_argument_group("input")
     _source(g)
     _selection(g)
 
@@ -359,7 +375,7 @@ def _merge(commands: Any) -> None:
     p = _command(
         commands,
         "merge",
-        "put the results of several recordings into one map",
+        "merge the results of several recordings into one map",
         epilog=_SESSIONS + _EXIT_MERGE,
     )
     p.add_argument(
@@ -367,22 +383,22 @@ def _merge(commands: Any) -> None:
         nargs="+",
         type=Path,
         metavar="RESULT",
-        help="two or more; the world is the first one's",
+        help="two or more results; the first one defines the world frame",
     )
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the map")
-    p.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
     p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     p.add_argument(
         "--tolerance",
         type=_length,
         metavar="LENGTH",
-        help='accuracy of a "good" map, as 30mm (default: that of the first result)',
+        help='accuracy required of a "good" map, e.g. 30mm (default: as the first result)',
     )
     p.add_argument(
-        "--faces", type=_count, metavar="N", help="at most so many triangles (as the first result)"
+        "--faces", type=_count, metavar="N", help="maximum number of triangles (default: as the first result)"
     )
     p.add_argument(
-        "--voxel", type=_length, metavar="LENGTH", help="resolution of the model, as 5mm (likewise)"
+        "--voxel", type=_length, metavar="LENGTH", help="resolution of the model, e.g. 5mm (default: as the first result)"
     )
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
@@ -391,35 +407,35 @@ def _merge(commands: Any) -> None:
 def _rig(commands: Any) -> None:
     p = commands.add_parser(
         "rig",
-        help="calibrate a rig of several cameras, or check one",
-        description="Several depth cameras that are fixed to each other.",
+        help="calibrate or check a rig of several cameras",
+        description="Several rigidly mounted depth cameras.",
         formatter_class=_Help,
     )
     p.set_defaults(parser=p)
-    commands = p.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    commands = p.add_subparsers(title="commands", metavar="COMMAND")
     p = _command(
         commands,
         "calibrate",
-        "say where the cameras of a rig are",
-        epilog="Give one recording of each camera, of the same time: one image each, images of a "
-        "scene in\nwhich something moves, or a walk with the rig. The first camera is the rig's "
-        "frame.\n\n" + _EXIT_CALIBRATE,
+        "estimate the extrinsics of a rig",
+        epilog="Pass one recording per camera, taken at the same time: a single image each, images "
+        "of a\nscene in which something moves, or a walk with the rig. The first camera defines "
+        "the rig frame.\n\n" + _EXIT_CALIBRATE,
         function="rig_calibrate",
     )
-    p.add_argument("inputs", nargs="+", metavar="RECORDING", help="one for each camera")
+    p.add_argument("inputs", nargs="+", metavar="RECORDING", help="one per camera")
     p.add_argument("--out", required=True, type=Path, metavar="FILE", help="the rig.json to write")
-    p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
     _rig_options(p)
     p = _command(
         commands,
         "check",
-        "say whether a camera of a rig was moved since it was calibrated",
+        "check whether a camera has moved since the rig was calibrated",
         epilog=_EXIT_CHECK,
         function="rig_check",
     )
     p.add_argument("rig", type=Path, metavar="RIG", help="a rig.json")
     p.add_argument(
-        "inputs", nargs="+", metavar="RECORDING", help="new ones of its cameras, in its order"
+        "inputs", nargs="+", metavar="RECORDING", help="new recordings of its cameras, in the same order"
     )
     _rig_options(p)
 
@@ -429,11 +445,11 @@ def _rig_options(p: argparse.ArgumentParser) -> None:
         "--motion",
         choices=("auto", "still", "moving"),
         default="auto",
-        help="whether the cameras stood still (default: as their images say)",
+        help="whether the cameras are static (default: detected from the images)",
     )
-    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
-    p.add_argument("--format", metavar="F", help="format of the recordings, if not guessed")
+    p.add_argument("--format", metavar="F", help="input format, if not recognised")
 
 
 def _demo(commands: Any) -> None:
@@ -449,9 +465,9 @@ def _demo(commands: Any) -> None:
         type=Path,
         default=Path("tofuse-demo"),
         metavar="DIR",
-        help="folder for it (tofuse-demo)",
+        help="output folder (tofuse-demo)",
     )
-    p.add_argument("--overwrite", action="store_true", help="replace an earlier demo in DIR")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing demo in DIR")
     p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
     p.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
     _seed(p)
@@ -459,75 +475,75 @@ def _demo(commands: Any) -> None:
 
 
 def _simulate(commands: Any) -> None:
-    p = _command(commands, "simulate", "make a recording with a simulated camera")
+    p = _command(commands, "simulate", "simulate a recording")
     p.add_argument("scene", metavar="SCENE", help=", ".join(DEMO_SCENES))
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for it")
-    p.add_argument("--camera", default="sr4000", metavar="NAME", help="which camera (sr4000)")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="output folder")
+    p.add_argument("--camera", default="sr4000", metavar="NAME", help="camera model (sr4000)")
     p.add_argument("--every", type=_count, metavar="N", help="stride (default: the thesis's)")
     p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
-    p.add_argument("--first", type=_seed_number, metavar="K", help="raw frame to begin with (0)")
-    p.add_argument("--uniform", action="store_true", help="one albedo everywhere, no texture")
+    p.add_argument("--first", type=_seed_number, metavar="K", help="first raw frame (0)")
+    p.add_argument("--uniform", action="store_true", help="uniform albedo, no texture")
     passing = p.add_mutually_exclusive_group()
     for kind, does in (("person", "walks"), ("box", "slides")):
         passing.add_argument(
             f"--with-{kind}",
             type=_ratio,
             metavar="RATIO",
-            help=f"a {kind} {does} through the view and covers this part of it, 0 to 1",
+            help=f"a {kind} {does} through the view, covering this fraction of it, 0 to 1",
         )
     p.add_argument(
         "--without",
         default="",
         metavar="EFFECTS",
-        help="errors to switch off, separated by commas (or: all)",
+        help="sensor errors to disable, separated by commas, or `all`",
     )
     p.add_argument(
-        "--no-correction", action="store_true", help="leave out the factory's depth correction"
+        "--no-correction", action="store_true", help="omit the factory depth correction"
     )
-    p.add_argument("--imu", action="store_true", help="an accelerometer on the camera as well")
-    p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the peaks scene (0.05)")
+    p.add_argument("--imu", action="store_true", help="simulate an accelerometer as well")
+    p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the `peaks` scene (0.05)")
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
 
 
 def _inspect(commands: Any) -> None:
-    p = _command(commands, "inspect", "say what a recording is, and what is wrong with it")
+    p = _command(commands, "inspect", "show a recording's properties and check it for faults")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     _source(p)
     p.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet of the frames")
-    p.add_argument("--object", action="store_true", help="an object turns before a still camera")
-    p.add_argument("--quick", action="store_true", help="only what a run does at its start")
-    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--object", action="store_true", help="an object turns in front of a static camera")
+    p.add_argument("--quick", action="store_true", help="only the checks that `tofuse run` makes at its start")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def _convert(commands: Any) -> None:
     p = _command(commands, "convert", "write any recording as a native, TUM or Open3D folder")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder for it")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder")
     p.add_argument(
         "--to",
         choices=("native", "tum", "open3d"),
         default="native",
-        help="layout of the folder (native; the others lose what they have no place for)",
+        help="layout of the folder (native; the others cannot store everything)",
     )
     _source(p)
     _selection(p)
 
 
 def _record(commands: Any) -> None:
-    p = _command(commands, "record", "record from a camera that is plugged in")
+    p = _command(commands, "record", "record from a connected camera")
     p.add_argument(
-        "device", nargs="?", metavar="CAMERA", help="which; without, those that can be used"
+        "device", nargs="?", metavar="CAMERA", help="camera name; omit to list available cameras"
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="a new folder for the recording")
     p.add_argument("--seconds", type=_seconds, metavar="S", help="stop after this time")
-    p.add_argument("--frames", type=_count, metavar="N", help="stop after so many frames")
+    p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
     p.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="an option of the camera, such as serial=1234; may be repeated",
+        help="camera option, e.g. serial=1234; may be repeated",
     )
 
 
@@ -535,38 +551,38 @@ def _calibrate(commands: Any) -> None:
     p = _command(
         commands,
         "calibrate",
-        "estimate a camera's lens or the errors of its depth, or import a lens",
+        "estimate intrinsics or depth errors of a camera, or import intrinsics",
         epilog="lens: from views of a checkerboard, writes a camera.json.\n"
         "depth: from views of planes, writes a correction.npz.\n"
         "import: from a file of Bouguet's toolbox, CalLab, OpenCV or ROS, writes a camera.json.\n",
     )
-    p.add_argument("subject", choices=("lens", "depth", "import"), help="what to do")
+    p.add_argument("subject", choices=("lens", "depth", "import"), help="what to calibrate")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings; import: one file")
     p.add_argument("--out", type=Path, metavar="FILE", help="write the result")
-    p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
-    p.add_argument("--json", action="store_true", help="what was found, as JSON")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
     g = p.add_argument_group("lens and depth")
     g.add_argument(
-        "--board", metavar="CxR:M", help="inner corners and metres of a square, such as 8x6:0.1"
+        "--board", metavar="CxR:M", help="inner corners and square size in metres, e.g. 8x6:0.1"
     )
     g.add_argument(
         "--image",
         choices=("amplitude", "color"),
         default="amplitude",
-        help="where the board is looked for (amplitude)",
+        help="image in which to detect the board (amplitude)",
     )
     _source(g)
     _selection(g)
     g = p.add_argument_group("depth")
     g.add_argument(
-        "--wall", action="store_true", help="the board lies flat on a wall, all of which is used"
+        "--wall", action="store_true", help="the board is flat on a wall; use the whole wall"
     )
     g.add_argument(
         "--planes",
         type=_count,
         default=4,
         metavar="N",
-        help="without --board: planes of each view at most (4)",
+        help="without --board: maximum planes per view (4)",
     )
     _seed(g)
     g = p.add_argument_group("lens")
@@ -574,21 +590,21 @@ def _calibrate(commands: Any) -> None:
         "--model",
         choices=("pinhole", "brown", "rational", "fisheye"),
         default="brown",
-        help="kind of lens (brown)",
+        help="distortion model (brown)",
     )
     g = p.add_argument_group("import")
-    g.add_argument("--recording", metavar="REC", help="keep depth unit and kind of this recording")
-    g.add_argument("--index", type=_whole, metavar="N", help="which camera of a CalLab file")
+    g.add_argument("--recording", metavar="REC", help="take depth unit and kind from this recording")
+    g.add_argument("--index", type=_whole, metavar="N", help="camera index in a CalLab file")
 
 
 def _noise(commands: Any) -> None:
-    p = _command(commands, "noise", "estimate a camera's noise from a recording that stands still")
+    p = _command(commands, "noise", "estimate a camera's noise from a static recording")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
-    p.add_argument("--out", type=Path, metavar="FILE", help="write the model, e.g. noise.json")
-    p.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
-    p.add_argument("--name", metavar="NAME", help="what to call the camera")
+    p.add_argument("--out", type=Path, metavar="FILE", help="write the noise model, e.g. noise.json")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
+    p.add_argument("--name", metavar="NAME", help="name of the camera")
     _source(p)
-    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def _evaluate(commands: Any) -> None:
@@ -601,15 +617,15 @@ def _evaluate(commands: Any) -> None:
         help="a trajectory, or a recording that comes with reference poses",
     )
     p.add_argument(
-        "--recording", type=Path, metavar="REC", help="also measure how well its images agree"
+        "--recording", type=Path, metavar="REC", help="also measure the map consistency of its images"
     )
     p.add_argument(
         "--reference-error",
         type=_length,
         metavar="LENGTH",
-        help="how far off the reference itself may be (rms), as 20mm: gives an interval of the ATE",
+        help="rms error of the reference itself, e.g. 20mm; prints an interval for the ATE",
     )
-    p.add_argument("--json", action="store_true", help="as JSON")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def _optimize(commands: Any) -> None:
@@ -617,26 +633,26 @@ def _optimize(commands: Any) -> None:
     p.add_argument("input", type=Path, metavar="IN.g2o")
     p.add_argument("--out", required=True, type=Path, metavar="OUT.g2o")
     p.add_argument(
-        "--optimiser", metavar="NAME", help="how (default: levenberg-marquardt; castellani, ...)"
+        "--optimiser", metavar="NAME", help="method (default: levenberg-marquardt; castellani, ...)"
     )
-    p.add_argument("--overwrite", action="store_true", help="replace OUT.g2o if it is there")
+    p.add_argument("--overwrite", action="store_true", help="replace an existing OUT.g2o")
 
 
 def _export(commands: Any) -> None:
     p = _command(commands, "export", "write a result in other formats")
-    p.add_argument("result", type=Path, metavar="DIR", help="the --out of `tofuse run`")
+    p.add_argument("result", type=Path, metavar="DIR", help="a result: the --out of `tofuse run`")
     p.add_argument("formats", nargs="+", metavar="FORMAT", help=", ".join(EXPORTS))
     p.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the files (beside the result)"
+        "--out", type=Path, metavar="DIR", help="folder for the files (default: that of the result)"
     )
-    p.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    p.add_argument("--overwrite", action="store_true", help="replace existing files")
 
 
 def _experiments(commands: Any) -> None:
-    p = _command(commands, "experiments", "run chapters 4 and 5 of the thesis again")
-    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the page")
-    p.add_argument("--overwrite", action="store_true", help="replace earlier experiments in DIR")
-    p.add_argument("--cases", default="", metavar="NAMES", help="only these, separated by commas")
+    p = _command(commands, "experiments", "reproduce the experiments of the 2010 thesis")
+    p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the report")
+    p.add_argument("--overwrite", action="store_true", help="replace existing experiments in DIR")
+    p.add_argument("--cases", default="", metavar="NAMES", help="run only these, separated by commas")
     p.add_argument("--seeds", type=_count, default=20, metavar="N", help="noise seeds (20)")
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
@@ -644,12 +660,12 @@ def _experiments(commands: Any) -> None:
 
 def _view(commands: Any) -> None:
     p = _command(commands, "view", "show a result in the browser")
-    p.add_argument("result", type=Path, metavar="DIR", help="the --out of `tofuse run`")
+    p.add_argument("result", type=Path, metavar="DIR", help="a result: the --out of `tofuse run`")
     _page(p)
 
 
 def _page(p: Any) -> None:
-    p.add_argument("--port", type=_port, metavar="N", help="port of the page (8080 or the next)")
+    p.add_argument("--port", type=_port, metavar="N", help="port (8080, or the next free one)")
     p.add_argument("--no-open", action="store_true", help="do not open the browser")
 
 

@@ -436,8 +436,8 @@ class BackEnd:
         if not names:
             return ()
         text = (
-            f"Left out: the correction {' and '.join(names)}. Overlapping views do not clearly "
-            "show the error that it takes off."
+            f"Correction not applied: {' and '.join(names)}. Overlapping views do not clearly show "
+            "the error that it compensates."
         )
         return (Reason("correction_left_out", self._everything, text),)
 

@@ -96,7 +96,7 @@ def _tried(config: Config, item: Correction, recording: Recording, progress: Pro
         found = trial(recording, *ways)
         after = item.tried(found.helps, found.strength, found.error)
         if after.left_out:
-            progress.note(f"the correction {name_of(item)} is left out: {found.in_words()}")
+            progress.note(f"correction {name_of(item)} not applied: {found.in_words()}")
     else:
         after = item.tried(helps=True)
     kept = tuple(after if c is item else c for c in config.corrections)

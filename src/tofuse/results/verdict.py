@@ -35,7 +35,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "loop_gap": ("degraded", "Odometry drifted far before a loop was closed."),
     "optimiser_gave_up": ("degraded", "The optimiser stopped before it converged."),
     "self_calibrated": ("note", "The calibration of the camera was corrected by its own views."),
-    "correction_left_out": ("note", "A correction was left out, as views do not show its error."),
+    "correction_left_out": ("note", "A correction was not applied, as views do not show its error."),
     "moving_objects": ("note", "Objects move in front of the camera; they are excluded."),
     "not_improved": ("note", "The optimiser did not improve on the initial poses."),
     "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
@@ -49,7 +49,7 @@ REASONS: dict[str, tuple[str, str]] = {
 
 # What a person can do about each reason, where there is something to do.
 ADVICE: dict[str, str] = {
-    "rig_changed": "Calibrate the rig anew: tofuse rig calibrate.",
+    "rig_changed": "Recalibrate the rig: tofuse rig calibrate.",
     "few_poses": "Record again with smaller steps between frames, or use every frame.",
     "images_disagree": "Look at the model from above: walls that appear twice show where it broke.",
     "lost_frames": "Move more slowly there, and keep corners and furniture in view.",
@@ -68,7 +68,7 @@ ADVICE: dict[str, str] = {
     "unobserved_motion": "Keep corners, furniture or texture in view there.",
     "unchecked_drift": "Come back to where you started, so that a loop can check the path.",
     "loop_gap": "Distances across the loop may be stretched; check one that you know.",
-    "optimiser_gave_up": "Give the optimiser more iterations.",
+    "optimiser_gave_up": "Allow the optimiser more iterations.",
 }
 
 _GRAVITY = {"failed": 0, "degraded": 1, "note": 2}
