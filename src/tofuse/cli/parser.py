@@ -224,12 +224,19 @@ def _run(commands: Any) -> None:
         help="average static stretches into one frame each",
     )
     g.add_argument("--min-depth", type=_metres, metavar="M", help="discard points closer than this")
-    g.add_argument("--max-depth", type=_metres, metavar="M", help="discard points farther than this")
+    g.add_argument(
+        "--max-depth", type=_metres, metavar="M", help="discard points farther than this"
+    )
 
 
 def _source(p: Any) -> None:
     p.add_argument("--format", metavar="F", help="input format, if not recognised")
-    p.add_argument("--camera", type=Path, metavar="FILE", help="use this camera.json instead of the recording's")
+    p.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="use this camera.json instead of the recording's",
+    )
     p.add_argument("--topic", metavar="T", help="topic of a ROS bag, if the default is wrong")
 
 
@@ -243,7 +250,10 @@ def _processing(p: argparse.ArgumentParser) -> None:
     g = p.add_argument_group("reconstruction")
     g.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
     g.add_argument(
-        "--config", type=Path, metavar="FILE", help="options from a .toml file, or from the run.json of an earlier result"
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="options from a .toml file, or from the run.json of an earlier result",
     )
     g.add_argument(
         "--guess",
@@ -296,17 +306,19 @@ def _batch(commands: Any) -> None:
         help="replace results made with other options; up-to-date results are kept",
     )
     p.add_argument("--json", action="store_true", help="jobs and outcome as JSON lines")
-    p.add_argument("--only", action="append", metavar="NAME", help="run only this job; may be repeated")
     p.add_argument(
-        "--print-jobs", action="store_true", help="only print one command per job"
+        "--only", action="append", metavar="NAME", help="run only this job; may be repeated"
     )
+    p.add_argument("--print-jobs", action="store_true", help="only print one command per job")
     g = p.add_argument_group("workers")
     who = g.add_mutually_exclusive_group()
     who.add_argument(
         "--workers", type=_count, metavar="N", help="parallel jobs on this machine (1)"
     )
     who.add_argument(
-        "--scheduler", metavar="ADDRESS", help="Dask scheduler: tcp://HOST:8786, or its scheduler file"
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Dask scheduler: tcp://HOST:8786, or its scheduler file",
     )
     g.add_argument(
         "--threads",
@@ -395,10 +407,16 @@ def _merge(commands: Any) -> None:
         help='accuracy required of a "good" map, e.g. 30mm (default: as the first result)',
     )
     p.add_argument(
-        "--faces", type=_count, metavar="N", help="maximum number of triangles (default: as the first result)"
+        "--faces",
+        type=_count,
+        metavar="N",
+        help="maximum number of triangles (default: as the first result)",
     )
     p.add_argument(
-        "--voxel", type=_length, metavar="LENGTH", help="resolution of the model, e.g. 5mm (default: as the first result)"
+        "--voxel",
+        type=_length,
+        metavar="LENGTH",
+        help="resolution of the model, e.g. 5mm (default: as the first result)",
     )
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
@@ -435,7 +453,10 @@ def _rig(commands: Any) -> None:
     )
     p.add_argument("rig", type=Path, metavar="RIG", help="a rig.json")
     p.add_argument(
-        "inputs", nargs="+", metavar="RECORDING", help="new recordings of its cameras, in the same order"
+        "inputs",
+        nargs="+",
+        metavar="RECORDING",
+        help="new recordings of its cameras, in the same order",
     )
     _rig_options(p)
 
@@ -497,9 +518,7 @@ def _simulate(commands: Any) -> None:
         metavar="EFFECTS",
         help="sensor errors to disable, separated by commas, or `all`",
     )
-    p.add_argument(
-        "--no-correction", action="store_true", help="omit the factory depth correction"
-    )
+    p.add_argument("--no-correction", action="store_true", help="omit the factory depth correction")
     p.add_argument("--imu", action="store_true", help="simulate an accelerometer as well")
     p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the `peaks` scene (0.05)")
     _seed(p)
@@ -511,8 +530,12 @@ def _inspect(commands: Any) -> None:
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     _source(p)
     p.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet of the frames")
-    p.add_argument("--object", action="store_true", help="an object turns in front of a static camera")
-    p.add_argument("--quick", action="store_true", help="only the checks that `tofuse run` makes at its start")
+    p.add_argument(
+        "--object", action="store_true", help="an object turns in front of a static camera"
+    )
+    p.add_argument(
+        "--quick", action="store_true", help="only the checks that `tofuse run` makes at its start"
+    )
     p.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -593,14 +616,18 @@ def _calibrate(commands: Any) -> None:
         help="distortion model (brown)",
     )
     g = p.add_argument_group("import")
-    g.add_argument("--recording", metavar="REC", help="take depth unit and kind from this recording")
+    g.add_argument(
+        "--recording", metavar="REC", help="take depth unit and kind from this recording"
+    )
     g.add_argument("--index", type=_whole, metavar="N", help="camera index in a CalLab file")
 
 
 def _noise(commands: Any) -> None:
     p = _command(commands, "noise", "estimate a camera's noise from a static recording")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
-    p.add_argument("--out", type=Path, metavar="FILE", help="write the noise model, e.g. noise.json")
+    p.add_argument(
+        "--out", type=Path, metavar="FILE", help="write the noise model, e.g. noise.json"
+    )
     p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
     p.add_argument("--name", metavar="NAME", help="name of the camera")
     _source(p)
@@ -617,7 +644,10 @@ def _evaluate(commands: Any) -> None:
         help="a trajectory, or a recording that comes with reference poses",
     )
     p.add_argument(
-        "--recording", type=Path, metavar="REC", help="also measure the map consistency of its images"
+        "--recording",
+        type=Path,
+        metavar="REC",
+        help="also measure the map consistency of its images",
     )
     p.add_argument(
         "--reference-error",
@@ -652,7 +682,9 @@ def _experiments(commands: Any) -> None:
     p = _command(commands, "experiments", "reproduce the experiments of the 2010 thesis")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the report")
     p.add_argument("--overwrite", action="store_true", help="replace existing experiments in DIR")
-    p.add_argument("--cases", default="", metavar="NAMES", help="run only these, separated by commas")
+    p.add_argument(
+        "--cases", default="", metavar="NAMES", help="run only these, separated by commas"
+    )
     p.add_argument("--seeds", type=_count, default=20, metavar="N", help="noise seeds (20)")
     _seed(p)
     p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")

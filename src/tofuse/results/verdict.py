@@ -35,7 +35,10 @@ REASONS: dict[str, tuple[str, str]] = {
     "loop_gap": ("degraded", "Odometry drifted far before a loop was closed."),
     "optimiser_gave_up": ("degraded", "The optimiser stopped before it converged."),
     "self_calibrated": ("note", "The calibration of the camera was corrected by its own views."),
-    "correction_left_out": ("note", "A correction was not applied, as views do not show its error."),
+    "correction_left_out": (
+        "note",
+        "A correction was not applied, as views do not show its error.",
+    ),
     "moving_objects": ("note", "Objects move in front of the camera; they are excluded."),
     "not_improved": ("note", "The optimiser did not improve on the initial poses."),
     "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
