@@ -420,3 +420,64 @@ def test_documents_are_small_enough_to_clone() -> None:
     ).stdout.split()
     for name in tracked:
         assert (ROOT / name).stat().st_size < 200_000, name
+
+
+def test_troubleshooting_explains_every_reason() -> None:
+    explained = re.findall(r"^### (.+)$", text_of("docs/troubleshooting.md"), re.MULTILINE)
+    assert sorted(explained) == sorted(REASONS)
+
+
+def test_troubleshooting_sorts_reasons_by_their_verdict() -> None:
+    parts_of = re.split(r"^## +", text_of("docs/troubleshooting.md"), flags=re.MULTILINE)
+    below = {part.split("\n", 1)[0]: part for part in parts_of}
+    headings = {
+        "failed": "The result failed",
+        "degraded": "The result is degraded",
+        "note": "Notes",
+    }
+    for code, (verdict, _) in REASONS.items():
+        assert f"### {code}\n" in below[headings[verdict]]
+
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+def run_notebook(path: Path) -> dict[str, Any]:
+    """Run the code cells of a notebook, one after the other; the last line of a cell is shown."""
+    names: dict[str, Any] = {}
+    for k, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
+        if cell["cell_type"] == "code":
+            assert not cell["outputs"], "outputs of notebooks are not kept: they go stale"
+            code = compile("".join(cell["source"]), f"{path.name}, cell {k}", "exec")
+            exec(code, names)
+    return names
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run(
+    path: Path, room_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(room_recording, tmp_path / "scan")
+    monkeypatch.chdir(tmp_path)
+    names = run_notebook(path)
+    assert len(names["recording"]) > 1
+
+
+def test_the_notebook_on_phones_runs_on_a_phone_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_data: Path
+) -> None:
+    scan = shared_data / "iphone_record3d"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TOFUSE_SCAN", str(scan))
+    names = run_notebook(ROOT / "docs" / "notebooks" / "phone_scan.ipynb")
+    assert (tmp_path / "scan.glb").stat().st_size > 10_000
+    assert np.isfinite(names["result"].trajectory).all()
+
+
+def test_the_notebook_on_judging_tells_drift_from_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_notebook(ROOT / "docs" / "notebooks" / "judging_poses.ipynb")
+    moved = {k: float(np.nanmax(j.displacement_m)) for k, j in names["judgements"].items()}
+    assert moved["drifted"] > 0.03 > moved["true"]
