@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from scipy.special import stdtrit
 from tofuse.errors import UnreadableFrameError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
+from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.registration.projective import (
@@ -88,25 +90,30 @@ class Trial:
     explained, predicted
         Of each run: the product of the disagreement that is there with the predicted one, and the
         square of the predicted one, each as a weighted mean. Their ratio is the run's strength.
+        Runs differ by more than noise, and one with bad poses may be far off, so their strengths
+        are pooled by a robust random-effects model (`pooling`).
     """
 
     explained: tuple[float, ...]
     predicted: tuple[float, ...]
 
+    @cached_property
+    def _pooled(self) -> tuple[float, float]:
+        """Strength and standard error of all runs together."""
+        if len(self.predicted) < _LEAST_RUNS:
+            return float("nan"), float("inf")
+        predicted = np.array(self.predicted)
+        return pooled(np.array(self.explained) / predicted, predicted)
+
     @property
     def strength(self) -> float:
-        """Share of the predicted disagreement that is there; NaN where nothing is predicted."""
-        total = sum(self.predicted)
-        return sum(self.explained) / total if total > 0 else float("nan")
+        """Share of the predicted disagreement that is there; NaN where too few runs tell."""
+        return self._pooled[0]
 
     @property
     def error(self) -> float:
         """Standard error of the strength, from how much the runs differ."""
-        n, total = len(self.predicted), sum(self.predicted)
-        if n < 2 or not total > 0:
-            return float("inf")
-        left = np.array(self.explained) - self.strength * np.array(self.predicted)
-        return float(np.sqrt((left @ left) * n / (n - 1)) / total)
+        return self._pooled[1]
 
     @property
     def relative_error(self) -> float:
