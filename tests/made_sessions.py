@@ -18,7 +18,8 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.opening import Opening
 from tofuse.registration.search import SearchOptions
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import write_result
 
 Float64 = NDArray[np.float64]
 

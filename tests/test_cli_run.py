@@ -31,7 +31,7 @@ from tofuse.posegraph.g2o import read_g2o
 from tofuse.recordings.convert import convert
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.output import STAGING
+from tofuse.results.folder import STAGING
 from tofuse.results.types import Component, Reason, Reconstruction
 from tofuse.results.verdict import ADVICE, REASONS
 from tofuse.simulation.effects import Effects

@@ -20,7 +20,8 @@ from tofuse.errors import InputError, OutputError
 from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, Stages, digest
 from tofuse.pipeline.config import changed, from_method
-from tofuse.results.output import CHECKPOINT, STAGING, run_json
+from tofuse.results.folder import CHECKPOINT, STAGING
+from tofuse.results.output import run_json
 from tofuse.simulation.record import simulate
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")

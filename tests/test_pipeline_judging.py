@@ -23,7 +23,7 @@ from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.results.output import FILES
+from tofuse.results.folder import FILES
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,8 @@ from tofuse.pipeline.sessions import read_sessions
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.opening import Opening
-from tofuse.results.output import OutputFolder, read_run_json, run_json, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import read_run_json, run_json, write_result
 from tofuse.results.sessions import sentences
 
 TRUE = np.array([*HERE, *THERE])

@@ -11,96 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from made_results import contents, result, torn
 from tofuse.errors import InputError, OutputError
-from tofuse.fusion.cloud import empty_cloud
 from tofuse.pipeline.run import exit_status
-from tofuse.posegraph.graph import PoseGraph
-from tofuse.results.output import (
-    STAGING,
-    OutputFolder,
-    component_number,
-    frames_in_main_model,
-    is_result,
-    plain,
-    read_run_json,
-    run_json,
-    write_result,
-)
-from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
+from tofuse.results.folder import STAGING, OutputFolder, component_number, is_result
+from tofuse.results.output import frames_in_main_model, plain, read_run_json, run_json, write_result
+from tofuse.results.types import FrameRecord
 
 FILES = {"trajectory.txt", "pose_graph.g2o", "cloud.ply", "run.json"}
-
-
-def result(seed=0) -> Reconstruction:
-    trajectory = np.stack([np.eye(4), np.full((4, 4), np.nan)])
-    graph = PoseGraph(
-        np.array([0]),
-        np.eye(4)[None],
-        np.zeros((0, 2), np.intp),
-        np.zeros((0, 4, 4)),
-        np.zeros((0, 6, 6)),
-        np.zeros(0, bool),
-    )
-    frames = (
-        FrameRecord(0, 0.0, "tracked", "", 0.5, None, np.float32(0.25), np.eye(6), np.ones((2, 6))),
-        FrameRecord(1, 0.1, "lost", "no points", 0.0, float("nan"), float("inf")),
-    )
-    diagnostics = Diagnostics(
-        "degraded",
-        (Reason("lost_frames", ((1, 1),), "Frame 1 has no pose."),),
-        frames,
-        (),
-        trajectory,
-        (),
-        {"median": 0.25},
-        {"tracking": 0.123456},
-    )
-    recording = {"path": "/somewhere", "format": "native", "frames": 2, "warnings": ["w"]}
-    return Reconstruction(
-        trajectory,
-        np.array([0.0, 0.1]),
-        graph,
-        empty_cloud(),
-        diagnostics,
-        {"method": "default"},
-        recording,
-        seed,
-        2,
-    )
-
-
-def torn(seed=0, parts=2) -> Reconstruction:
-    """Four frames: one in the main model, one linked to it, one apart and one lost.
-
-    Of the components apart the first has a model of its own, if there are `parts` that do.
-    """
-    whole = result(seed)
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    poses[2:] = np.nan
-    frames = tuple(
-        FrameRecord(k, 0.1 * k, status, component=c)
-        for k, (status, c) in enumerate(
-            (("tracked", 0), ("tracked", 1), ("tracked", 2), ("lost", None))
-        )
-    )
-    T = np.eye(4)
-    T[0, 3] = 0.5
-    components = (
-        Component(((0, 0),), np.eye(4), None),
-        Component(((1, 1),), T, "links"),
-        Component(((2, 2),), None, None, result(seed) if parts > 1 else None),
-    )
-    return replace(
-        whole,
-        trajectory=poses,
-        timestamps=0.1 * np.arange(4),
-        diagnostics=replace(whole.diagnostics, frames=frames, sequential=poses),
-        components=components,
-    )
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_a_new_folder_and_its_parents_are_made(tmp_path) -> None:

@@ -27,7 +27,8 @@ from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.run import Options, run
 from tofuse.recordings.frames import CloudFrame
 from tofuse.report.pictures import draw
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import write_result
 from tofuse.viewer.kept import NAME, read_kept, write_kept
 from tofuse.viewer.measure import picked
 from tofuse.viewer.result import Layer, colorings, painted, read_result

@@ -28,8 +28,9 @@ from tofuse.pipeline.run import write_report_files
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.recording import Recording
 from tofuse.results.card import SEPARATOR, card
+from tofuse.results.folder import OutputFolder
 from tofuse.results.loading import load_result
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.output import write_result
 from tofuse.results.types import Reconstruction
 
 if TYPE_CHECKING:
@@ -73,12 +74,9 @@ class Result(Reconstruction):
         OutputError
             If the folder holds something else, or a result and `overwrite` is not given.
         """
-        out = OutputFolder(folder, overwrite=overwrite)
-        try:
-            with threadpool_limits(1):  # BLAS sums differ with its number of threads
-                write_result(self, out, self._write_report)
-        finally:
-            out.discard()
+        # BLAS sums differ with its number of threads.
+        with OutputFolder(folder, overwrite=overwrite) as out, threadpool_limits(1):
+            write_result(self, out, self._write_report)
         return Path(folder)
 
     def _write_report(self, result: Reconstruction, folder: Path) -> None:

@@ -389,7 +389,8 @@ def demo(arguments: argparse.Namespace) -> int:
 def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     """Say in a few lines what came out."""
     from tofuse.results.card import SEPARATOR, card
-    from tofuse.results.output import accuracy_json, component_name, plain, reasons_json
+    from tofuse.results.folder import component_name
+    from tofuse.results.output import accuracy_json, plain, reasons_json
     from tofuse.results.ranges import in_words
     from tofuse.results.sessions import sentences
 

@@ -20,8 +20,10 @@ from tofuse.experiments import sections
 from tofuse.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
 from tofuse.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
 from tofuse.experiments.statements import Judged, Results, judge_all
+from tofuse.files.moving import Names
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.results.output import OutputFolder, plain
+from tofuse.results.folder import Contract, OutputFolder, json_of
+from tofuse.results.output import plain
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -77,9 +79,8 @@ def run_experiments(
                 f"there is no case {name!r}", where="--cases", remedy=f"use some of {list(NAMES)}"
             )
     chosen = cases or NAMES
-    folder = OutputFolder(out, overwrite=overwrite, marker=_MARKER, ours=is_experiments)
     start = perf_counter()
-    try:
+    with OutputFolder(out, overwrite=overwrite, contract=_CONTRACT) as folder:
         # BLAS sums differ with its number of threads; ours don't.
         with threadpool_limits(1):
             results = _run_all(chosen, seeds, seed, progress, limit, draws)
@@ -94,18 +95,16 @@ def run_experiments(
             (staging / "index.html").write_text(page, encoding="utf-8")
             text = json.dumps(plain(data), indent=1, allow_nan=False)
             (staging / _MARKER).write_text(text + "\n", encoding="utf-8")
-    finally:
-        folder.discard()
     return out / "index.html"
 
 
 def is_experiments(folder: Path) -> bool:
     """Say whether a folder holds the result of earlier experiments."""
-    try:
-        data = json.loads((folder / _MARKER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(data, dict) and data.get("kind") == KIND
+    data = json_of(folder / _MARKER)
+    return data is not None and data.get("kind") == KIND
+
+
+_CONTRACT = Contract(Names(frozenset({"index.html", _MARKER})), _MARKER, is_experiments)
 
 
 def _run_all(

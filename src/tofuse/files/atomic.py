@@ -1,10 +1,15 @@
-"""Writing a file so that it is either whole or not there."""
+"""Writing a file so that it is either whole or not there, also after a power cut.
+
+What is written into a folder that is itself moved into place later (its name begins with
+`UNFINISHED`) reaches the disk with that folder, by `sync_tree`; everything else by itself.
+"""
 
 from __future__ import annotations
 
 import errno
 import itertools
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +20,8 @@ from tofuse.errors import OutputError
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer as Buffer
+
+UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
 
 _counter = itertools.count()
 
@@ -38,11 +45,17 @@ def output_error(error: OSError, path: str | Path) -> OutputError:
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, *, durable: bool | None = None) -> Iterator[Path]:
     """Give a temporary path beside `path`, renamed to it if the block succeeds, else removed.
 
     The temporary name keeps the suffix, as some libraries choose the format by it. The block
     should only write: its OSErrors are taken for trouble with the output.
+
+    Parameters
+    ----------
+    durable
+        Whether to wait until it is on the disk, before the name is; unless given, where it is not
+        in a folder that is moved into place later.
 
     Raises
     ------
@@ -51,9 +64,15 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     beside = path.with_name(f".{path.stem}.{os.getpid()}-{next(_counter)}.part{path.suffix}")
+    if durable is None:
+        durable = not any(part.startswith(UNFINISHED) for part in path.parts)
     try:
         yield beside
+        if durable:
+            sync(beside)
         os.replace(beside, path)
+        if durable:
+            sync(path.parent)
     except BaseException as error:
         with suppress(OSError):
             beside.unlink()
@@ -75,6 +94,40 @@ def write_bytes(path: str | Path, *parts: Buffer) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Write a whole UTF-8 file with line feeds on every system; see `replacing`."""
     write_bytes(path, text.encode())
+
+
+def sync(path: str | Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk.
+
+    File systems that know no such thing, and systems that can't open folders, are let be.
+
+    Raises
+    ------
+    OSError
+        If the disk says that it failed.
+    """
+    writable = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
+    try:
+        handle = os.open(path, writable | getattr(os, "O_BINARY", 0))
+    except OSError:
+        if Path(path).is_dir():
+            return
+        raise
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.ENOSYS):
+            raise
+    finally:
+        os.close(handle)
+
+
+def sync_tree(folder: str | Path) -> None:
+    """Wait until all files in a folder and below it, and their names, are on the disk."""
+    for here, _folders, names in os.walk(folder):
+        for name in names:
+            sync(Path(here) / name)
+        sync(here)
 
 
 def make_folder(path: str | Path) -> Path:
@@ -110,11 +163,13 @@ def new_folder(path: str | Path) -> Iterator[Path]:
     parent = make_folder(path.absolute().parent)
     try:
         # The folder made by `tempfile` is private; the one inside has the usual permissions.
-        with tempfile.TemporaryDirectory(prefix=".tofuse-", dir=parent) as private:
+        with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=parent) as private:
             beside = make_folder(Path(private) / "made")
             yield beside
+            sync_tree(beside)
             if path.exists():
                 path.rmdir()
             os.replace(beside, path)
+            sync(parent)
     except OSError as error:
         raise output_error(error, path) from error

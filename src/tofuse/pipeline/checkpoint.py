@@ -12,10 +12,12 @@ import json
 import os
 import pickle
 import platform
+import re
 import shutil
 import sys
 import zlib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from time import perf_counter
@@ -23,7 +25,7 @@ from typing import Any, BinaryIO, Protocol
 
 from tofuse.errors import OutputError
 from tofuse.files.stamps import Stamp, stamp, stamps_in
-from tofuse.results.output import CHECKPOINT
+from tofuse.results.folder import CHECKPOINT
 
 # While frames are tracked a state is kept this often, and so seldom that it costs little.
 _EVERY_S, _SHARE = 10.0, 0.03
@@ -31,6 +33,8 @@ _EVERY_S, _SHARE = 10.0, 0.03
 _TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
 # A failure after so much work leaves the states, for when there is space or memory again.
 _WORTH_KEEPING_S = 60.0
+# Names of states, and of parts of them that were being written.
+_STATE = re.compile(r"[a-z]+\.(state|part)")
 _MAGIC = b"tofuse checkpoint\n"
 _LONGEST_HEADER = 4096
 _ROOMS = (
@@ -204,7 +208,7 @@ class Checkpoints(Stages):
 
     def discard(self) -> None:
         """Remove all that was kept."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        _clear(self.folder)
 
     def give_up(self, error: BaseException) -> None:
         """Remove what was kept, unless it was much work and trying again may help."""
@@ -214,6 +218,22 @@ class Checkpoints(Stages):
 
     def _path(self, stage: str) -> Path:
         return self.folder / f"{stage}.state"
+
+
+def discard_states(out: Path) -> None:
+    """Remove what a stopped run left in its output folder to go on from."""
+    _clear(out / CHECKPOINT)
+
+
+def _clear(folder: Path) -> None:
+    """Remove states, and nothing that only lies beside them."""
+    if folder.is_symlink() or not folder.is_dir():
+        return
+    for file in folder.iterdir():
+        if _STATE.fullmatch(file.name) and not file.is_dir():
+            _unlink(file)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def digest(facts: Mapping[str, Any], files: Iterable[Path], *, without: Path) -> str:

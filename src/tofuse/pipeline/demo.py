@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from tofuse.errors import OutputError
-from tofuse.files.atomic import write_text
+from tofuse.files.atomic import UNFINISHED, sync_tree, write_text
+from tofuse.pipeline.checkpoint import discard_states
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.run import Options, resolve, run
-from tofuse.results.output import CHECKPOINT, RECORDING, UNFINISHED, OutputFolder
+from tofuse.results.folder import RECORDING, OutputFolder
 from tofuse.results.types import Reconstruction
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.passing import Passing
@@ -55,19 +57,19 @@ def demo(
     )
     # Whatever is wrong with the options or the folder is said before the work begins.
     resolve(options)
-    folder = OutputFolder(out, overwrite=overwrite)
-    shutil.rmtree(out / CHECKPOINT, ignore_errors=True)  # of a recording that is made anew
-    try:
-        with _replacing_recording(out / RECORDING) as fresh:
-            simulate_to(scene, fresh, seed=seed, progress=progress)
-            if scene == "peaks":
-                thesis = options.method == "thesis"
-                write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
-                options = replace(options, config=out / RECORDING / "peaks.toml")
-            os.replace(fresh, out / RECORDING)
-            return run([out / RECORDING], options, progress)
-    finally:
-        folder.discard()
+    with (
+        OutputFolder(out, overwrite=overwrite) as folder,
+        _replacing_recording(out / RECORDING) as fresh,
+    ):
+        discard_states(out)  # of a recording that is made anew
+        simulate_to(scene, fresh, seed=seed, progress=progress)
+        if scene == "peaks":
+            thesis = options.method == "thesis"
+            write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
+            options = replace(options, config=out / RECORDING / "peaks.toml")
+        sync_tree(fresh)
+        os.replace(fresh, out / RECORDING)
+        return run([out / RECORDING], options, progress, folder)
 
 
 @contextmanager
@@ -77,12 +79,17 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
     Only a simulated recording is ever replaced.
     """
     fresh, old = path.parent / f"{UNFINISHED}simulating", path.parent / f"{UNFINISHED}replaced"
-    if path.exists() and not (path / "truth").is_dir():
-        raise OutputError(
-            "is no simulated recording", where=path, remedy="move it away, or give another --out"
-        )
-    for left in (fresh, old):
-        shutil.rmtree(left, ignore_errors=True)
+    for folder in (path, fresh, old):
+        if os.path.lexists(folder) and not _is_simulated(folder):
+            raise OutputError(
+                "is no simulated recording, or holds something else as well",
+                where=folder,
+                remedy="move it away, or give another --out",
+            )
+    shutil.rmtree(fresh, ignore_errors=True)
+    if not path.exists() and old.exists():  # it was stopped in between
+        os.replace(old, path)
+    shutil.rmtree(old, ignore_errors=True)
     if path.exists():
         os.replace(path, old)
     try:
@@ -94,6 +101,26 @@ def _replacing_recording(path: Path) -> Iterator[Path]:
             os.replace(old, path)
         raise
     shutil.rmtree(old, ignore_errors=True)
+
+
+# All that a simulated recording holds, in the end and while it is written.
+_SIMULATED = re.compile(
+    r"(truth/)?[a-z_]+/\.?\d{6}\.[\w.-]+|truth/[\w.-]+\.ply"
+    r"|\.?(camera|correction|rays|timestamps|groundtruth|odometry|frames|imu|peaks)\.[\w.-]+"
+)
+
+
+def _is_simulated(folder: Path) -> bool:
+    """Whether a folder holds a simulated recording, or a part of it, and nothing else."""
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    for here, folders, names in os.walk(folder):
+        if any((Path(here) / name).is_symlink() for name in (*folders, *names)):
+            return False
+        inside = Path(here).relative_to(folder)
+        if not all(_SIMULATED.fullmatch((inside / name).as_posix()) for name in names):
+            return False
+    return folder.name.startswith(UNFINISHED) or (folder / "truth").is_dir()
 
 
 # Section 4.1.6: all points, no filters; and a resolution of 1 m. Loops would be 3 m apart.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,8 @@ from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, evenly
 from tofuse.results.card import bound, length
-from tofuse.results.output import OutputFolder, accuracy_json, plain, reasons_json, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import accuracy_json, plain, reasons_json, write_result
 from tofuse.results.ranges import in_words, runs_of
 from tofuse.results.types import Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
@@ -264,10 +266,8 @@ def judge_files(
         options.every,
     )
     recording = opening.open()
-    folder = None
-    if options.out is not None:
-        folder = OutputFolder(options.out, overwrite=options.overwrite)
-    try:
+    out = options.out
+    with nullcontext() if out is None else OutputFolder(out, overwrite=options.overwrite) as folder:
         found = judge(
             recording,
             trajectory,
@@ -281,9 +281,6 @@ def judge_files(
             progress.stage("writing")
             with threadpool_limits(1):
                 _write(found, trajectory, recording, folder)
-    finally:
-        if folder is not None:
-            folder.discard()
     return found
 
 

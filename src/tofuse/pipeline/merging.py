@@ -31,7 +31,8 @@ from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import write_result
 from tofuse.results.sessions import sentences
 from tofuse.results.types import (
     Reason,
@@ -286,7 +287,14 @@ def merge_files(
     OutputError
         If the result can't be written; nothing that was there before has changed then.
     """
-    progress = progress or Silent()
+    # Claimed before the results are read: it may be one of them.
+    with OutputFolder(options.out, overwrite=options.overwrite) as folder:
+        return _merge_into(folder, results, options, progress or Silent())
+
+
+def _merge_into(
+    folder: OutputFolder, results: Sequence[str | Path], options: MergeOptions, progress: Progress
+) -> Reconstruction:
     progress.stage("opening")
     sessions = read_sessions(results, options.threads, progress)
     config = merged_config(sessions)
@@ -298,19 +306,15 @@ def merge_files(
     config = replace(config, fusion=fusion)
     if options.tolerance is not None:
         config = replace(config, tolerance_m=options.tolerance)
-    folder = OutputFolder(options.out, overwrite=options.overwrite)
-    try:
-        result = merge_sessions(
-            sessions, config, seed=options.seed, threads=options.threads, progress=progress
-        )
-        if options.only_joined and result.sessions[-1].T_main_session is None:
-            progress.note(f"{options.out} is left as it was")
-            return result
-        progress.stage("writing")
-        with threadpool_limits(1):
-            write_result(result, folder, _report)
-    finally:
-        folder.discard()
+    result = merge_sessions(
+        sessions, config, seed=options.seed, threads=options.threads, progress=progress
+    )
+    if options.only_joined and result.sessions[-1].T_main_session is None:
+        progress.note(f"{options.out} is left as it was")
+        return result
+    progress.stage("writing")
+    with threadpool_limits(1):
+        write_result(result, folder, _report)
     return result
 
 

@@ -19,7 +19,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.single import SingleView, open_view
 from tofuse.registration.register import register
-from tofuse.results.output import OutputFolder
+from tofuse.results.folder import OutputFolder
 from tofuse.results.pair import LocalView, PairResult, pair_folder, write_pair
 
 Float64 = NDArray[np.float64]
@@ -73,17 +73,12 @@ def register_files(
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         guess = None if options.guess is None else read_pose(options.guess)
-        folder = None
-        if options.out is not None:
-            folder = pair_folder(options.out, overwrite=options.overwrite)
-        try:
+        if options.out is None:
+            return _registered(source, target, guess, options, progress)
+        with pair_folder(options.out, overwrite=options.overwrite) as folder:
             result = _registered(source, target, guess, options, progress)
-            if folder is not None:
-                progress.stage("writing")
-                _write(result, folder)
-        finally:
-            if folder is not None:
-                folder.discard()
+            progress.stage("writing")
+            _write(result, folder)
     return result
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,15 +36,14 @@ from tofuse.posegraph.given import read_loops
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
-from tofuse.results.output import (
+from tofuse.results.folder import (
     RECORDING,
     OutputFolder,
+    check_free,
     component_number,
     is_result,
-    plain,
-    read_run_json,
-    write_result,
 )
+from tofuse.results.output import plain, read_run_json, write_result
 from tofuse.results.types import Reason, Reconstruction, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
 
@@ -83,9 +83,12 @@ class Options:
 
 
 def run(
-    inputs: Sequence[str | Path], options: Options, progress: Progress | None = None
+    inputs: Sequence[str | Path],
+    options: Options,
+    progress: Progress | None = None,
+    folder: OutputFolder | None = None,
 ) -> Reconstruction:
-    """Reconstruct recordings and write the output folder.
+    """Reconstruct recordings and write the output folder, which may be claimed already.
 
     Raises
     ------
@@ -93,6 +96,8 @@ def run(
         If nothing could be written; see the message for the remedy.
     """
     progress = progress or Silent()
+    if folder is None:
+        check_free(options.out)
     seed = _seed(options)
     watch = Stopwatch()
     with watch.timing("opening"):
@@ -118,44 +123,44 @@ def run(
         for warning in (*recording.warnings, *(str(f) for f in findings)):
             progress.note(warning)
     kept = Checkpoints(options.out, _key(inputs, options, recording, config, seed), progress.note)
-    folder = OutputFolder(options.out, overwrite=options.overwrite or bool(kept.fresh))
-    kept.begin(not is_result(options.out))
-    try:
-        result = reconstruct(
-            recording,
-            config,
-            seed=seed,
-            threads=options.threads,
-            loops=loops,
-            progress=progress,
-            stages=kept,
-        )
-        size = config.fusion.texture
-        texture = None
-        if size:
-            with watch.timing("texture"):
-                texture = paint(recording, result, size, options.threads, progress)
-        if size and texture is None:
-            progress.note("no texture: there is no surface, or neither colour nor amplitude")
-        result = with_findings(result, findings, turning=options.object)
-        result = replace(result, recording={**result.recording, "opening": opening.to_dict()})
-        if device := device_sentence(recording, result):
-            progress.note(device)
-        seconds = {**watch.seconds, **result.diagnostics.seconds}
-        result = replace(result, diagnostics=replace(result.diagnostics, seconds=seconds))
-        progress.stage("writing")
-        # BLAS sums differ with its number of threads, and its threads wait by spinning.
-        with threadpool_limits(1):
-            write_result(
-                result, folder, lambda r, f: write_report_files(recording, config, r, f), texture
+    overwrite = options.overwrite or bool(kept.fresh)
+    with (
+        OutputFolder(options.out, overwrite=overwrite) if folder is None else nullcontext(folder)
+    ) as out:
+        kept.begin(not is_result(options.out))
+        try:
+            result = reconstruct(
+                recording,
+                config,
+                seed=seed,
+                threads=options.threads,
+                loops=loops,
+                progress=progress,
+                stages=kept,
             )
-    except BaseException as error:
-        kept.give_up(error)
-        raise
-    else:
+            size = config.fusion.texture
+            texture = None
+            if size:
+                with watch.timing("texture"):
+                    texture = paint(recording, result, size, options.threads, progress)
+            if size and texture is None:
+                progress.note("no texture: there is no surface, or neither colour nor amplitude")
+            result = with_findings(result, findings, turning=options.object)
+            result = replace(result, recording={**result.recording, "opening": opening.to_dict()})
+            if device := device_sentence(recording, result):
+                progress.note(device)
+            seconds = {**watch.seconds, **result.diagnostics.seconds}
+            result = replace(result, diagnostics=replace(result.diagnostics, seconds=seconds))
+            progress.stage("writing")
+            # BLAS sums differ with its number of threads, and its threads wait by spinning.
+            with threadpool_limits(1):
+                write_result(
+                    result, out, lambda r, f: write_report_files(recording, config, r, f), texture
+                )
+        except BaseException as error:
+            kept.give_up(error)
+            raise
         kept.discard()
-    finally:
-        folder.discard()
     return result
 
 

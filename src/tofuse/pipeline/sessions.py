@@ -21,13 +21,8 @@ from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
-from tofuse.results.output import (
-    RECORDING,
-    component_name,
-    is_result,
-    main_poses,
-    read_run_json,
-)
+from tofuse.results.folder import RECORDING, component_name, is_result, settle
+from tofuse.results.output import main_poses, read_run_json
 
 Float64 = NDArray[np.float64]
 
@@ -142,6 +137,7 @@ def _read_parts(folder: Path, components: int) -> list[_Part]:
     """Read what a result says; its components are numbered from `components`."""
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
+    settle(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError("holds no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tofuse._version import __version__
+from tofuse.files.atomic import write_text
 from tofuse.report.extras import ReportExtras
 from tofuse.report.sections import sections
 from tofuse.results.types import Reconstruction
@@ -23,16 +23,10 @@ def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> No
 
     Raises
     ------
-    OSError
+    OutputError
         If the file can't be written; an earlier one is left as it was.
     """
-    text = render(result, extras)
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    try:
-        unfinished.write_text(text, encoding="utf-8")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_text(path, render(result, extras))
 
 
 def render(result: Reconstruction, extras: ReportExtras) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tofuse.report import words
 from tofuse.report.subject import ROWS, Subject, Values
-from tofuse.results.output import component_name
+from tofuse.results.folder import component_name
 from tofuse.results.ranges import numbers
 from tofuse.results.types import Component
 

@@ -17,7 +17,8 @@ from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion.exchange import Shape
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
-from tofuse.results.output import is_result, read_run_json
+from tofuse.results.folder import is_result, settle
+from tofuse.results.output import read_run_json
 
 Float64 = NDArray[np.float64]
 
@@ -127,6 +128,7 @@ def export(
         If a file is there already, or can't be written.
     """
     folder = Path(folder)
+    settle(folder)
     if not is_result(folder):
         raise InputError("holds no result", where=folder, remedy="give the --out of `tofuse run`")
     unknown = [name for name in formats if name not in FORMATS]

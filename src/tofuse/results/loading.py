@@ -16,12 +16,8 @@ from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.posegraph.outside import OutsideRecord
-from tofuse.results.output import (
-    component_name,
-    is_result,
-    main_poses,
-    read_run_json,
-)
+from tofuse.results.folder import component_name, is_result, settle
+from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.types import (
     Component,
     Diagnostics,
@@ -48,6 +44,7 @@ def load_result(folder: str | Path) -> Reconstruction:
         If it is no such folder, or what it holds is damaged or of different runs.
     """
     folder = Path(folder)
+    settle(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(
             "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"

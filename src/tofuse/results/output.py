@@ -1,15 +1,10 @@
-"""The output folder of a run: prepared first, staged beside, moved into place at the end."""
+"""What a run writes into its output folder, and how it is read again."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import re
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse._version import __version__
-from tofuse.errors import InputError, OutputError
-from tofuse.files.atomic import write_text
+from tofuse.errors import InputError
 from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
@@ -32,260 +26,13 @@ from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
+from tofuse.results.folder import OutputFolder, component_name, is_result
 from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
 
 Float64 = NDArray[np.float64]
 
-UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
-STAGING = f"{UNFINISHED}unfinished"
-CHECKPOINT = f"{UNFINISHED}checkpoint"  # what a run has so far
-_ASIDE, _FORWARD, _BACK = "replaced", "plan.json", "undo.json"  # in the staging folder
-RECORDING = "recording"  # what `tofuse demo` puts beside its result
-
 # Colours of surfaces that changed between sessions; people who are colour-blind tell them apart.
 CHANGED = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
-
-# What `tofuse run` and `tofuse export` may write; of an earlier result nothing of it stays.
-FILES = (
-    "trajectory.txt",
-    "pose_graph.g2o",
-    "cloud.ply",
-    "mesh.ply",
-    "mesh.glb",
-    "changes.ply",
-    "mesh.obj",
-    "mesh.mtl",
-    "mesh.png",
-    "report.html",
-    "view.npz",
-    "run.json",
-    "judge.json",
-    "cloud.pcd",
-    "cloud.las",
-    "cloud.e57",
-    "mesh.gltf",
-    "trajectory.kitti.txt",
-    "trajectory.log",
-)
-# Components that have a model of their own have it in a folder, with the same files.
-_COMPONENT = re.compile(r"component-[1-9]\d*")
-
-
-class OutputFolder:
-    """A folder that a run may write into.
-
-    Making one checks everything that can be checked before hours of work: that the folder is
-    ours or empty, and that it can be written.
-
-    What a run puts into place are files, and folders `component-1` and so on, which are moved as a
-    whole. Links are moved as what they are, and never followed.
-    """
-
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        overwrite: bool = False,
-        marker: str = "run.json",
-        ours: Callable[[Path], bool] | None = None,
-    ) -> None:
-        """Check and create the folder.
-
-        Parameters
-        ----------
-        marker
-            The file that is moved into place last: where it is, everything else is.
-        ours
-            Says whether a folder holds an earlier result of the kind that will be written;
-            `is_result` unless given.
-
-        Raises
-        ------
-        OutputError
-            If it holds something other than an earlier result, or a result and `overwrite` is
-            not given, or can't be written.
-        """
-        self.path = Path(path)
-        self._staging = self.path / STAGING
-        self._marker = marker
-        self._ours = ours or is_result
-        self._made: list[Path] = []
-        try:
-            _recover(self.path)
-            self._check(overwrite)
-            self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
-            self.path.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(self._staging, ignore_errors=True)
-            self._staging.mkdir()
-        except OSError as error:
-            self.discard()
-            raise _output_error(self.path, error) from error
-
-    def _check(self, overwrite: bool) -> None:
-        if self.path.exists() and not self.path.is_dir():
-            raise OutputError("is a file", where=self.path, remedy="give --out a folder")
-        entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
-        entries -= {name for name in entries if name.startswith(UNFINISHED)}
-        if not entries:
-            return
-        if not self._ours(self.path) and entries - {RECORDING}:
-            raise OutputError(
-                "is not empty and holds no earlier result of this command",
-                where=self.path,
-                remedy="give --out a new or empty folder",
-            )
-        if not overwrite:
-            raise OutputError(
-                "holds an earlier result" if self._marker in entries else "holds a recording",
-                where=self.path,
-                remedy="give --overwrite to replace it, or another --out",
-            )
-        for name in sorted(entries):
-            self._check_replaceable(name)
-
-    def _check_replaceable(self, name: str) -> None:
-        """Refuse to replace the folder of a component that somebody has put something into."""
-        if _COMPONENT.fullmatch(name) and not _is_component(self.path / name):
-            raise OutputError(
-                "holds something other than the files of an earlier result",
-                where=self.path / name,
-                remedy="move it away, or give another --out",
-            )
-
-    @contextmanager
-    def staging(self, *, instead_of: Sequence[str] = ()) -> Iterator[Path]:
-        """Give a folder to write into; on success all of it is moved into place, else nothing.
-
-        What has the names `instead_of` is gone afterwards, written anew or not.
-        """
-        try:
-            yield self._staging
-            files = sorted(p.name for p in self._staging.iterdir())
-            files.sort(key=lambda name: name == self._marker)
-            gone = {name for name in (*files, *instead_of) if os.path.lexists(self.path / name)}
-            for name in sorted(gone):
-                self._check_replaceable(name)
-            old = sorted(gone, key=lambda name: (name != self._marker, name))
-            _move_all(_Plan(tuple(files), tuple(old)), self._staging, self.path)
-        except OutputError as error:
-            # Named as it would have been called in the end.
-            where = self._final(error.where or "")
-            raise OutputError(error.problem, where=where, remedy=error.remedy) from error
-        except OSError as error:
-            raise _output_error(self.path, error) from error
-        finally:
-            self.discard()
-
-    def _final(self, staged: str) -> Path:
-        path = Path(staged)
-        if path.is_relative_to(self._staging):
-            return self.path / path.relative_to(self._staging)
-        return path if path.is_relative_to(self.path) else self.path / path.name
-
-    def discard(self) -> None:
-        """Remove what is unfinished, and the folders made for it if nothing else is in them."""
-        if not any((self._staging / name).exists() for name in (_FORWARD, _BACK)):
-            shutil.rmtree(self._staging, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            for folder in self._made:
-                folder.rmdir()
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What of a staging folder is moved into place, and what is moved away before.
-
-    It lies in the staging folder meanwhile, so that the next run can finish what a killed one
-    began. The marker goes away first and comes last: where it is, everything is of one run.
-    """
-
-    files: tuple[str, ...]
-    old: tuple[str, ...]
-
-    def carry_out(self, staging: Path, folder: Path) -> None:
-        """Move, or go on with it."""
-        for name in self.old:
-            if not os.path.lexists(staging / _ASIDE / name):
-                os.replace(folder / name, staging / _ASIDE / name)
-        for name in self.files:
-            if os.path.lexists(staging / name):
-                os.replace(staging / name, folder / name)
-
-    def undo(self, staging: Path, folder: Path) -> None:
-        """Move back, or go on with it."""
-        for name in reversed(self.files):
-            if not os.path.lexists(staging / name):
-                os.replace(folder / name, staging / name)
-        for name in reversed(self.old):
-            if os.path.lexists(staging / _ASIDE / name):
-                os.replace(staging / _ASIDE / name, folder / name)
-
-
-def _move_all(plan: _Plan, staging: Path, folder: Path) -> None:
-    """Move files into a folder: all of them, or none, with what was there put back."""
-    (staging / _ASIDE).mkdir()
-    write_text(staging / _FORWARD, json.dumps(asdict(plan)))
-    try:
-        plan.carry_out(staging, folder)
-    except BaseException:
-        os.replace(staging / _FORWARD, staging / _BACK)
-        plan.undo(staging, folder)
-        (staging / _BACK).unlink()
-        raise
-    (staging / _FORWARD).unlink()
-
-
-def _recover(folder: Path) -> None:
-    """Finish the moves of a run that was killed at them."""
-    staging = folder / STAGING
-    for name, way in ((_FORWARD, _Plan.carry_out), (_BACK, _Plan.undo)):
-        try:
-            found = json.loads((staging / name).read_text(encoding="utf-8"))
-        except (FileNotFoundError, NotADirectoryError):
-            continue
-        names = {key: tuple(Path(each).name for each in found[key]) for key in ("files", "old")}
-        way(_Plan(**names), staging, folder)
-        (staging / name).unlink()
-
-
-def _output_error(path: Path, error: OSError) -> OutputError:
-    return OutputError(
-        f"can't be written ({error.strerror or error})",
-        where=path,
-        remedy="check the permissions and the free space, or give another --out",
-    )
-
-
-def is_result(folder: Path) -> bool:
-    """Say whether a folder holds the result of an earlier run."""
-    try:
-        data = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(data, dict) and {"schema", "version", "verdict"} <= set(data)
-
-
-def _is_component(folder: Path) -> bool:
-    """Say whether a folder holds nothing but files that a run or an export makes."""
-    if folder.is_symlink() or not folder.is_dir():
-        return False
-    return all(p.name in FILES and p.is_file() and not p.is_symlink() for p in folder.iterdir())
-
-
-def component_folders(folder: Path) -> tuple[str, ...]:
-    """Return the names of the folders of an earlier result's components, that may be removed."""
-    names = (p.name for p in folder.iterdir() if _COMPONENT.fullmatch(p.name))
-    return tuple(sorted(name for name in names if _is_component(folder / name)))
-
-
-def component_name(number: int) -> str:
-    """Return the name of the folder of a component that has a model of its own."""
-    return f"component-{number}"
-
-
-def component_number(folder: Path) -> int | None:
-    """Return the number of the component that a folder is named after; None for any other name."""
-    return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
 
 
 def write_result(
@@ -305,8 +52,7 @@ def write_result(
     OutputError
         If a file can't be written; then nothing that was there before has changed.
     """
-    replaced = (*FILES, *component_folders(folder.path))
-    with folder.staging(instead_of=replaced) as staging:
+    with folder.staging() as staging:
         for number, component in enumerate(result.components):
             if component.result is not None and not component.connected:
                 own = staging / component_name(number)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tofuse._version import __version__
 from tofuse.files.atomic import write_text
+from tofuse.files.moving import Names
 from tofuse.files.ply import write_ply
 from tofuse.files.pose import pose_text
 from tofuse.geometry import se3
@@ -21,7 +22,8 @@ from tofuse.recordings.cloud_files import MAP_COORDINATES_M
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
-from tofuse.results.output import OutputFolder, plain
+from tofuse.results.folder import Contract, OutputFolder, json_of
+from tofuse.results.output import plain
 
 Float64 = NDArray[np.float64]
 
@@ -240,16 +242,16 @@ def _view_json(local: LocalView) -> dict[str, Any]:
 
 def is_registration(folder: Path) -> bool:
     """Say whether a folder holds an earlier registration."""
-    try:
-        data = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(data, dict) and {"schema", "version", "T_target_source"} <= set(data)
+    data = json_of(folder / MARKER)
+    return data is not None and {"schema", "version", "T_target_source"} <= set(data)
+
+
+CONTRACT = Contract(Names(frozenset(FILES)), MARKER, is_registration)
 
 
 def pair_folder(path: Path, *, overwrite: bool = False) -> OutputFolder:
     """Check and create the folder for a registration; see `OutputFolder` for errors."""
-    return OutputFolder(path, overwrite=overwrite, marker=MARKER, ours=is_registration)
+    return OutputFolder(path, overwrite=overwrite, contract=CONTRACT)
 
 
 def write_pair(
@@ -262,7 +264,7 @@ def write_pair(
     OutputError
         If a file can't be written; then nothing that was there before has changed.
     """
-    with folder.staging(instead_of=FILES) as staging:
+    with folder.staging() as staging:
         write_text(staging / "transform.txt", pose_text(result.T_target_source))
         write_aligned(result, staging / "aligned.ply")
         report(result, staging / "report.html")

@@ -27,7 +27,8 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, read_rig
 from tofuse.recordings.rig_source import RigSource
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import write_result
 from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import ranked, verdict_of
 from tofuse.rigs.calibrate import Motion, cameras_of, moves
@@ -86,16 +87,13 @@ def run_rig(
         whole = Recording.of(source, " ".join(map(str, inputs)), "rig")
         recording = _selected(whole, source, options)
         config = resolve(options)
-        folder = OutputFolder(options.out, overwrite=options.overwrite)
-        try:
+        with OutputFolder(options.out, overwrite=options.overwrite) as folder:
             found = reconstruct_rig(
                 rig, cameras, recording, config, motion=motion, seed=options.seed or 0,
                 progress=progress,
             )  # fmt: skip
             progress.stage("writing")
             _write(found, recording, folder)
-        finally:
-            folder.discard()
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
+from tofuse.files.atomic import replacing
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -101,10 +101,8 @@ class DepthCorrection:
         arrays: dict[str, NDArray[np.floating]] = {"range_m": self.range_m, "bias_m": self.bias_m}
         if self.pixel_bias_m is not None:
             arrays["pixel_bias_m"] = self.pixel_bias_m
-        part = path.with_name(path.name + ".part")
-        with part.open("wb") as file:
+        with replacing(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
-        os.replace(part, path)
 
     @classmethod
     def load(cls, path: str | Path) -> DepthCorrection:

@@ -17,7 +17,8 @@ from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
-from tofuse.results.output import is_result, main_poses, read_run_json
+from tofuse.results.folder import is_result, settle
+from tofuse.results.output import main_poses, read_run_json
 from tofuse.viewer.kept import read_kept
 
 Float32 = NDArray[np.float32]
@@ -120,6 +121,7 @@ def read_result(folder: Path) -> Result:
     """
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy="give the --out of `tofuse run`")
+    settle(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(
             "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"

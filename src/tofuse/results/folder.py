@@ -1,0 +1,308 @@
+"""The output folder of a run: claimed first, staged inside, moved into place at the end.
+
+Nothing in a folder is touched before it is known to be ours. One process at a time may write into
+it. A program that was stopped while it moved a result into place leaves a plan by which the next,
+one that reads or one that writes, finishes the moves (`files.moving`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from tofuse.errors import InputError, OutputError
+from tofuse.files.atomic import UNFINISHED
+from tofuse.files.locking import Claim
+from tofuse.files.moving import (
+    Names,
+    check_error,
+    check_stopped,
+    clear,
+    is_stopped,
+    move_all,
+    places,
+    recover,
+)
+
+STAGING = f"{UNFINISHED}unfinished"
+LOCK = f"{UNFINISHED}lock"
+CHECKPOINT = f"{UNFINISHED}checkpoint"  # what a run has so far
+RECORDING = "recording"  # what `tofuse demo` puts beside its result
+
+# What `tofuse run` and `tofuse export` may write; of an earlier result nothing of it stays.
+FILES = (
+    "trajectory.txt",
+    "pose_graph.g2o",
+    "cloud.ply",
+    "mesh.ply",
+    "mesh.glb",
+    "changes.ply",
+    "mesh.obj",
+    "mesh.mtl",
+    "mesh.png",
+    "report.html",
+    "view.npz",
+    "run.json",
+    "judge.json",
+    "cloud.pcd",
+    "cloud.las",
+    "cloud.e57",
+    "mesh.gltf",
+    "trajectory.kitti.txt",
+    "trajectory.log",
+)
+# Components that have a model of their own have it in a folder, with the same files.
+_COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Contract:
+    """What one kind of result is made of.
+
+    Attributes
+    ----------
+    marker
+        The file that is moved into place last: where it is, everything else is.
+    ours
+        Whether a folder holds, or by this file held, a result of this kind.
+    """
+
+    names: Names
+    marker: str
+    ours: Callable[[Path], bool]
+
+
+class OutputFolder:
+    """A folder that a run may write into, and that nobody else may meanwhile.
+
+    Making one checks everything that can be checked before hours of work: that the folder is
+    ours or empty, that nobody else writes into it, and that it can be written.
+
+    What a run puts into place are files, and folders `component-1` and so on, which are moved as a
+    whole. Links are moved as what they are, and never followed.
+
+    The folder is given back when the result is written; used in a `with`, at the end of its block.
+    """
+
+    def __init__(
+        self, path: str | Path, *, overwrite: bool = False, contract: Contract | None = None
+    ) -> None:
+        """Check, create and claim the folder.
+
+        Parameters
+        ----------
+        contract
+            What will be written; the files of a run unless given.
+
+        Raises
+        ------
+        OutputError
+            If it holds something other than an earlier result, or a result and `overwrite` is
+            not given, or another process writes into it, or it can't be written.
+        """
+        self.path = Path(path)
+        self._contract = contract or RESULT
+        self._names = self._contract.names
+        self._staging = self.path / STAGING
+        self._made: list[Path] = []
+        self._claim: Claim | None = None
+        self._entered = False
+        try:
+            self._check(overwrite)  # before anything is touched, and then what nobody else changes
+            self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._claim = Claim(self.path / LOCK, what=self.path)
+            _recover(self.path, self._contract)
+            self._check(overwrite)
+            if not clear(self._staging, self._names):
+                raise check_error(self._staging)
+            self._staging.mkdir()
+        except OSError as error:
+            self.discard()
+            raise _output_error(self.path, error) from error
+        except BaseException:
+            self.discard()
+            raise
+
+    def __enter__(self) -> Self:
+        self._entered = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
+    ) -> None:
+        self._entered = False
+        self.discard()
+
+    def _check(self, overwrite: bool) -> None:
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError("is a file", where=self.path, remedy="give --out a folder")
+        contract = self._contract
+        if is_stopped(self._staging):
+            check_stopped(self._staging, self._names, contract.marker)
+            if any(contract.ours(place) for place in places(self._staging, self.path)):
+                return
+        entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
+        entries -= {name for name in entries if name.startswith(UNFINISHED)}
+        if not entries:
+            return
+        if not contract.ours(self.path) and entries - {RECORDING}:
+            raise OutputError(
+                "is not empty and holds no earlier result of this command",
+                where=self.path,
+                remedy="give --out a new or empty folder",
+            )
+        if not overwrite:
+            raise OutputError(
+                "holds an earlier result" if contract.marker in entries else "holds a recording",
+                where=self.path,
+                remedy="give --overwrite to replace it, or another --out",
+            )
+        for name in sorted(entries):
+            if self._names.folder(name) and not self._names.is_whole(self.path / name):
+                raise check_error(self.path / name)
+
+    @contextmanager
+    def staging(self) -> Iterator[Path]:
+        """Give a folder to write into; on success all of it is moved into place, else nothing.
+
+        What has the names of such a result is gone afterwards, written anew or not.
+        """
+        try:
+            yield self._staging
+            move_all(self._staging, self.path, self._names, self._contract.marker)
+        except OutputError as error:
+            # Named as it would have been called in the end.
+            where = self._final(error.where or "")
+            raise OutputError(error.problem, where=where, remedy=error.remedy) from error
+        except OSError as error:
+            raise _output_error(self.path, error) from error
+        finally:
+            if self._entered:
+                self._clear()
+            else:
+                self.discard()
+
+    def _final(self, staged: str) -> Path:
+        path = Path(staged)
+        if path.is_relative_to(self._staging):
+            return self.path / path.relative_to(self._staging)
+        return path if path.is_relative_to(self.path) else self.path / path.name
+
+    def _clear(self) -> None:
+        if self._claim is not None and not is_stopped(self._staging):
+            clear(self._staging, self._names)
+
+    def discard(self) -> None:
+        """Remove what is unfinished, and the folders made for it if nothing else is in them."""
+        try:
+            self._clear()
+        finally:
+            if self._claim is not None:
+                self._claim.release()
+                self._claim = None
+        with contextlib.suppress(OSError):
+            for folder in self._made:
+                folder.rmdir()
+
+
+def check_free(path: str | Path) -> None:
+    """Refuse a folder that another process writes into, at once; later, `OutputFolder` will too.
+
+    Raises
+    ------
+    OutputError
+        If there is one; its number, machine and start are told.
+    """
+    lock = Path(path) / LOCK
+    if os.path.lexists(lock):
+        Claim(lock, what=path).release()
+
+
+def _recover(folder: Path, contract: Contract) -> None:
+    """Finish the moves of a program that was stopped at them."""
+    staging = folder / STAGING
+    if not is_stopped(staging):
+        return
+    check_stopped(staging, contract.names, contract.marker)
+    if not any(contract.ours(place) for place in places(staging, folder)):
+        raise check_error(folder)
+    recover(staging, folder, contract.names, contract.marker)
+
+
+def _output_error(path: Path, error: OSError) -> OutputError:
+    return OutputError(
+        f"can't be written ({error.strerror or error})",
+        where=path,
+        remedy="check the permissions and the free space, or give another --out",
+    )
+
+
+def settle(folder: Path, contract: Contract | None = None) -> None:
+    """Finish what a program that was stopped left, so that a result can be read.
+
+    Raises
+    ------
+    InputError
+        If a result is just being moved into place, or that was stopped and can't be finished.
+    """
+    staging = folder / STAGING
+    if not is_stopped(staging):
+        return
+    contract = contract or RESULT
+    try:
+        claim = Claim(folder / LOCK, what=folder)
+        try:
+            _recover(folder, contract)
+            clear(staging, contract.names)
+        finally:
+            claim.release()
+    except OutputError as error:
+        raise InputError(
+            f"a result was being moved into place, which isn't finished: {error.problem}",
+            where=error.where,
+            remedy=error.remedy,
+        ) from error
+    except OSError as error:
+        raise InputError(
+            f"a program was stopped while it moved a result into place, and that can't be finished "
+            f"({error.strerror or error})",
+            where=folder,
+            remedy="copy the folder, with its hidden ones, to where you may write, and try again",
+        ) from error
+
+
+def is_result(folder: Path) -> bool:
+    """Say whether a folder holds the result of an earlier run."""
+    data = json_of(folder / RESULT.marker)
+    return data is not None and {"schema", "version", "verdict"} <= set(data)
+
+
+def json_of(path: Path) -> dict[str, object] | None:
+    """Return the table in a JSON file; None where there is none."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return data if isinstance(data, dict) else None
+
+
+def component_name(number: int) -> str:
+    """Return the name of the folder of a component that has a model of its own."""
+    return f"component-{number}"
+
+
+def component_number(folder: Path) -> int | None:
+    """Return the number of the component that a folder is named after; None for any other name."""
+    return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
+
+
+RESULT = Contract(Names(frozenset(FILES), _COMPONENT), "run.json", is_result)
