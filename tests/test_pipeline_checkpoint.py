@@ -9,6 +9,8 @@ import pickle
 import signal
 import subprocess
 import sys
+import zipfile
+from collections import OrderedDict, deque
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +19,14 @@ import pytest
 import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
+from tofuse.files.arrays import read_npz, write_npz
 from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, Stages, digest
 from tofuse.pipeline.config import changed, from_method
+from tofuse.pipeline.states import StateError, decode, encode, known_types
 from tofuse.results.folder import CHECKPOINT, STAGING
 from tofuse.results.output import run_json
+from tofuse.results.types import FrameRecord
 from tofuse.simulation.record import simulate
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
@@ -35,16 +40,17 @@ class Kept(Stages):
     """Keeps states as bytes after every frame, and stops when told."""
 
     def __init__(self, stop_at: int) -> None:
-        self.states: dict[str, bytes] = {}
+        self.states: dict[str, tuple[str, dict[str, np.ndarray]]] = {}
         self.saved: list[str] = []
         self.stop_at = stop_at
 
     def load(self, stage: str) -> object:
         data = self.states.get(stage)
-        return None if data is None else checkpoint._OwnTypes(io.BytesIO(data)).load()
+        return None if data is None else decode(json.loads(data[0]), data[1])
 
     def save(self, stage: str, state: object) -> None:
-        self.states[stage] = pickle.dumps(state, 5)
+        nodes, arrays = encode(state)
+        self.states[stage] = json.dumps(nodes), {k: v.copy() for k, v in arrays.items()}
         self.saved.append(stage)
         if len(self.saved) == self.stop_at:
             raise Stopped
@@ -164,16 +170,191 @@ class Harmful:
 
 
 @pytest.mark.parametrize(
-    "state", [Harmful(), Path("x"), np.array([Harmful()], object), main, Checkpoints]
+    "state",
+    [Harmful(), Path("x"), np.array([Harmful()], object), main, Checkpoints, np.dtype("f4"), 1j],
 )
-def test_a_state_runs_no_code_of_others(state: object, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_only_our_own_types_are_kept(state: object, tmp_path: Path) -> None:
     notes: list[str] = []
     kept = Checkpoints(tmp_path / "out", "a", notes.append)
     kept.save("fusion", state)
-    assert kept.load("fusion") is None
     assert "is no part of a state" in notes[0]
+    assert kept.load("fusion") is None
+
+
+def test_no_type_that_does_something_can_be_named() -> None:
+    assert {name.partition(".")[0] for name in known_types()} == {"tofuse"}
+    for cls in known_types().values():
+        assert not issubclass(cls, BaseException | os.PathLike | tuple | type)
+        assert not hasattr(cls, "__del__")
+        assert not hasattr(cls, "__reduce_ex__") or cls.__reduce_ex__ is object.__reduce_ex__
+
+
+def test_a_state_comes_back_as_it_was() -> None:
+    nan, shared = float("nan"), [np.arange(6.0).reshape(2, 3), b"\x00\xff"]
+    looped: dict[object, object] = {(1, "a"): shared, 2.5: shared, None: (shared, {3, 4})}
+    looped["self"] = looped
+    state = {
+        "loop": looped,
+        "numbers": [nan, -0.0, np.inf, 10**30, True, np.float32(0.1), np.uint16(7)],
+        "queue": deque([1, [2]], maxlen=3),
+        "order": OrderedDict([("b", 1), ("a", frozenset({1}))]),
+        "turned": np.asfortranarray(np.arange(60_000, dtype=np.int16).reshape(300, 200)),
+        "nothing": (np.zeros((0, 3), np.float32), np.array(5), [], "\ud800"),
+        "frame": FrameRecord(3, 0.1, "tracked", covariance=np.eye(6)),
+    }
+    nodes, arrays = encode(state)
+    found = decode(json.loads(json.dumps(nodes)), arrays)
+    assert list(found) == list(state)
+    loop = found["loop"]
+    assert loop["self"] is loop
+    assert loop[1, "a"] is loop[2.5]
+    assert loop[None][0] is loop[2.5]
+    assert loop[None][1] == {3, 4}
+    np.testing.assert_array_equal(loop[2.5][0], shared[0])
+    assert loop[2.5][1] == shared[1]
+    assert str(found["numbers"]) == str(state["numbers"])
+    assert [type(n) for n in found["numbers"]] == [type(n) for n in state["numbers"]]
+    assert (found["queue"], found["queue"].maxlen) == (state["queue"], 3)
+    assert found["order"] == state["order"]
+    assert found["turned"].flags.f_contiguous
+    np.testing.assert_array_equal(found["turned"], state["turned"])
+    assert [a.shape for a in found["nothing"][:2]] == [(0, 3), ()]
+    assert found["nothing"][2:] == ([], "\ud800")
+    assert isinstance(found["frame"], FrameRecord)
+    found["frame"].covariance[0, 0] = 5.0
+
+
+FORGED: dict[str, object] = {
+    "nothing": [],
+    "no list": {"a": 1},
+    "no node": [1],
+    "leads nowhere": [["tuple", [7]]],
+    "before all": [["tuple", [-1]]],
+    "a tuple in itself": [["tuple", [0]]],
+    "many deep": [*([["list", [k + 1]] for k in range(50_000)]), ["list"]],
+    "code": [["list", [1]], ["object", "os.system"]],
+    "a class of NumPy": [["list", [1]], ["object", "numpy.ndarray"]],
+    "a class of ours that opens files": [["list", [1]], ["object", "tofuse.files.locking.Claim"]],
+    "an attribute for a field": [
+        ["list", [1]],
+        ["object", f"{FrameRecord.__module__}.FrameRecord"],
+    ],
+    "attributes more": [
+        ["tuple", [1]],
+        ["object", "tofuse.posegraph.views.Spacing", "__class__", 1],
+    ],
+    "an odd table": [["list", [1]], ["dict", 1]],
+    "a list as a key": [["list", [1]], ["dict", [2], 1], ["list"]],
+    "an array that is not there": [["list", [1]], ["array", "x", 0, 1, False, 1]],
+    "an array that is longer": [["list", [1]], ["array", "a", 0, 99, False, 99]],
+    "an array before its start": [["list", [1]], ["array", "a", -4, 8, False, 8]],
+    "an array that is taken often": [
+        ["list", *([k] for k in range(1, 9))],
+        *[["array", "a", 0, 7, False, 7]] * 8,
+    ],
+    "another shape": [["list", [1]], ["array", "a", 0, 8, False, 3, 3]],
+    "no shape": [["list", [1]], ["array", "a", 0, 8, False, "x"]],
+    "an endless queue": [["list", [1]], ["deque", -5, 1]],
+    "a number that is none": [["list", [1]], ["float", "x"]],
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_a_forged_state_is_refused(name: str, tmp_path: Path) -> None:
+    arrays = {"a": np.arange(8.0)}
+    with pytest.raises(StateError) as caught:
+        decode(FORGED[name], arrays)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
+    notes: list[str] = []
+    kept = Checkpoints(tmp_path, "a", notes.append)
+    kept.save("fusion", [1])
+    path = kept.folder / "fusion.state"
+    made = read_npz(path)
+    made["nodes"] = np.frombuffer(json.dumps(FORGED[name]).encode(), np.uint8)
+    with path.open("wb") as file:
+        write_npz(file, made | arrays)
+    assert kept.load("fusion") is None
+    assert "damaged, and not used" in notes[0]
+    assert not path.exists()
+
+
+def pickled() -> bytes:
+    return pickle.dumps(Harmful())
+
+
+def zipped(name: str, data: bytes, method: int = zipfile.ZIP_STORED) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", method) as archive:
+        archive.writestr(name, data)
+    return made.getvalue()
+
+
+def array(value: np.ndarray) -> bytes:
+    made = io.BytesIO()
+    np.save(made, value, allow_pickle=True)
+    return made.getvalue()
+
+
+def claims(shape: tuple[int, ...]) -> bytes:
+    made = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(made, header)
+    return made.getvalue() + bytes(64)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x00" * 100,
+        pickled(),
+        zipped("header.npy", pickled()),
+        zipped("header.npy", array(np.array([Harmful()], object))),
+        zipped("header.npy", claims((10**15,))),
+        zipped("header.npy", claims((2**62, 2**62))),
+        zipped("header.npy", claims((1,)), zipfile.ZIP_DEFLATED),
+        zipped("header.npy", array(np.zeros(10**7)), zipfile.ZIP_DEFLATED),
+        zipped("header.npy", b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535),
+        zipped("../../header.npy", array(np.zeros(3))),
+        zipped("header", b"{}"),
+    ],
+)
+def test_a_file_that_is_no_state_is_not_used(data: bytes, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    notes: list[str] = []
+    path = tmp_path / "out" / CHECKPOINT / "fusion.state"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(data)
+    kept = Checkpoints(tmp_path / "out", "a", notes.append)
+    assert kept.fresh is None
+    assert kept.load("fusion") is None
+    assert "damaged, and not used" in notes[0]
     assert not Path("harmed").exists()
+
+
+def test_a_state_that_was_changed_ends_in_one_line(turned_box: Path, tmp_path, capfd) -> None:
+    """Whoever knows the key can forge what passes all checks: that costs one more try."""
+    out = tmp_path / "out"
+    words = ["run", str(turned_box), "--out", str(out), "--method", "thesis"]
+    seen: list[tuple[Path, str]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Checkpoints, "begin", lambda self, fresh: seen.append((self.folder, self._key))
+        )
+        patch.setattr(run, "reconstruct", lambda *_a, **_o: (_ for _ in ()).throw(Stopped))
+        with pytest.raises(Stopped):
+            main(words)
+    (folder, key) = seen[0]
+    for state in ({"mapper": 5}, [1, 2], "x"):
+        Checkpoints(out, key, pytest.fail).save("tracking", state)
+        capfd.readouterr()
+        assert main(words) == 2
+        said = capfd.readouterr().err
+        assert said.startswith(f"tofuse: {folder}: what a stopped run left can't be gone on from")
+        assert said.count("\n") == 1
+        assert not folder.exists()
+        assert not (out / "run.json").exists()
 
 
 def test_what_can_not_be_kept_stops_no_run(tmp_path: Path, monkeypatch) -> None:

@@ -1,30 +1,32 @@
 """Where a run that was killed goes on: what it had after each stage, kept beside its result.
 
-A state is a pickle of our own types and of arrays; nothing else is ever loaded, so that a folder
-from somebody else runs no code of theirs.
+A state is an .npz file: arrays, and JSON that says how our own types are made of them (`states`).
+Nothing else is ever loaded, so that a folder from somebody else runs no code of theirs.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import os
-import pickle
 import platform
 import re
 import shutil
 import sys
-import zlib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from time import perf_counter
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
-from tofuse.errors import OutputError
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, OutputError
+from tofuse.files.arrays import Arrays, read_npz, write_npz
 from tofuse.files.stamps import Stamp, stamp, stamps_in
+from tofuse.pipeline.states import StateError, decode, encode
 from tofuse.results.folder import CHECKPOINT
 
 # While frames are tracked a state is kept this often, and so seldom that it costs little.
@@ -35,43 +37,9 @@ _TIMES_LEFT, _BYTES_LEFT = 2, 50_000_000
 _WORTH_KEEPING_S = 60.0
 # Names of states, and of parts of them that were being written.
 _STATE = re.compile(r"[a-z]+\.(state|part)")
-_MAGIC = b"tofuse checkpoint\n"
-_LONGEST_HEADER = 4096
-_ROOMS = (
-    "evaluation",
-    "filters",
-    "fusion",
-    "geometry",
-    "maps",
-    "odometry",
-    "pipeline.backend",
-    "pipeline.behind",
-    "pipeline.components",
-    "pipeline.config",
-    "pipeline.frame_log",
-    "pipeline.intake",
-    "pipeline.live",
-    "pipeline.mapper",
-    "pipeline.observations",
-    "pipeline.preparation",
-    "pipeline.progress",
-    "pipeline.reconstruct",
-    "posegraph",
-    "recordings.frames",
-    "registration",
-    "results.samples",
-    "results.types",
-    "sensor",
-)
-_FOREIGN = {
-    ("collections", "OrderedDict"),
-    ("collections", "deque"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-}
+_VERSION = 2  # of the format; 1 were pickles
+_MAX_BYTES, _MAX_NODES_BYTES, _MAX_HEADER_BYTES = 16 << 30, 1 << 30, 4096
+_HEADER, _NODES = "header", "nodes"
 
 
 class Stages(Protocol):
@@ -112,6 +80,8 @@ class Checkpoints(Stages):
     ----------
     folder
         Where they are.
+    used
+        Whether the run goes on from something that was kept.
     fresh
         Whether the run began without an earlier result in the folder; None where there is nothing
         of this run. Then it may write there once more without being told to.
@@ -129,13 +99,15 @@ class Checkpoints(Stages):
         """
         self.folder = out / CHECKPOINT
         self.fresh: bool | None = None
+        self.used = False
         self._key = key
         self._note = note
         self._works = True
         self._begun = self._last = perf_counter()
         self._cost_s = 0.0
         self._strange: list[Path] = []
-        for file in sorted(self.folder.glob("*.state")):
+        linked = self.folder.is_symlink()
+        for file in () if linked else sorted(self.folder.glob("*.state")):
             header = _header(file)
             if header.get("key") == key:
                 self.fresh = bool(header.get("fresh"))
@@ -165,13 +137,14 @@ class Checkpoints(Stages):
         if not path.exists():
             return None
         try:
-            with path.open("rb") as file:
-                return _read(file, self._key)
-        # Damaged data can make anything of a pickle.
-        except Exception as error:
-            self._note(f"what a stopped run left of its {stage} is damaged, and not used ({error})")
+            state = _read(path, self._key)
+        except (InputError, StateError) as error:
+            why = error.problem if isinstance(error, InputError) else str(error)
+            self._note(f"what a stopped run left of its {stage} is damaged, and not used ({why})")
             _unlink(path)
             return None
+        self.used = True
+        return state
 
     def save(self, stage: str, state: Any) -> None:
         """See `Stages`. Where it can't be written the run goes on without."""
@@ -180,17 +153,16 @@ class Checkpoints(Stages):
         start = perf_counter()
         path = self._path(stage)
         part = path.with_suffix(".part")
-        header = {"key": self._key, "fresh": bool(self.fresh)}
+        header = {"version": _VERSION, "key": self._key, "fresh": bool(self.fresh)}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as file:
-                _write(file, header, state)
+            _write(part, header, state)
             os.replace(part, path)
             size = path.stat().st_size
             if shutil.disk_usage(self.folder).free < _TIMES_LEFT * size + _BYTES_LEFT:
                 raise OSError("hardly any space left")
-        # A part that somebody added may hold what can't be pickled.
-        except (OSError, pickle.PicklingError, AttributeError, TypeError) as error:
+        # A part that somebody added may hold what can't be kept.
+        except (OSError, StateError) as error:
             self._works = False
             why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self._note(
@@ -215,6 +187,14 @@ class Checkpoints(Stages):
         can_help = isinstance(error, OutputError | OSError | MemoryError)
         if not (can_help and perf_counter() - self._begun >= _WORTH_KEEPING_S):
             self.discard()
+
+    def unusable(self, error: Exception) -> InputError:
+        """Say that what was kept, and is removed now, led to an error."""
+        return InputError(
+            f"what a stopped run left can't be gone on from ({type(error).__name__}: {error})",
+            where=self.folder,
+            remedy="it has been removed: run the same command again",
+        )
 
     def _path(self, stage: str) -> Path:
         return self.folder / f"{stage}.state"
@@ -282,68 +262,43 @@ def _unlink(path: Path) -> None:
 def _header(path: Path) -> dict[str, Any]:
     """What a file of ours says of itself; nothing where it is none."""
     try:
-        with path.open("rb") as file:
-            return _read_header(file)
-    except (OSError, ValueError):
+        return _header_in(read_npz(path, limit=_MAX_HEADER_BYTES, only=frozenset({_HEADER})))
+    except (InputError, StateError):
         return {}
 
 
-def _read_header(file: BinaryIO) -> dict[str, Any]:
-    if file.read(len(_MAGIC)) != _MAGIC:
-        raise ValueError("it is no checkpoint")
-    header = json.loads(file.readline(_LONGEST_HEADER))
-    if not isinstance(header, dict):
-        raise ValueError("its header is damaged")
+def _header_in(arrays: Arrays) -> dict[str, Any]:
+    header = _json(arrays.pop(_HEADER, None))
+    if not isinstance(header, dict) or header.get("version") != _VERSION:
+        raise StateError("it is no checkpoint of this version")
     return header
 
 
-class _Summed:
-    """A file that sums up what is written to it."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self.sum = 0
-
-    def write(self, data: Any) -> int:
-        self.sum = zlib.crc32(data, self.sum)
-        return self._file.write(data)
+def _json(data: NDArray[Any] | None) -> Any:
+    if data is None or data.dtype != np.uint8:
+        raise StateError("it is no checkpoint")
+    try:
+        return json.loads(data.tobytes())
+    except (ValueError, RecursionError):
+        raise StateError("it is no checkpoint") from None
 
 
-def _write(file: BinaryIO, header: dict[str, Any], state: Any) -> None:
-    file.write(_MAGIC + json.dumps(header).encode() + b"\n")
-    summed = _Summed(file)
-    pickle.Pickler(summed, protocol=5).dump(state)
-    # Not forced to the disk: should the power fail, the sum tells.
-    file.write(summed.sum.to_bytes(4, "little"))
+def _text(data: Any) -> NDArray[np.uint8]:
+    return np.frombuffer(json.dumps(data, separators=(",", ":")).encode(), np.uint8)
 
 
-def _read(file: BinaryIO, key: str) -> Any:
-    if _read_header(file).get("key") != key:
-        raise ValueError("it is of another run")
-    start = file.tell()
-    end = file.seek(-4, os.SEEK_END)
-    wanted = int.from_bytes(file.read(4), "little")
-    file.seek(start)
-    found, left = 0, end - start
-    while left > 0:
-        data = file.read(min(left, 1 << 20))
-        found, left = zlib.crc32(data, found), left - len(data)
-    if found != wanted:
-        raise ValueError("its sum is wrong")
-    file.seek(start)
-    return _OwnTypes(file).load()
+def _write(path: Path, header: dict[str, Any], state: Any) -> None:
+    nodes, arrays = encode(state)
+    # Not forced to the disk: should the power fail, the sums tell.
+    with path.open("wb") as file:
+        write_npz(file, {_HEADER: _text(header), _NODES: _text(nodes), **arrays})
 
 
-class _OwnTypes(pickle.Unpickler):
-    """Loads arrays, and classes of the rooms whose state is kept."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return a class that may take part."""
-        if (module, name) in _FOREIGN:
-            return super().find_class(module, name)
-        room = module.removeprefix("tofuse.")
-        if room != module and any(room == r or room.startswith(f"{r}.") for r in _ROOMS):
-            found = getattr(importlib.import_module(module), name, None)
-            if isinstance(found, type):
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no part of a state")
+def _read(path: Path, key: str) -> Any:
+    arrays = read_npz(path, limit=_MAX_BYTES)
+    if _header_in(arrays).get("key") != key:
+        raise StateError("it is of another run")
+    nodes = arrays.pop(_NODES, None)
+    if nodes is not None and nodes.nbytes > _MAX_NODES_BYTES:
+        raise StateError("it is too large")
+    return decode(_json(nodes), arrays)

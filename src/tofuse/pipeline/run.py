@@ -49,6 +49,8 @@ from tofuse.results.verdict import ranked, verdict_of
 
 _CLOUDS = 12  # views drawn, where they are clouds
 _TEXTURE = 2048  # texels, where no size is given
+# What may come of a state that was changed.
+_STRANGE = (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError)
 _LOOKED_AT = 8  # frames, for what they hold
 
 
@@ -157,6 +159,11 @@ def run(
                 write_result(
                     result, out, lambda r, f: write_report_files(recording, config, r, f), texture
                 )
+        except _STRANGE as error:
+            kept.give_up(error)
+            if kept.used:  # somebody changed it; without it, an error is ours
+                raise kept.unusable(error) from error
+            raise
         except BaseException as error:
             kept.give_up(error)
             raise

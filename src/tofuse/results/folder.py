@@ -52,6 +52,7 @@ FILES = (
     "view.npz",
     "run.json",
     "judge.json",
+    "rig_trajectory.txt",
     "cloud.pcd",
     "cloud.las",
     "cloud.e57",

@@ -1,0 +1,121 @@
+"""Sets of arrays in an .npz file: without objects, and never more than the file has bytes."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import input_error, is_file
+
+Arrays = dict[str, NDArray[Any]]
+
+_MAX_BYTES = 4 << 30
+_MAX_MEMBERS = 100_000
+_MOST_SMALLER = 1100  # times; deflate makes nothing smaller than that
+_KINDS = "biufcSU"
+
+
+def write_npz(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays to an open file, uncompressed; the same arrays give the same bytes.
+
+    Raises
+    ------
+    ValueError
+        If one of them holds objects.
+    """
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for name, array in arrays.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                npy.write_array(member, np.asanyarray(array), allow_pickle=False)
+
+
+def read_npz(
+    path: str | Path, *, limit: int = _MAX_BYTES, only: frozenset[str] | None = None
+) -> Arrays:
+    """Return the arrays of a file, by name.
+
+    Parameters
+    ----------
+    limit
+        Bytes that all of them may have together.
+    only
+        Names of those that are wanted; all unless given.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, is damaged (each array has a sum), holds objects, or too much.
+    """
+    try:
+        if not is_file(Path(path)):
+            path.stat() if isinstance(path, Path) else Path(path).stat()
+            raise InputError("is no ordinary file", where=path, remedy="give a file")
+        with zipfile.ZipFile(path) as archive:
+            return _read(archive, limit, only)
+    except OSError as error:
+        raise input_error(error, path) from error
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        SyntaxError,
+        NotImplementedError,
+        OverflowError,
+        RecursionError,
+        RuntimeError,
+        MemoryError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(
+            f"can't be read as an .npz file ({said})",
+            where=path,
+            remedy="check that it is the file you meant, and whole",
+        ) from error
+
+
+def _read(archive: zipfile.ZipFile, limit: int, only: frozenset[str] | None) -> Arrays:
+    members = archive.infolist()
+    if len(members) > _MAX_MEMBERS:
+        raise ValueError(f"it holds {len(members)} arrays")
+    wanted = [m for m in members if only is None or m.filename.removesuffix(".npy") in only]
+    if sum(m.file_size for m in wanted) > limit:
+        raise ValueError(f"its arrays have more than {limit >> 20} MiB")
+    found: Arrays = {}
+    for member in wanted:
+        if not member.filename.endswith(".npy"):
+            raise ValueError(f"{member.filename!r} is no array")
+        if member.file_size > _MOST_SMALLER * member.compress_size + 1000:
+            raise ValueError(f"{member.filename!r} claims more than it can hold")
+        with archive.open(member) as stream:
+            _check_header(stream, member)
+        with archive.open(member) as stream:
+            array = npy.read_array(stream, allow_pickle=False)
+            if stream.read(1):  # which also has the sum looked at
+                raise ValueError(f"{member.filename!r} holds more than its array")
+        found[member.filename.removesuffix(".npy")] = array
+    return found
+
+
+def _check_header(stream: IO[bytes], member: zipfile.ZipInfo) -> None:
+    """Refuse an array that is larger than its bytes, before there is any room made for it."""
+    version = npy.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"{member.filename!r} is of a version {version}")
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _fortran, dtype = read(stream)
+    if dtype.kind not in _KINDS:
+        raise ValueError(f"{member.filename!r} holds {dtype}")
+    if math.prod(shape) * dtype.itemsize != member.file_size - stream.tell():
+        raise ValueError(f"{member.filename!r} is of another size than it says")
