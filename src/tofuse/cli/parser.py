@@ -160,6 +160,7 @@ def _command(
     *,
     epilog: str | None = None,
     function: str | None = None,
+    reconstructs: bool = False,
 ) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
@@ -173,14 +174,19 @@ def _command(
         import tofuse.cli.commands as functions
 
         made: Callable[[argparse.Namespace], int] = getattr(functions, function or name)
-        return made(arguments)
+        if not reconstructs:
+            return made(arguments)
+        from tofuse.kernels.ahead import compiled_beside
+
+        with compiled_beside():
+            return made(arguments)
 
     parser.set_defaults(command=call, parser=parser)
     return parser
 
 
 def _run(commands: Any) -> None:
-    p = _command(commands, "run", "reconstruct a recording", epilog=_EXIT)
+    p = _command(commands, "run", "reconstruct a recording", epilog=_EXIT, reconstructs=True)
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the result")
     p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
@@ -360,6 +366,7 @@ def _judge(commands: Any) -> None:
         "judge",
         "assess poses from any source, without a reference",
         epilog="exit status: 0, judged; 3, the depth images contradict the poses; 2, bad input",
+        reconstructs=True,
     )
     p.add_argument("recording", metavar="RECORDING", help="range images")
     p.add_argument(
@@ -389,6 +396,7 @@ def _merge(commands: Any) -> None:
         "merge",
         "merge the results of several recordings into one map",
         epilog=_SESSIONS + _EXIT_MERGE,
+        reconstructs=True,
     )
     p.add_argument(
         "results",
@@ -479,6 +487,7 @@ def _demo(commands: Any) -> None:
         "demo",
         "simulate a recording and reconstruct it",
         epilog="The recording is left in DIR/recording, the result in DIR.\n\n" + _EXIT,
+        reconstructs=True,
     )
     p.add_argument("--scene", choices=DEMO_SCENES, default="room", help="what to simulate (room)")
     p.add_argument(

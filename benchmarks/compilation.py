@@ -1,0 +1,102 @@
+"""How long the first run on a machine compiles, alone and with a second process beside it.
+
+    python benchmarks/compilation.py [RECORDING]
+    python benchmarks/compilation.py --list RECORDING [RECORDING ...]
+
+Each row is a `tofuse run` in a process of its own: with all kernels in the cache, with none and no
+second process, and with none and the second process (`tofuse.kernels.ahead`). `--list` writes the
+list by which that process works, from what runs of the recordings call.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+LIST = ROOT / "src" / "tofuse" / "kernels" / "signatures.txt"
+ALONE = "import os, sys; os.cpu_count = lambda: 1; from tofuse.cli import main; sys.exit(main())"
+BOTH = "import sys; from tofuse.cli import main; sys.exit(main())"
+
+
+def seconds(program: str, recording: Path, cache: str) -> float:
+    """Wall time of a run."""
+    with tempfile.TemporaryDirectory() as out:
+        words = ["run", str(recording), "--out", f"{out}/result", "--threads", "2"]
+        start = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-c", program, *words],
+            env=os.environ | {"NUMBA_CACHE_DIR": cache},
+            check=True,
+            capture_output=True,
+        )
+        return time.perf_counter() - start
+
+
+def print_table(recording: Path) -> None:
+    """Print the seconds of each way."""
+    print("| kernels | s |\n|---|---|")
+    with tempfile.TemporaryDirectory() as cache:
+        cold = seconds(ALONE, recording, cache)
+        warm = seconds(ALONE, recording, cache)
+    with tempfile.TemporaryDirectory() as cache:
+        beside = seconds(BOTH, recording, cache)
+    print(f"| in the cache | {warm:.1f} |")
+    print(f"| compiled by the run alone | {cold:.1f} |")
+    print(f"| and by a second process | {beside:.1f} |")
+
+
+def called(recordings: list[Path]) -> list[str]:
+    """Lines of the list, in the order in which runs call kernels from Python."""
+    lines: dict[str, None] = {}
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["NUMBA_CACHE_DIR"] = cache
+        from numba.core import event
+
+        from tofuse.kernels import ahead
+
+        depth = 0
+
+        class Listener(event.Listener):
+            def on_start(self, event: Any) -> None:
+                nonlocal depth
+                kernel = event.data["dispatcher"].py_func
+                if depth == 0 and kernel.__module__.startswith("tofuse.kernels."):
+                    name = f"{kernel.__module__.rsplit('.', 1)[1]}.{kernel.__name__}"
+                    lines.setdefault(ahead.line_of(name, event.data["args"]))
+                depth += 1
+
+            def on_end(self, event: Any) -> None:
+                nonlocal depth
+                depth -= 1
+
+        with event.install_listener("numba:compile", Listener()):
+            from tofuse.cli import main
+
+            for recording in recordings:
+                main(
+                    ["run", str(recording), "--every", "4", "--out", f"{cache}/out", "--overwrite"]
+                )
+    return list(lines)
+
+
+def main() -> None:
+    """Print the table, or write the list."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("recordings", nargs="*", type=Path)
+    parser.add_argument("--list", action="store_true")
+    given = parser.parse_args()
+    if given.list:
+        LIST.write_text("\n".join(called(given.recordings)) + "\n", encoding="ascii")
+        return
+    print_table(given.recordings[0])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""Kernels compiled ahead of their first call, by a second process beside the first run.
+
+The first run on a machine compiles every kernel that it calls. While it compiles what it needs
+first, a process of its own goes through the same list from the end, into the same cache; where they
+meet, the rest is there. The list holds the types of arguments, as they were in runs of the default
+method: `python benchmarks/compilation.py --list` writes it anew.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from tofuse.kernels import jit
+
+_LIST = Path(__file__).with_name("signatures.txt")
+_DONE = "compiled"
+_SCALARS = {"f4": "float32", "f8": "float64", "i8": "int64", "b1": "boolean"}
+_DTYPES = _SCALARS | {
+    "i1": "int8",
+    "i4": "int32",
+    "u1": "uint8",
+    "u2": "uint16",
+    "c16": "complex128",
+}
+_NAMES = {name: short for short, name in _DTYPES.items()} | {"bool": "b1"}
+
+
+@contextmanager
+def compiled_beside() -> Iterator[None]:
+    """Let another process compile kernels meanwhile, where none are compiled yet.
+
+    It ends with the block. Nothing depends on it: what it has not compiled is compiled when called.
+    """
+    helper = _start()
+    try:
+        yield
+    finally:
+        if helper is not None:
+            helper.terminate()
+            helper.wait()
+
+
+def _start() -> subprocess.Popen[bytes] | None:
+    if (os.cpu_count() or 1) < 2 or (Path(jit.cache_folder()) / _DONE).exists():
+        return None
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-m", "tofuse.kernels.ahead"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the run, which ends this process
+        )
+    except OSError:  # no more processes
+        return None
+
+
+def listed() -> list[tuple[str, tuple[Any, ...]]]:
+    """Names and types of arguments of the kernels that runs call, in the order in which they do."""
+    found = []
+    for line in _LIST.read_text(encoding="ascii").splitlines():
+        name, *types = line.split()
+        found.append((name, tuple(_type_of(text) for text in types)))
+    return found
+
+
+def compile_listed() -> None:
+    """Compile what is listed, the last first, or load it from the cache."""
+    for name, types in reversed(listed()):
+        module, function = name.rsplit(".", 1)
+        getattr(import_module(f"tofuse.kernels.{module}"), function).compile(types)
+    (Path(jit.cache_folder()) / _DONE).touch()
+
+
+def line_of(name: str, types: tuple[Any, ...]) -> str:
+    """Return the line of the list for a kernel, "module.function", and types of arguments."""
+    return " ".join([name, *(_text_of(kind) for kind in types)])
+
+
+def _type_of(text: str) -> Any:
+    kinds: Any = numba.types
+    if "x" in text:
+        count, item = text.split("x")
+        return kinds.UniTuple(_type_of(item), int(count))
+    short, _, shape = text.lstrip("!").partition(":")
+    dtype = getattr(kinds, _DTYPES[short])
+    if not shape:
+        return dtype
+    return kinds.Array(dtype, int(shape[0]), shape[1], readonly=text.startswith("!"))
+
+
+def _text_of(kind: Any) -> str:
+    if isinstance(kind, numba.types.UniTuple):
+        return f"{kind.count}x{_text_of(kind.dtype)}"
+    if isinstance(kind, numba.types.Array):
+        mark = "" if kind.mutable else "!"
+        return f"{mark}{_NAMES[str(kind.dtype)]}:{kind.ndim}{kind.layout}"
+    return _NAMES[str(kind)]
+
+
+if __name__ == "__main__":
+    compile_listed()

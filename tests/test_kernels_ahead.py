@@ -1,0 +1,97 @@
+"""Kernels that a second process compiles beside the first run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from tofuse.kernels import ahead, jit
+
+
+def test_every_listed_kernel_is_there_and_can_be_written_again() -> None:
+    lines = []
+    for name, types in ahead.listed():
+        module, function = name.rsplit(".", 1)
+        __import__(f"tofuse.kernels.{module}")
+        assert hasattr(sys.modules[f"tofuse.kernels.{module}"], function)
+        lines.append(ahead.line_of(name, types))
+    assert lines == Path(ahead.__file__).with_name("signatures.txt").read_text().splitlines()
+    assert len(lines) == len(set(lines)) > 50
+
+
+def test_what_is_listed_compiles(tmp_path: Path) -> None:
+    """From the cache of these tests, or anew: types that a kernel can't take would fail."""
+    words = [sys.executable, "-m", "tofuse.kernels.ahead"]
+    subprocess.run(words, check=True, capture_output=True)
+    assert (Path(jit.cache_folder()) / "compiled").exists()
+
+
+def test_a_run_calls_what_is_listed(room_recording: Path) -> None:
+    program = textwrap.dedent(
+        """
+        import sys, tofuse
+        from importlib import import_module
+        from tofuse.kernels import ahead
+        tofuse.reconstruct(tofuse.open(sys.argv[1]))
+        for name, types in ahead.listed():
+            module, function = name.rsplit(".", 1)
+            module = sys.modules.get(f"tofuse.kernels.{module}")
+            if module is not None and types in getattr(module, function).overloads:
+                print(name)
+        """
+    )
+    words = [sys.executable, "-c", program, str(room_recording)]
+    done = subprocess.run(words, check=True, capture_output=True, text=True)
+    called = done.stdout.split()
+    for name in ("steps.settle", "surface.fit_planes", "refinement.pair_equations"):
+        assert name in called
+    assert len(called) > 40
+
+
+def test_only_a_first_run_starts_a_second_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    started = []
+
+    class Process:
+        ended = 0
+
+        def terminate(self) -> None:
+            self.ended += 1
+
+        def wait(self) -> None:
+            self.ended += 1
+
+    def start(words: list[str], **_: object) -> Process:
+        started.append(Process())
+        assert words[1:] == ["-m", "tofuse.kernels.ahead"]
+        return started[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(RuntimeError), ahead.compiled_beside():
+        raise RuntimeError
+    assert [p.ended for p in started] == [2]
+    (tmp_path / "compiled").touch()
+    with ahead.compiled_beside():
+        pass
+    assert len(started) == 1
+
+
+def test_a_machine_without_more_processes_compiles_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    with ahead.compiled_beside():
+        pass
