@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -21,14 +21,13 @@ from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
-from tofuse.results.folder import RECORDING, component_name, is_result, settle
+from tofuse.results.folder import component_name, is_result, settle
 from tofuse.results.output import main_poses, read_run_json
+from tofuse.results.reopening import RecordedPart, recorded_parts, reopened, where_it_lies
 
 Float64 = NDArray[np.float64]
 
 _REMEDY = "give the --out of `tofuse run`"
-# Times of frames that differ by more are not those of the same recording, s.
-_SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,33 +107,17 @@ def sessions_of(
     InputError
         If it can't be merged with any other; see `read_sessions`.
     """
-    return [_session(part, folder, threads, progress) for part in _read_parts(folder, components)]
+    return [
+        _session(part, stated, folder, threads, progress)
+        for part, stated in _read_parts(folder, components)
+    ]
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """What a result says of one of its sessions.
+def _read_parts(folder: Path, components: int) -> list[tuple[RecordedPart, dict[int, StatedPose]]]:
+    """Read what a result says of its recordings and of their frames, by index in the recording.
 
-    Attributes
-    ----------
-    config
-        As plain data.
-    times
-        s, by the index of the frame in the recording; None where other sessions moved them on.
-    frames, stated
-        Indices in the recording, and what is stated of them.
+    Its components are numbered from `components`.
     """
-
-    name: str
-    opening: Opening
-    config: dict[str, Any]
-    times: dict[int, float] | None
-    frames: list[int]
-    stated: dict[int, StatedPose]
-
-
-def _read_parts(folder: Path, components: int) -> list[_Part]:
-    """Read what a result says; its components are numbered from `components`."""
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
     settle(folder)
@@ -142,50 +125,34 @@ def _read_parts(folder: Path, components: int) -> list[_Part]:
         raise InputError("holds no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")
     try:
-        return list(_parts(folder, run, components))
+        stated = _stated(folder, run, components)
+        parts = list(recorded_parts(folder, run))
+        return [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
             "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy=_REMEDY
         ) from error
 
 
-def _parts(folder: Path, run: Mapping[str, Any], components: int) -> Iterator[_Part]:
-    stated = _stated(folder, run, components)
-    times = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
-    if not times:
-        raise ValueError("no frames")
-    several = run.get("sessions") or []
-    alone = {
-        "name": folder.resolve().name,
-        "opening": run["input"].get("opening") or _of_old(run["input"]),
-        "config": run["config"],
-        "first": 0,
-        "count": max(times) + 1,
-    }
-    for part in several or [alone]:
-        first, count = int(part["first"]), int(part["count"])
-        mine = {k - first: t for k, t in times.items() if first <= k < first + count}
-        yield _Part(
-            str(part["name"]),
-            Opening.from_dict(part["opening"], folder / "run.json"),
-            dict(part["config"]),
-            None if several else mine,
-            list(mine),
-            {k - first: s for k, s in stated.items() if first <= k < first + count},
-        )
-
-
-def _session(part: _Part, folder: Path, threads: int | None, progress: Progress) -> Session:
+def _session(
+    part: RecordedPart,
+    stated: dict[int, StatedPose],
+    folder: Path,
+    threads: int | None,
+    progress: Progress,
+) -> Session:
     """Open the recording of a part of a result again."""
-    opening = _where_it_lies(part.opening, folder)
-    recording = _opened(opening, part, folder)
+    recording = reopened(part, folder)
+    frame = recording.first_readable()
+    if frame is not None and kind_of(frame) != "range":
+        raise InputError(
+            "is of clouds, and only results of images can be merged",
+            where=folder,
+            remedy="give their clouds together to one `tofuse run`",
+        )
     config = _config(part.config, recording, folder, threads, progress)
-    return Session(part.name, folder, opening, recording, config, part.stated)
-
-
-def _of_old(told: Mapping[str, Any]) -> dict[str, Any]:
-    """How the recording of a result of before version 0.2 was opened, as far as it says."""
-    return Opening((Path(told["path"]),)).to_dict()
+    opening = where_it_lies(part.opening, folder)
+    return Session(part.name, folder, opening, recording, config, stated)
 
 
 def _stated(folder: Path, run: Mapping[str, Any], components: int) -> dict[int, StatedPose]:
@@ -216,47 +183,6 @@ def _poses(folder: Path, run: dict[str, Any] | None) -> dict[int, Float64]:
     run = read_run_json(folder / "run.json") if run is None else run
     indices, poses = main_poses(folder, run)
     return dict(zip(indices, poses, strict=True))
-
-
-def _where_it_lies(opening: Opening, folder: Path) -> Opening:
-    """The recording where it was, or where `tofuse demo` leaves it: beside its result."""
-    beside = folder / RECORDING
-    lies = all(path.exists() for path in opening.paths)
-    if not lies and beside.is_dir() and [path.name for path in opening.paths] == [RECORDING]:
-        return replace(opening, paths=(beside,))
-    return opening
-
-
-def _opened(opening: Opening, part: _Part, folder: Path) -> Recording:
-    """Open the recording of a result, and check that it still is what it was."""
-    for path in (*opening.paths, *((opening.camera,) if opening.camera else ())):
-        if not path.exists():
-            raise InputError(
-                f"needs {path}, which is gone",
-                where=folder,
-                remedy="put it back there, or run `tofuse run` again where it is now",
-            )
-    recording = opening.open()
-    chosen = np.isin(recording.indices, part.frames)
-    same = int(chosen.sum()) == len(part.frames)
-    recording = replace(recording, indices=recording.indices[chosen])
-    if same and part.times is not None:
-        times = np.array([part.times[k] for k in recording.indices.tolist()])
-        same = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_SAME_TIME))
-    if not same:
-        raise InputError(
-            f"is not of the frames that {recording.path} holds by now",
-            where=folder,
-            remedy="run `tofuse run` again",
-        )
-    frame = recording.first_readable()
-    if frame is not None and kind_of(frame) != "range":
-        raise InputError(
-            "is of clouds, and only results of images can be merged",
-            where=folder,
-            remedy="give their clouds together to one `tofuse run`",
-        )
-    return recording
 
 
 def _config(
