@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
+import struct
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
+from test_files_glb import parse
 from tofuse.cli import main
 from tofuse.cli.parser import EXPORTS
 from tofuse.errors import InputError
@@ -39,7 +44,8 @@ def result(tmp_path: Path) -> Path:
     faces = np.concatenate([np.stack([a, a + 1, a + 6], 1), np.stack([a + 1, a + 7, a + 6], 1)])
     columns = {
         "normals": normals,
-        "color": rng.integers(0, 256, (30, 3), np.uint8),
+        # Smooth, so that no picture of them can be off by more than its rounding.
+        "color": np.round(60 + 40 * points @ [[3, 0, 1], [0, 3, 1], [5, 0, 0]]).astype(np.uint8),
         "scalars": {
             "views": rng.integers(1, 900, 30).astype(np.int32),
             "sigma": rng.uniform(0.001, 0.02, 30).astype(np.float32),
@@ -137,24 +143,173 @@ def test_e57(result: Path, expected) -> None:
     np.testing.assert_array_equal(arrays["tofuse:sigma"].astype(np.float32), expected.sigma)
 
 
-@pytest.mark.parametrize("name", ["obj", "gltf"])
-def test_meshes_stand_upright(name: str, result: Path, expected) -> None:
+@pytest.fixture
+def upright(expected) -> SimpleNamespace:
+    """The surface as it should stand: up is the mean of the cameras' up."""
+    up = -POSES[:, :3, 1].mean(0)
+    y = up / np.linalg.norm(up)
+    x = np.cross(y, [0, 0, -1])  # the first camera looks along z, away from the viewer
+    x /= np.linalg.norm(x)
+    R = np.stack([x, y, np.cross(x, y)])
+    return SimpleNamespace(
+        points=expected.points @ R.T,
+        normals=expected.normals @ R.T,
+        color=expected.color.astype(float),
+        corners=np.sort((expected.points @ R.T)[expected.faces].reshape(-1, 9).round(4), 0),
+    )
+
+
+def check_surface(upright, points, faces, normals, color, *, exact: float = 2e-5) -> None:
+    """What another program read is what was written, whatever vertices stand twice at seams."""
+    points = np.asarray(points, float)
+    distance = np.linalg.norm(points[:, None] - upright.points[None], axis=2)
+    near = distance.argmin(1)
+    assert distance.min(1).max() < exact
+    assert distance.min(0).max() < exact
+    corners = np.sort(points[np.asarray(faces)].reshape(-1, 9).round(4), 0)
+    np.testing.assert_allclose(corners, upright.corners, atol=2e-4)
+    if normals is not None:
+        np.testing.assert_allclose(normals, upright.normals[near], atol=0.01)
+    if color is not None:
+        assert np.abs(np.asarray(color, float) - upright.color[near]).max() <= 0.01 * 255 + 1
+
+
+@pytest.mark.parametrize("name", ["glb", "gltf", "obj", "stl"])
+def test_surfaces_by_trimesh(name: str, result: Path, upright) -> None:
     trimesh = pytest.importorskip("trimesh")
     (path,) = export(result, [name])
     (mesh,) = trimesh.load_scene(path, process=False, maintain_order=True).geometry.values()
-    # The first camera's y points down, and it looks along z; up is the mean of the cameras'.
-    assert (
-        np.linalg.norm(mesh.vertices, axis=1) - np.linalg.norm(expected.points, axis=1)
-    ).max() < 1e-5
-    R = np.linalg.lstsq(expected.points.astype(float), mesh.vertices, rcond=None)[0].T
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-4)
-    up = -POSES[:, :3, 1].mean(0)
-    np.testing.assert_allclose(R @ up / np.linalg.norm(up), [0, 1, 0], atol=1e-3)
-    np.testing.assert_array_equal(mesh.faces, expected.faces)
-    np.testing.assert_allclose(mesh.vertex_normals, expected.normals @ R.T, atol=1e-3)
-    if name == "obj":  # what glTF holds is linear light, and is read back elsewhere
-        found = mesh.visual.vertex_colors[:, :3].astype(int)
-        np.testing.assert_allclose(found, expected.color, atol=1)
+    plain = name == "stl"
+    color = None if plain else mesh.visual.to_color().vertex_colors[:, :3]
+    check_surface(upright, mesh.vertices, mesh.faces, None if plain else mesh.vertex_normals, color)
+
+
+@pytest.mark.parametrize("name", ["glb", "obj", "stl"])
+def test_surfaces_by_open3d(name: str, result: Path, upright) -> None:
+    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
+    (path,) = export(result, [name])
+    mesh = open3d.io.read_triangle_mesh(str(path))
+    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+    color = None
+    if name != "stl":
+        (image,) = (np.asarray(each) for each in mesh.textures if not each.is_empty())
+        # Places of the corners of triangles, from the lower left; each vertex has one.
+        uv = np.zeros((len(points), 2))
+        uv[faces.ravel()] = np.asarray(mesh.triangle_uvs)
+        color = sampled(image, uv)
+    normals = None if name == "stl" else np.asarray(mesh.vertex_normals)
+    check_surface(upright, points, faces, normals, color)
+
+
+def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) at places (N, 2) from the upper left corner."""
+    size = np.array(image.shape[1::-1])
+    u, v = np.rint(uv * size - 0.5).astype(int).clip(0, size - 1).T
+    return image[v, u, :3]
+
+
+def test_usdz_by_its_specification(result: Path, upright) -> None:
+    """The archive by the words of the specification, and the scene's text by hand."""
+    (path,) = export(result, ["usdz"])
+    data = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        assert archive.testzip() is None
+        files = archive.infolist()
+        scene = archive.read(files[0]).decode()
+        image = cv2.imdecode(np.frombuffer(archive.read("texture.jpg"), np.uint8), 1)[..., ::-1]
+    assert [each.filename for each in files] == ["model.usda", "texture.jpg"]
+    for each in files:
+        assert (each.compress_type, each.flag_bits & 1) == (zipfile.ZIP_STORED, 0)
+        name, extra = struct.unpack_from("<HH", data, each.header_offset + 26)
+        assert (each.header_offset + 30 + name + extra) % 64 == 0
+    assert scene.startswith("#usda 1.0")
+    assert 'upAxis = "Y"' in scene
+    assert "metersPerUnit = 1\n" in scene
+
+    def numbers(what: str) -> np.ndarray:
+        (found,) = re.findall(re.escape(what) + r" = \[(.*)\]", scene)
+        return np.array(re.findall(r"-?[0-9.]+", found), float)
+
+    faces = numbers("faceVertexIndices").astype(int).reshape(-1, 3)
+    assert (numbers("faceVertexCounts") == 3).all()
+    uv = numbers("primvars:st").reshape(-1, 2) * [1, -1] + [0, 1]
+    points = numbers("point3f[] points").reshape(-1, 3)
+    normals = numbers("normal3f[] normals").reshape(-1, 3)
+    check_surface(upright, points, faces, normals, sampled(image, uv))
+    low, high = numbers("float3[] extent").reshape(2, 3)
+    np.testing.assert_allclose([low, high], [points.min(0), points.max(0)], atol=1e-5)
+
+
+def test_usdz_by_openusd(result: Path, upright) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
+    from pxr import UsdGeom, UsdShade
+
+    (path,) = export(result, ["usdz"])
+    stage = usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
+    points, faces = mesh.GetPointsAttr().Get(), mesh.GetFaceVertexIndicesAttr().Get()
+    faces = np.array(faces).reshape(-1, 3)
+    check_surface(upright, np.array(points), faces, np.array(mesh.GetNormalsAttr().Get()), None)
+    assert mesh.GetNormalsInterpolation() == "vertex"
+    assert len(mesh.GetPrim().GetAttribute("primvars:st").Get()) == len(points)
+    material, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
+    shader = material.ComputeSurfaceSource()[0]
+    source = shader.GetInput("diffuseColor").GetConnectedSources()[0][0].source
+    file = UsdShade.Shader(source.GetPrim()).GetInput("file").Get()
+    assert file.path == "texture.jpg"
+    assert file.resolvedPath.endswith("mesh.usdz[texture.jpg]")
+
+
+def test_many_triangles_have_colours_of_vertices(result: Path, upright, monkeypatch) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setattr("tofuse.results.export._MOST_PAINTED", 10)
+    glb, obj, usdz = export(result, ["glb", "obj", "usdz"])
+    (mesh,) = trimesh.load_scene(obj, process=False, maintain_order=True).geometry.values()
+    color = mesh.visual.vertex_colors[:, :3]
+    check_surface(upright, mesh.vertices, mesh.faces, mesh.vertex_normals, color)
+    document, arrays = parse(glb)
+    (primitive,) = document["meshes"][0]["primitives"]
+    found = arrays[primitive["attributes"]["COLOR_0"]][:, :3] / 65535
+    # What glTF holds is linear light, by the inverse of sRGB.
+    s = upright.color / 255
+    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(found, light, atol=1e-4)
+    with zipfile.ZipFile(usdz) as archive:
+        scene = archive.read("model.usda").decode()
+    found = re.findall(r"displayColor = \[(.*)\]", scene)[0]
+    numbers = np.array(re.findall(r"[0-9.]+", found), float).reshape(-1, 3)
+    np.testing.assert_allclose(numbers, light, atol=1e-4)
+
+
+def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
+    """A texture keeps what lies between the few vertices that are left."""
+    trimesh = pytest.importorskip("trimesh")
+    n = 120
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    points = np.stack([x, y, np.full_like(x, 2.0)], -1).reshape(-1, 3)
+    color = np.zeros((n * n, 3), np.uint8)
+    color[:, 0] = np.round(127 + 120 * np.sin(6 * points[:, 0]))
+    color[:, 1] = np.round(127 + 120 * np.cos(6 * points[:, 1]))
+    a = (np.arange(n - 1) + n * np.arange(n - 1)[:, None]).ravel()
+    faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
+    normals = np.tile(np.float32([0, 0, -1]), (n * n, 1))
+    write_ply(result / "mesh.ply", points, faces=faces, normals=normals, color=color)
+    write_tum(result / "trajectory.txt", TIMES, np.tile(np.eye(4), (3, 1, 1)))
+    glb, stl = export(result, ["glb", "stl"], faces=200)
+    (mesh,) = trimesh.load_scene(glb, process=False).geometry.values()
+    assert 50 < len(mesh.faces) <= 200
+    assert len(trimesh.load(stl).faces) <= 200
+    image = np.array(mesh.visual.material.baseColorTexture.convert("RGB")).astype(int)
+    # Places within triangles, between vertices, have the colours that the full mesh has there.
+    weights = np.random.default_rng(3).dirichlet([1, 1, 1], (20, len(mesh.faces)))
+    uv = np.einsum("kfi,fic->kfc", weights, mesh.visual.uv[mesh.faces]).reshape(-1, 2)
+    p = np.einsum("kfi,fic->kfc", weights, mesh.vertices[mesh.faces]).reshape(-1, 3)
+    found = sampled(image, uv * [1, -1] + [0, 1])
+    np.testing.assert_allclose(p[:, 2], -2, atol=1e-5)
+    assert np.abs(found[:, 0] - (127 + 120 * np.sin(6 * p[:, 0]))).max() < 20
+    assert np.abs(found[:, 1] - (127 + 120 * np.cos(-6 * p[:, 1]))).max() < 20
 
 
 def test_kitti(result: Path) -> None:

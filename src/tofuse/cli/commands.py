@@ -720,7 +720,13 @@ def export(arguments: argparse.Namespace) -> int:
     from tofuse.results.export import export as export_result
 
     for path in export_result(
-        arguments.result, arguments.formats, arguments.out, overwrite=arguments.overwrite
+        arguments.result,
+        arguments.formats,
+        arguments.out,
+        faces=arguments.faces,
+        every=arguments.every,
+        pinhole=arguments.pinhole,
+        overwrite=arguments.overwrite,
     ):
         print(path)
     return 0

@@ -14,7 +14,10 @@ from typing import Any, NoReturn
 from tofuse._version import __version__
 
 DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
-EXPORTS = ("pcd", "las", "e57", "obj", "gltf", "kitti", "log")
+EXPORTS = (
+    *("pcd", "las", "e57", "glb", "gltf", "obj", "usdz", "stl"),
+    *("kitti", "log", "nerfstudio", "colmap"),
+)
 
 _EXIT = """\
 exit status:
@@ -683,6 +686,15 @@ def _export(commands: Any) -> None:
     p.add_argument("formats", nargs="+", metavar="FORMAT", help=", ".join(EXPORTS))
     p.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the files (default: that of the result)"
+    )
+    p.add_argument(
+        "--faces", type=_count, metavar="N", help="at most so many triangles (60000; STL: all)"
+    )
+    p.add_argument(
+        "--every", type=_count, default=1, metavar="N", help="every N-th image (nerfstudio, colmap)"
+    )
+    p.add_argument(
+        "--pinhole", action="store_true", help="images without distortion (nerfstudio, colmap)"
     )
     p.add_argument("--overwrite", action="store_true", help="replace existing files")
 

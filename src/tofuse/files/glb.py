@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,20 +103,10 @@ def _document(
     if normals is not None:
         columns["NORMAL"] = np.asarray(normals, np.float32)
     if color is not None:
-        columns["COLOR_0"] = _linear(np.asarray(color, np.uint8))
+        columns["COLOR_0"] = linear(np.asarray(color, np.uint8))
     if uv is not None:
         columns["TEXCOORD_0"] = np.asarray(uv, np.float32)
-    for what, values in columns.items():
-        if values.shape[:1] != points.shape[:1] or values.ndim != 2 or points.shape[1:] != (3,):
-            raise InputError(
-                f"{what} has shape {values.shape}", where=path, remedy=f"give {len(points)} rows"
-            )
-    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and faces.max() >= len(points)):
-        raise InputError(
-            f"faces of shape {faces.shape} don't fit {len(points)} points",
-            where=path,
-            remedy="give (M, 3) rows of points",
-        )
+    check_mesh(path, points, faces, columns)
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": generator},
         "scene": 0,
@@ -164,6 +155,25 @@ def _document(
     return document, body
 
 
+def check_mesh(
+    path: str | Path, points: ArrayLike, faces: ArrayLike, columns: Mapping[str, ArrayLike]
+) -> None:
+    """Raise InputError, naming the file, unless columns (N, ...) and faces fit points (N, 3)."""
+    points, faces = np.asarray(points), np.asarray(faces)
+    for what, values in {"points": points, **columns}.items():
+        shape = np.shape(values)
+        if shape[:1] != points.shape[:1] or len(shape) != 2 or points.shape[1:] != (3,):
+            raise InputError(
+                f"{what} has shape {shape}", where=path, remedy=f"give {len(points)} rows"
+            )
+    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and faces.max() >= len(points)):
+        raise InputError(
+            f"faces of shape {faces.shape} don't fit {len(points)} points",
+            where=path,
+            remedy="give (M, 3) rows of points",
+        )
+
+
 def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
     component = {"f": _FLOAT, "u2": _USHORT, "u4": _UINT}
     code = values.dtype.kind if values.dtype.kind == "f" else f"u{values.dtype.itemsize}"
@@ -178,7 +188,7 @@ def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
     return accessor
 
 
-def _linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Linear light and opacity (N, 4) of sRGB colours (IEC 61966-2-1)."""
     s = np.arange(256) / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)

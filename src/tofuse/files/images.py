@@ -217,6 +217,24 @@ def png_bytes(image: NDArray[np.generic]) -> bytes:
     return bytes(data)
 
 
+def jpeg_bytes(image: NDArray[np.uint8], quality: int = 92) -> bytes:
+    """Encode (H, W, 3) uint8 RGB as JPEG."""
+    import cv2
+
+    pixels: NDArray[Any] = np.ascontiguousarray(np.asarray(image, np.uint8)[..., ::-1])
+    ok, data = cv2.imencode(
+        ".jpg",
+        pixels,
+        [
+            *(cv2.IMWRITE_JPEG_QUALITY, quality),
+            *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+        ],
+    )
+    if not ok:
+        raise InputError(f"of shape {image.shape} can't be encoded as JPEG", where="image")
+    return bytes(data)
+
+
 def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
     """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
     write_bytes(path, png_bytes(image))

@@ -52,12 +52,12 @@ def write_obj(
         lines += [f"mtllib {material.name}", "usemtl surface"]
     if color is not None:
         table = np.column_stack([table, np.asarray(color, float) / 255])
-    lines += _rows("v", table, "%.6g" if color is None else "%.6g %.6g %.6g %.4g %.4g %.4g")
+    lines += _rows("v", table, "%.5f" if color is None else "%.5f %.5f %.5f %.4g %.4g %.4g")
     if uv is not None:
         places = np.asarray(uv, float) * [1, -1] + [0, 1]  # from the lower left corner
-        lines += _rows("vt", places, "%.6f")
+        lines += _rows("vt", places, "%.5f")
     if normals is not None:
-        lines += _rows("vn", np.asarray(normals, float), "%.4f")
+        lines += _rows("vn", np.asarray(normals, float), "%.3f")
     corner = {(False, False): "%d", (True, False): "%d/%d", (False, True): "%d//%d"}.get(
         (uv is not None, normals is not None), "%d/%d/%d"
     )

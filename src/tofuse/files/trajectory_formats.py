@@ -34,7 +34,7 @@ _NANOSECONDS = 1e12
 # Digits of a number that an int64 holds in any case.
 _DIGITS = 18
 # Cameras of OpenGL look along -z, with y up.
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +271,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
             T = np.array(matrix, float)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError("has no 'transform_matrix' of 4 x 4", where=where) from error
-        poses.append(_rigid(T, where) @ _OPENGL)
+        poses.append(_rigid(T, where) @ OPENGL)
         names.append(str(frame.get("file_path", k)))
     return TimedPoses(_stacked(poses), frames=_numbers_in(names, path))
 

@@ -20,6 +20,7 @@ from tofuse.files.obj import write_obj
 from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
 from tofuse.files.stl import write_stl
+from tofuse.files.usdz import write_usdz
 
 Float64 = NDArray[np.float64]
 
@@ -33,7 +34,9 @@ _SCALARS = {"views": "frames that saw the point", "sigma": "standard deviation i
 class Shape:
     """Points of a model in the world frame, with what is known of them.
 
-    `faces` (M, 3) is None for a cloud; `scalars` are columns (N,) by name.
+    `faces` (M, 3) is None for a cloud; `scalars` are columns (N,) by name. With a `texture`, a PNG
+    or JPEG file, and places in it `uv` (N, 2), from its upper left corner, 0 to 1, the formats that
+    know textures leave `color` out.
     """
 
     points: Float64 | NDArray[np.float32]
@@ -41,6 +44,8 @@ class Shape:
     color: NDArray[np.uint8] | None
     scalars: Mapping[str, ArrayLike]
     faces: NDArray[np.int32] | None = None
+    uv: NDArray[np.float32] | None = None
+    texture: bytes | None = None
 
     def save(self, path: str | Path, R_up_world: Float64 = _R_GLTF_WORLD) -> None:
         """Write it in the format of the suffix.
@@ -48,8 +53,8 @@ class Shape:
         Parameters
         ----------
         R_up_world
-            (3, 3) from the world into axes with y up, in which glTF, OBJ and STL stand; those of
-            the first camera unless given.
+            (3, 3) from the world into axes with y up, in which glTF, OBJ, STL and USDZ stand; those
+            of the first camera unless given.
 
         Raises
         ------
@@ -100,11 +105,12 @@ class Shape:
 
     def turned(self, R: Float64) -> dict[str, Any]:
         """Arrays of the mesh in other axes, as writers of meshes take them."""
+        painted = {"uv": self.uv, "texture": self.texture}
         return {
             "points": self.points @ R.T,
             "faces": self.faces,
             "normals": None if self.normals is None else self.normals @ R.T,
-            "color": self.color,
+            **({"color": self.color} if self.texture is None else painted),
         }
 
 
@@ -157,6 +163,7 @@ _MESHES: dict[str, _Write] = {
     ".gltf": lambda shape, path, R: write_gltf(path, **shape.turned(R), generator=_GENERATOR),
     ".ply": _ply,
     ".obj": lambda shape, path, R: write_obj(path, **shape.turned(R)),
+    ".usdz": lambda shape, path, R: write_usdz(path, **shape.turned(R), generator=_GENERATOR),
     ".stl": _stl,
 }
 _CLOUDS: dict[str, _Write] = {".ply": _ply, ".pcd": _pcd, ".las": _las, ".e57": _e57}

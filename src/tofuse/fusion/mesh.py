@@ -70,7 +70,7 @@ class Mesh:
         return Shape(points, self.normals, self.color, scalars, self.faces)
 
     def save(self, path: str | Path) -> None:
-        """Write it as .glb, .gltf, .ply, .obj or .stl, see `Shape.save`."""
+        """Write it as .glb, .gltf, .ply, .obj, .stl or .usdz, see `Shape.save`."""
         self.shape().save(path)
 
     def to_trimesh(self) -> Any:

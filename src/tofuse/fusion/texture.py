@@ -15,6 +15,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.atlas import NOBODY, draw_triangles, see
+from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import Projection
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -34,6 +35,8 @@ _ROBUST, _ROUNDS = 0.15, 4  # of the logarithm of light
 _MOST_GAIN = 1.0
 # A tenth of what is seen at least, so that black does not weigh without limit.
 _DARK = 0.02
+# Of a texture that keeps the colours of vertices: texels for each, vertices that a texel looks at.
+_TEXELS_A_VERTEX, _NEAR, _LEAST_SIZE = 2.0, 4, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,21 +118,8 @@ def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) ->
     size
         Edge of the texture.
     """
-    atlas = unwrap(mesh, size)
-    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
-    places = np.zeros((atlas.size, atlas.size, 2), np.float32)
-    draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
-    painted = owner != NOBODY
-    corners = atlas.vertices[atlas.faces[owner[painted]]]
-    b, c = places[painted].T[:, :, None]
-
-    def at_texels(values: NDArray[np.generic]) -> Float32:
-        of = values[corners].astype(np.float32)
-        return of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
-
-    points = at_texels(mesh.vertices)
-    normals = at_texels(mesh.normals)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    sheet = _Sheet.of(mesh, size)
+    points, normals = sheet.points, sheet.normals
     gains = exposures(mesh, views, poses)
     channels = views[0].light.shape[2]
     sums = np.zeros((len(points), channels), np.float32)
@@ -144,13 +134,94 @@ def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) ->
         rgb = grey_of(light[:, 0].astype(float))
     colors = np.full((len(points), 3), 128, np.uint8)
     if mesh.color is not None:
-        colors = np.round(at_texels(mesh.color).clip(0, 255)).astype(np.uint8)
+        colors = np.round(sheet.at_texels(mesh.color).clip(0, 255)).astype(np.uint8)
     colors[seen] = rgb
-    image = np.zeros((atlas.size, atlas.size, 3), np.uint8)
-    image[painted] = colors
-    return Textured(
-        mesh, atlas, _spread(image, painted), gains, float(seen.mean()) if len(seen) else 0.0
-    )
+    share = float(seen.mean()) if len(seen) else 0.0
+    return Textured(mesh, sheet.atlas, sheet.filled(colors), gains, share)
+
+
+def baked(mesh: Mesh, faces: int, size: int) -> Textured:
+    """Simplify a surface, and keep the colours of all its vertices in a texture.
+
+    Of the triangles fewer are needed than of the colours. Each texel gets the mean of the four
+    vertices nearest to it, those on the other side of a thin sheet left out, the nearer counting
+    more. Programs disagree about what colours of vertices mean, and none about a texture.
+
+    Parameters
+    ----------
+    mesh
+        With faces and colours.
+    faces
+        Triangles at most.
+    size
+        Edge of the texture at most, in texels; smaller where there are fewer vertices.
+    """
+    assert mesh.color is not None
+    small = mesh.decimated(faces)
+    size = int(np.clip(np.ceil(np.sqrt(_TEXELS_A_VERTEX * len(mesh))), _LEAST_SIZE, size))
+    sheet = _Sheet.of(small, size)
+    if small is mesh:
+        colors = sheet.at_texels(mesh.color)
+    else:
+        near, distance2 = KdTree(mesh.vertices).neighbours(sheet.points, _NEAR)
+        facing = np.einsum("nki,ni->nk", mesh.normals[near], sheet.normals) > 0
+        facing |= ~facing.any(1, keepdims=True)
+        closest = distance2.min(1, keepdims=True)
+        weights = np.where((near >= 0) & facing, 1 / (distance2 + closest + 1e-12), 0)
+        colors = np.einsum("nk,nki->ni", weights, mesh.color[near].astype(float))
+        colors /= weights.sum(1, keepdims=True)
+    image = sheet.filled(np.round(colors.clip(0, 255)).astype(np.uint8))
+    return Textured(small, sheet.atlas, image, np.zeros((0, 3)), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """The texels of a mesh that lie on its triangles.
+
+    Attributes
+    ----------
+    painted
+        (size, size) which texels; there are K.
+    points, normals
+        (K, 3) what they show.
+    """
+
+    atlas: Atlas
+    painted: NDArray[np.bool_]
+    corners: NDArray[np.int32]
+    shares: Float32
+    points: Float32
+    normals: Float32
+
+    @classmethod
+    def of(cls, mesh: Mesh, size: int) -> _Sheet:
+        atlas = unwrap(mesh, size)
+        owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+        places = np.zeros((atlas.size, atlas.size, 2), np.float32)
+        draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
+        painted = owner != NOBODY
+        corners = atlas.vertices[atlas.faces[owner[painted]]]
+        shares = places[painted]
+        points = _between(mesh.vertices, corners, shares)
+        normals = _between(mesh.normals, corners, shares)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        return cls(atlas, painted, corners, shares, points, normals)
+
+    def at_texels(self, values: NDArray[np.generic]) -> Float32:
+        """Values (K, C) between those of the vertices (N, C)."""
+        return _between(values, self.corners, self.shares)
+
+    def filled(self, colors: UInt8) -> UInt8:
+        """Image (size, size, 3) of the colours (K, 3), nothing left open."""
+        image = np.zeros((*self.painted.shape, 3), np.uint8)
+        image[self.painted] = colors
+        return _spread(image, self.painted)
+
+
+def _between(values: NDArray[np.generic], corners: NDArray[np.int32], shares: Float32) -> Float32:
+    b, c = shares.T[:, :, None]
+    of = values[corners].astype(np.float32)
+    return of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
 
 
 def exposures(mesh: Mesh, views: Sequence[LitView], poses: Float64) -> Float64:

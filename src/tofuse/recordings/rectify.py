@@ -81,7 +81,7 @@ class Rectifier:
 
 
 def _as_z(frame: RangeFrame) -> RangeFrame:
-    return replace(frame, depth=frame.z, depth_kind="z", sigma_image=None)
+    return replace(frame, depth=frame.z, depth_kind="z")
 
 
 def _moved(
@@ -110,6 +110,7 @@ def _moved(
         taken(frame.amplitude_image),
         taken(frame.confidence_image),
         taken(frame.color_image),
+        taken(frame.sigma_image),
         amplitude_kind=frame.amplitude_kind,
         ambiguity_m=frame.ambiguity_m,
     )

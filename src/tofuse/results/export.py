@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,16 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError, OutputError
-from tofuse.files.atomic import make_folder
+from tofuse.files.atomic import make_folder, new_folder, output_error
+from tofuse.files.images import jpeg_bytes
 from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion.exchange import Shape
 from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.texture import baked
 from tofuse.fusion.upright import upright
+from tofuse.results.colmap import write_colmap
 from tofuse.results.folder import is_result, settle
+from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.output import read_run_json
 
 Float64 = NDArray[np.float64]
+
+# Triangles unless more are asked for: with a texture as glTF they take 8 MB at most.
+FACES = 60_000
+# To lay out a texture for more would take minutes.
+_MOST_PAINTED = 120_000
+_TEXTURE_SIZE = 2048
 
 
 @dataclass(frozen=True)
@@ -28,6 +41,9 @@ class _Result:
     """The files of a result, read when they are asked for."""
 
     folder: Path
+    faces: int | None
+    every: int
+    pinhole: bool
 
     @cached_property
     def cloud(self) -> Shape:
@@ -41,8 +57,7 @@ class _Result:
         return read_tum(self.folder / "trajectory.txt")
 
     @cached_property
-    def mesh(self) -> tuple[Shape, Float64]:
-        """The mesh, and the rotation (3, 3) that makes it upright."""
+    def mesh(self) -> Mesh:
         path = self.folder / "mesh.ply"
         if not path.is_file():
             raise InputError(
@@ -54,10 +69,34 @@ class _Result:
         faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
         normals = np.zeros((len(ply), 3), np.float32) if ply.normals is None else ply.normals
         nothing = np.zeros(len(ply), np.int32)
-        mesh = Mesh(
+        return Mesh(
             ply.points, faces, normals, ply.color, nothing.astype(np.float32), nothing, np.zeros(3)
         )
-        return mesh.shape(), upright(mesh, self.trajectory[1])
+
+    @cached_property
+    def R_up_world(self) -> Float64:
+        """The rotation (3, 3) that makes the mesh upright."""
+        return upright(self.mesh, self.trajectory[1])
+
+    @cached_property
+    def painted(self) -> Shape:
+        """The mesh as it is looked at: simplified, its colours in a texture where that is quick."""
+        most = self.faces or FACES
+        if self.mesh.color is None or not len(self.mesh.faces):
+            return self.mesh.decimated(most).shape()
+        if min(most, len(self.mesh.faces)) > _MOST_PAINTED:
+            return self.mesh.decimated(most).shape()
+        found = baked(self.mesh, most, _TEXTURE_SIZE)
+        rows = found.atlas.vertices
+        return Shape(
+            found.mesh.vertices[rows],
+            found.mesh.normals[rows],
+            None,
+            {},
+            found.atlas.faces,
+            found.atlas.uv,
+            jpeg_bytes(found.image),
+        )
 
     @cached_property
     def frame_numbers(self) -> NDArray[np.intp]:
@@ -76,8 +115,56 @@ def _cloud(result: _Result, path: Path) -> None:
 
 
 def _mesh(result: _Result, path: Path) -> None:
-    shape, R_up_world = result.mesh
-    shape.save(path, R_up_world)
+    result.painted.save(path, result.R_up_world)
+
+
+def _stl(result: _Result, path: Path) -> None:
+    mesh = result.mesh if result.faces is None else result.mesh.decimated(result.faces)
+    mesh.shape().save(path, result.R_up_world)
+
+
+def _nerfstudio(result: _Result, path: Path) -> None:
+    with _folder(path) as folder:
+        write_nerfstudio(result.folder, folder, result.every, result.pinhole)
+
+
+def _colmap(result: _Result, path: Path) -> None:
+    with _folder(path) as folder:
+        write_colmap(result.folder, folder, result.every, result.pinhole)
+
+
+# Folders that hold images with poses, and what is in them.
+_KINDS = frozenset({"images", "depth", "sigma", "masks"})
+FOLDERS = {
+    "nerfstudio": _KINDS | {"transforms.json", "points.ply"},
+    "colmap": _KINDS | {"sparse"},
+}
+
+
+def foreign(folder: Path) -> tuple[str, ...]:
+    """Return what is in the folder of an export that does not belong there, its own name if all."""
+    if folder.is_symlink() or not folder.is_dir():
+        return (folder.name,)
+    return tuple(sorted({p.name for p in folder.iterdir()} - FOLDERS[folder.name]))
+
+
+@contextmanager
+def _folder(path: Path) -> Iterator[Path]:
+    """Give a new folder that takes the place of an earlier one, of which everything is ours."""
+    if os.path.lexists(path) and (others := foreign(path)):
+        raise OutputError(
+            f"is in the way: it holds {others[0]}, which no export wrote",
+            where=path,
+            remedy="move it away, or give another --out",
+        )
+    made = path.with_name(f".{path.name}-{os.getpid()}")
+    with new_folder(made) as folder:
+        yield folder
+    try:
+        shutil.rmtree(path, ignore_errors=True)
+        os.replace(made, path)
+    except OSError as error:
+        raise output_error(error, path) from error
 
 
 def _kitti(result: _Result, path: Path) -> None:
@@ -93,10 +180,15 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "pcd": ("cloud.pcd", _cloud),
     "las": ("cloud.las", _cloud),
     "e57": ("cloud.e57", _cloud),
-    "obj": ("mesh.obj", _mesh),
+    "glb": ("mesh.glb", _mesh),
     "gltf": ("mesh.gltf", _mesh),
+    "obj": ("mesh.obj", _mesh),
+    "usdz": ("mesh.usdz", _mesh),
+    "stl": ("mesh.stl", _stl),
     "kitti": ("trajectory.kitti.txt", _kitti),
     "log": ("trajectory.log", _log),
+    "nerfstudio": ("nerfstudio", _nerfstudio),
+    "colmap": ("colmap", _colmap),
 }
 
 
@@ -105,6 +197,9 @@ def export(
     formats: Sequence[str],
     out: str | Path | None = None,
     *,
+    faces: int | None = None,
+    every: int = 1,
+    pinhole: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
     """Write a result in other formats; returns the files.
@@ -117,6 +212,12 @@ def export(
         Names in `FORMATS`.
     out
         Where to; beside the result unless given.
+    faces
+        Triangles of a surface at most; `FACES` unless given, and all for STL.
+    every
+        Of the images that have a pose, each so-many-th.
+    pinhole
+        Whether images are rectified, as some programs know no distortion.
     overwrite
         Whether files may be replaced.
 
@@ -142,7 +243,7 @@ def export(
                 "is there already", where=path, remedy="give --overwrite to replace it"
             )
     make_folder(target)
-    result = _Result(folder)
+    result = _Result(folder, faces, every, pinhole)
     for name, path in files.items():
         FORMATS[name][1](result, path)
     return list(files.values())

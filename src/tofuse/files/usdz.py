@@ -1,0 +1,164 @@
+"""USDZ (OpenUSD; Pixar's "Usdz File Format Specification" 1.3): a mesh for phones and headsets.
+
+An archive without compression in which the content of each file begins at a multiple of 64 bytes.
+The first file is the scene, as text.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.files.atomic import write_bytes
+from tofuse.files.glb import check_mesh, linear
+
+_ALIGNED = 64
+_HEADER_BYTES = 30  # of a file in an archive, before its name
+_PADDING_TAG = 0x1986  # of the extra field that moves a file on; as OpenUSD's own packages have it
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+_SCENE = """#usda 1.0
+(
+    defaultPrim = "{name}"
+    doc = "{generator}"
+    metersPerUnit = 1
+    upAxis = "Y"
+)
+
+def Xform "{name}" (
+    kind = "component"
+)
+{{
+    def Mesh "surface" (
+        prepend apiSchemas = ["MaterialBindingAPI"]
+    )
+    {{
+        uniform bool doubleSided = 1
+        float3[] extent = [{low}, {high}]
+        int[] faceVertexCounts = [{counts}]
+        int[] faceVertexIndices = [{faces}]
+        rel material:binding = </{name}/material>
+        point3f[] points = [{points}]
+{columns}        uniform token subdivisionScheme = "none"
+    }}
+
+    def Material "material"
+    {{
+        token outputs:surface.connect = </{name}/material/shader.outputs:surface>
+
+        def Shader "shader"
+        {{
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:diffuseColor.connect = </{name}/material/{reader}>
+            float inputs:metallic = 0
+            float inputs:roughness = 1
+            token outputs:surface
+        }}
+
+{shaders}    }}
+}}
+"""
+_TEXTURED = """        def Shader "place"
+        {{
+            uniform token info:id = "UsdPrimvarReader_float2"
+            string inputs:varname = "st"
+            float2 outputs:result
+        }}
+
+        def Shader "picture"
+        {{
+            uniform token info:id = "UsdUVTexture"
+            asset inputs:file = @{image}@
+            token inputs:sourceColorSpace = "sRGB"
+            float2 inputs:st.connect = </{name}/material/place.outputs:result>
+            token inputs:wrapS = "clamp"
+            token inputs:wrapT = "clamp"
+            float3 outputs:rgb
+        }}
+"""
+_COLORED = """        def Shader "color"
+        {{
+            uniform token info:id = "UsdPrimvarReader_float3"
+            string inputs:varname = "displayColor"
+            float3 outputs:result
+        }}
+"""
+
+
+def write_usdz(
+    path: str | Path,
+    points: ArrayLike,
+    faces: ArrayLike,
+    *,
+    normals: ArrayLike | None = None,
+    color: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
+    texture: bytes | None = None,
+    name: str = "model",
+    generator: str = "tofuse",
+) -> None:
+    """Write a mesh; see `write_glb` for the parameters, errors and axes.
+
+    Colours of vertices, in linear light as USD asks, are shown by few programs; take a texture.
+    """
+    columns = {"normals": normals, "color": color, "uv": uv}
+    check_mesh(path, points, faces, {k: v for k, v in columns.items() if v is not None})
+    p, f = np.asarray(points, np.float32), np.asarray(faces)
+    texts = []
+    if normals is not None:
+        texts.append(("normal3f[] normals", _tuples(np.asarray(normals, float), "%.4f")))
+    image = "texture.png" if texture is not None and texture[:4] == b"\x89PNG" else "texture.jpg"
+    if texture is not None:
+        places = np.asarray(uv, float) * [1, -1] + [0, 1]  # from the lower left corner
+        texts.append(("texCoord2f[] primvars:st", _tuples(places, "%.5f")))
+    elif color is not None:
+        light = linear(np.asarray(color, np.uint8))[:, :3] / 65535
+        texts.append(("color3f[] primvars:displayColor", _tuples(light, "%.4f")))
+    shaders, reader = _COLORED, "color.outputs:result"
+    if texture is not None:
+        shaders, reader = _TEXTURED, "picture.outputs:rgb"
+    low, high = (p.min(0), p.max(0)) if len(p) else (np.zeros(3), np.zeros(3))
+    scene = _SCENE.format(
+        name=name,
+        generator=generator,
+        low=_tuples(low[None], "%.5f"),
+        high=_tuples(high[None], "%.5f"),
+        counts=", ".join(["3"] * len(f)),
+        faces=", ".join(map(str, f.ravel().tolist())),
+        points=_tuples(p, "%.5f"),
+        columns="".join(
+            f'        {what} = [{text}] (\n            interpolation = "vertex"\n        )\n'
+            for what, text in texts
+        ),
+        reader=reader,
+        shaders=shaders.format(name=name, image=image),
+    )
+    files = [(f"{name}.usda", scene.encode())]
+    if texture is not None:
+        files.append((image, texture))
+    write_bytes(path, _package(files))
+
+
+def _tuples(table: NDArray[Any], style: str) -> str:
+    row = "(" + ", ".join([style] * table.shape[1]) + ")"
+    return ", ".join([row % tuple(values) for values in table.tolist()])
+
+
+def _package(files: Iterable[tuple[str, bytes]]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in files:
+            info = zipfile.ZipInfo(name, _DATE)
+            # The content begins after the header, the name and a field of 4 bytes and padding.
+            begin = out.tell() + _HEADER_BYTES + len(name.encode()) + 4
+            padding = -begin % _ALIGNED
+            info.extra = struct.pack("<HH", _PADDING_TAG, padding) + bytes(padding)
+            archive.writestr(info, content)
+    return out.getvalue()

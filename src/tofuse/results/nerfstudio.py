@@ -1,0 +1,105 @@
+"""A result as a data set of nerfstudio: images, depth, poses and points."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.atomic import write_text
+from tofuse.files.ply import write_ply
+from tofuse.files.trajectory_formats import OPENGL
+from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
+from tofuse.results.posed_images import (
+    DEPTH,
+    DEPTH_UNIT_M,
+    IMAGES,
+    MASKS,
+    SIGMA,
+    SIGMA_UNIT_M,
+    ImageFolder,
+    posed_images,
+    some_points,
+)
+
+_FILES = {"file_path": IMAGES, "depth_file_path": DEPTH, "sigma_file_path": SIGMA}
+
+
+def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = False) -> None:
+    """Write the main model of a result into a new folder; with `pinhole` images are rectified.
+
+    Raises
+    ------
+    InputError
+        See `posed_images`; or if no image can be read, or only some are of a fisheye lens.
+    """
+    images = ImageFolder(folder)
+    suited = {Pinhole} if pinhole else set(_MODELS)
+    frames: list[dict[str, Any]] = []
+    lenses: list[dict[str, Any]] = []
+    for posed in posed_images(result, every, lambda camera: type(camera) in suited):
+        images.write(posed)
+        lenses.append(lens(posed.camera))
+        frames.append(
+            {key: f"{kind}/{posed.name}" for key, kind in _FILES.items()}
+            | {
+                "transform_matrix": (posed.T_world_camera @ OPENGL).tolist(),
+                "timestamp": posed.frame.timestamp,
+            }
+        )
+        if posed.covariance is not None:
+            frames[-1]["pose_covariance"] = posed.covariance.ravel().tolist()
+    images.finish()
+    if not frames:
+        raise InputError("holds no frame with a pose that can be read", where=result)
+    about: dict[str, Any] = {"camera_model": lenses[0]["camera_model"]}
+    if any(each["camera_model"] != about["camera_model"] for each in lenses):
+        raise InputError(
+            "has fisheye lenses and others, which this format can't hold together",
+            where=result,
+            remedy="export the results of the single recordings",
+        )
+    if all(each == lenses[0] for each in lenses):
+        about = lenses[0]
+    else:
+        for frame, each in zip(frames, lenses, strict=True):
+            frame |= {key: value for key, value in each.items() if key != "camera_model"}
+    if images.masked:
+        for frame in frames:
+            frame["mask_path"] = f"{MASKS}/{Path(frame['file_path']).name}"
+    about |= {
+        "depth_unit_scale_factor": DEPTH_UNIT_M,
+        "integer_depth_scale": DEPTH_UNIT_M,
+        "sigma_unit_scale_factor": SIGMA_UNIT_M,
+        "ply_file_path": "points.ply",
+    }
+    points, color = some_points(result)
+    write_ply(folder / "points.ply", points, color=color)
+    about |= {"frames": []}
+    text = json.dumps(about, indent=1, allow_nan=False).removesuffix("[]\n}")
+    lines = ",\n  ".join(json.dumps(frame, allow_nan=False) for frame in frames)
+    write_text(folder / "transforms.json", f"{text}[\n  {lines}\n ]\n}}\n")
+
+
+_MODELS: dict[type[Camera], str] = {
+    Pinhole: "OPENCV",
+    BrownConrady: "OPENCV",
+    Fisheye: "OPENCV_FISHEYE",
+}
+
+
+def lens(camera: Pinhole) -> dict[str, Any]:
+    """Return what `transforms.json` says of a camera; there pixels have their corner at (0, 0)."""
+    order = DISTORTION_ORDER[camera.model]
+    return {
+        "camera_model": _MODELS[type(camera)],
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": float(camera.fx),
+        "fl_y": float(camera.fy),
+        "cx": float(camera.cx + 0.5),
+        "cy": float(camera.cy + 0.5),
+    } | {name: float(np.float64(getattr(camera, name))) for name in order}

@@ -1,0 +1,230 @@
+"""The images of a result with their poses, for programs that start from both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.atomic import make_folder
+from tofuse.files.images import write_png
+from tofuse.files.ply import read_ply
+from tofuse.filters.camera_errors import CameraErrors
+from tofuse.filters.correction import Corrector
+from tofuse.fusion.texture import LitView
+from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths
+from tofuse.parts import name_of
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.noise import noise_model_for
+from tofuse.recordings.recording import Recording
+from tofuse.recordings.rectify import Rectifier, pinhole_of
+from tofuse.results.output import main_poses, read_run_json
+from tofuse.results.reopening import RecordedPart, recorded_parts, reopened
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # of a count
+IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
+_MOST = 65535
+_BRIGHT = 99.0  # percentile of the first frame's light that is shown as white
+_MOST_POINTS = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """What one frame of a result gives.
+
+    Attributes
+    ----------
+    index
+        Of the frame, as `run.json` counts.
+    frame
+        z depth, with the camera that the result believes in; rectified where asked for.
+    image
+        (H, W, 3) uint8 RGB: the colour, or what a surface reflects as grey.
+    known
+        (H, W) where the image shows anything.
+    sigma
+        (H, W) standard deviation of the z depth in m, 0 where invalid.
+    T_world_camera
+        (4, 4).
+    covariance
+        (6, 6) of the pose, see docs/conventions.md; None where not known.
+    """
+
+    index: int
+    frame: RangeFrame
+    camera: Pinhole
+    image: UInt8
+    known: NDArray[np.bool_]
+    sigma: Float32
+    T_world_camera: Float64
+    covariance: Float64 | None
+
+    @property
+    def name(self) -> str:
+        """File name of its images."""
+        return f"frame_{self.index:06d}.png"
+
+
+def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> Iterator[PosedImage]:
+    """Give every so-many-th image of the main model of a result, in order.
+
+    Images of a camera that does not suit are rectified. What can't be read is left out.
+
+    Raises
+    ------
+    InputError
+        If the recording is gone, or another one by now; if it holds clouds, or images with neither
+        colour nor amplitude.
+    """
+    run = read_run_json(folder / "run.json")
+    indices, poses = main_poses(folder, run)
+    chosen = dict(zip(indices[::every], poses[::every], strict=True))
+    try:
+        covariances = {f["index"]: f["covariance"] for f in run["frames"]}
+        parts = list(recorded_parts(folder, run))
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(
+            "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy="run again"
+        ) from error
+    for part in parts:
+        recording = reopened(part, folder)
+        lighting = _Lighting(recording)
+        rectifiers: dict[Camera, Rectifier] = {}
+        for frame in _frames(part, recording, chosen):
+            sigma = lighting.noise.sigma(frame)
+            frame = replace(frame, sigma_image=sigma)
+            light = lighting.image(frame)
+            frame = replace(frame, color_image=light)
+            if not suits(frame.camera) and frame.camera not in rectifiers:
+                rectifiers[frame.camera] = Rectifier(pinhole_of(frame.camera))
+            camera = frame.camera
+            frame = (
+                rectifiers[camera](frame)
+                if camera in rectifiers
+                else replace(frame, depth=frame.z, depth_kind="z")
+            )
+            index = part.first + frame.index
+            C = covariances.get(index)
+            assert isinstance(frame.camera, Pinhole)
+            assert frame.color_image is not None
+            assert frame.sigma_image is not None
+            yield PosedImage(
+                index,
+                frame,
+                frame.camera,
+                frame.color_image,
+                np.asarray(frame.color_image.any(-1)),
+                np.where(frame.valid, frame.sigma_image / ray_lengths(frame.camera), 0),
+                chosen[index],
+                None if C is None else np.array(C, float).reshape(6, 6),
+            )
+
+
+def _frames(
+    part: RecordedPart, recording: Recording, chosen: dict[int, Float64]
+) -> Iterator[RangeFrame]:
+    """The chosen frames of a recording that can be read, with the camera as it was found to be."""
+    wanted = [k + part.first in chosen for k in recording.indices.tolist()]
+    correctors = _correctors(part)
+    recording = replace(recording, indices=recording.indices[wanted])
+    for item in recording.read_all():
+        if isinstance(item, UnreadableFrameError):
+            continue
+        if not isinstance(item, RangeFrame):
+            raise InputError(
+                "holds clouds", where=recording.path, remedy="choose a format for clouds"
+            )
+        frame: Any = item
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        yield frame
+
+
+def _correctors(part: RecordedPart) -> list[Corrector]:
+    """Of what is corrected, the errors of the camera alone move points."""
+    return [
+        CameraErrors(item["focal"], item["offset_m"]).start()
+        for item in part.config.get("corrections", ())
+        if item["part"] == name_of(CameraErrors())
+    ]
+
+
+class _Lighting:
+    """How frames of one recording are shown, as bright in all of them, and their noise."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.path = recording.path
+        self.noise = noise_model_for(recording)
+        self._white: float | None = None
+
+    def image(self, frame: RangeFrame) -> UInt8:
+        """(H, W, 3) RGB of a frame; black where nothing is known."""
+        if frame.color_image is not None and frame.color_registered:
+            return frame.color_image
+        view = LitView.of(replace(frame, color_image=None))
+        if view is None:
+            raise InputError(
+                f"frame {frame.index} has neither colour nor amplitude",
+                where=self.path,
+                remedy="record one of them: these programs start from images",
+            )
+        light = view.light[..., 0]
+        lit = light > 0
+        if self._white is None and lit.any():
+            self._white = float(np.percentile(light[lit], _BRIGHT))
+        share = (np.where(lit, light, 0) / (self._white or 1.0)).clip(0, 1)
+        # Gamma 1/2.2: albedo is linear, screens are not; what is known is not black.
+        grey = np.where(lit, np.maximum(1, np.round(255 * share ** (1 / 2.2))), 0)
+        return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+
+
+class ImageFolder:
+    """Writes images, depth, sigma and masks, each under the name of its frame."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._whole: list[tuple[str, tuple[int, int]]] = []
+        self.masked = False
+
+    def write(self, posed: PosedImage) -> None:
+        """Write what belongs to one frame."""
+        self._png(IMAGES, posed.name, posed.image)
+        self._png(DEPTH, posed.name, _counts(posed.frame.depth, DEPTH_UNIT_M))
+        self._png(SIGMA, posed.name, _counts(posed.sigma, SIGMA_UNIT_M))
+        if posed.known.all():
+            self._whole.append((posed.name, posed.known.shape))
+        else:
+            self.masked = True
+            self._png(MASKS, posed.name, np.where(posed.known, 255, 0).astype(np.uint8))
+
+    def finish(self) -> None:
+        """Give the others masks as well, if any frame needs one."""
+        for name, shape in self._whole if self.masked else ():
+            self._png(MASKS, name, np.full(shape, 255, np.uint8))
+
+    def _png(self, kind: str, name: str, image: NDArray[Any]) -> None:
+        write_png(make_folder(self.folder / kind) / name, image)
+
+
+def _counts(metres: Float32, unit_m: float) -> NDArray[np.uint16]:
+    """16-bit counts; 0 where they don't fit."""
+    counts = np.rint(metres.astype(float) / unit_m)
+    return np.where(counts < _MOST, counts, 0).astype(np.uint16)
+
+
+def some_points(folder: Path) -> tuple[Float32, UInt8]:
+    """Return points (N, 3) of the cloud of a result, evenly chosen, and their colours (N, 3)."""
+    ply = read_ply(folder / "cloud.ply")
+    step = max(1, -(-len(ply) // _MOST_POINTS))
+    points = ply.points[::step].astype(np.float32)
+    color = np.full((len(points), 3), 128, np.uint8) if ply.color is None else ply.color[::step]
+    return points, color
