@@ -29,8 +29,11 @@ from tofuse.results.output import read_run_json
 
 Float64 = NDArray[np.float64]
 
-# Triangles unless more are asked for: with a texture as glTF they take 8 MB at most.
+# Triangles unless more are asked for, and what they take with their texture as .glb at most.
 FACES = 60_000
+_MOST_BYTES = 8_000_000
+_VERTEX_BYTES, _FACE_BYTES, _OTHER_BYTES = 32, 12, 4096
+_QUALITIES = (92, 85, 75, 60, 40)
 # To lay out a texture for more would take minutes.
 _MOST_PAINTED = 120_000
 _TEXTURE_SIZE = 2048
@@ -95,7 +98,7 @@ class _Result:
             {},
             found.atlas.faces,
             found.atlas.uv,
-            jpeg_bytes(found.image),
+            _jpeg(found.image, len(rows), len(found.atlas.faces)),
         )
 
     @cached_property
@@ -108,6 +111,17 @@ class _Result:
 
 
 _SCALARS = ("views", "sigma")
+
+
+def _jpeg(image: NDArray[np.uint8], vertices: int, faces: int) -> bytes:
+    """The best picture that is small enough beside so many vertices and triangles."""
+    room = _MOST_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
+    picture = b""
+    for quality in _QUALITIES:
+        picture = jpeg_bytes(image, quality)
+        if len(picture) <= room:
+            break
+    return picture
 
 
 def _cloud(result: _Result, path: Path) -> None:
