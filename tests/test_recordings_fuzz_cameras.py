@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import made_arrays
+import made_dumps
 import made_exports
 import made_ifm
 import made_kinect
@@ -32,8 +33,14 @@ MAKERS: dict[str, tuple[Callable[[Path], None], str | None, str]] = {
     "helios": (made_exports.make_helios, None, "grid"),
     "csv": (made_exports.make_csv, None, "grid"),
     "r3d": (made_phones.make_r3d, "scan.r3d", "record3d"),
+    "polycam": (made_dumps.make_polycam, None, "polycam"),
+    "nerfstudio": (made_dumps.make_nerfstudio, None, "nerfstudio"),
+    "nerfcapture": (made_dumps.make_nerfcapture, None, "nerfstudio"),
+    "hololens2": (made_dumps.make_hololens, None, "hololens2"),
+    "kinect2": (made_dumps.make_kinect2, None, "kinect2"),
+    "depth16": (made_dumps.make_depth16, None, "depth16"),
 }
-ROUNDS = {"mkv": 30, "helios": 30, "csv": 30}
+ROUNDS = {"kinect2": 30, "mkv": 30, "helios": 30, "csv": 30}
 CUTS = 30
 
 

@@ -32,7 +32,7 @@ class DepthImageSource(FileSource):
     camera, depth_unit_m
         Of all frames, unless `options` names another camera.json, which then gives both.
     color
-        None, or one image for each frame.
+        None, or one image for each frame, None where there is none.
     color_registered
         Whether they are as seen by the depth camera.
     options
@@ -53,7 +53,7 @@ class DepthImageSource(FileSource):
         camera: Camera | None,
         depth_unit_m: float,
         *,
-        color: Sequence[Path] | None = None,
+        color: Sequence[Path | None] | None = None,
         color_registered: bool = True,
         options: ReaderOptions | None = None,
     ) -> None:
@@ -72,6 +72,9 @@ class DepthImageSource(FileSource):
             )
         self.camera, self.depth_unit_m, self.depth_kind = camera, depth_unit_m, kind
         self.metadata |= {"depth_unit_m": depth_unit_m, "depth_kind": kind}
+        colored = sum(path is not None for path in self.color or ())
+        if 0 < colored < len(self.files):
+            self.warnings.append(f"only {colored} of {len(self.files)} frames have colour")
         self._check_size(where)
 
     def _check_size(self, where: str) -> None:
@@ -94,12 +97,13 @@ class DepthImageSource(FileSource):
         size = (self.camera.width, self.camera.height)
         counts = read_image(self.files[index], size=size, dtype="uint16")
         color = None
-        if self.color is not None:
-            color = read_color(self.color[index])
+        path = None if self.color is None else self.color[index]
+        if path is not None:
+            color = read_color(path)
             if color.shape[:2] != counts.shape:
                 raise InputError(
                     f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
-                    where=self.color[index],
+                    where=path,
                     remedy="register colour to depth, or leave it out",
                 )
         return RangeFrame(

@@ -28,6 +28,10 @@ CLOSED = {
         "play it by pmd's Royale and export its frames as PLY (sampleExportPLY), or record the "
         "camera's ROS topics, and give those",
     ),
+    ".xef": (
+        "is of Kinect Studio, whose layout isn't published",
+        "play it by Kinect Studio and save its depth images, or record by iai_kinect2",
+    ),
 }
 
 # A folder with these may be depth images whose camera is not told.

@@ -122,7 +122,7 @@ class PhoneSource(FileSource):
             float(self.timestamps[index]),
             camera,
             self.read_depth(index, size),
-            confidence_image=None if confidence is None else _confidence(confidence, size),
+            confidence_image=None if confidence is None else self.read_confidence(confidence, size),
             color_image=self.read_color(index, size),
         )
 
@@ -130,14 +130,14 @@ class PhoneSource(FileSource):
         """Return the depth (H, W) of a frame in m."""
         return depth_from_counts(read_image(self.files[index], size=size, dtype="uint16"), 0.001)
 
+    def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
+        """Return the confidence (H, W) in an image, 0 to `CONFIDENCE_MAX`."""
+        return read_image(path, size=size, dtype="uint8").astype(np.uint8, copy=False)
+
     def read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
         """Return the colour (H, W, 3) of a frame at the pixels of depth, or None."""
         path = self.color[index]
         return None if path is None else resized(read_color(path), size, path)
-
-
-def _confidence(path: Path, size: tuple[int, int]) -> UInt8:
-    return read_image(path, size=size, dtype="uint8").astype(np.uint8, copy=False)
 
 
 def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:

@@ -1,0 +1,37 @@
+"""PGM (Netpbm): binary grey images of 8 or 16 bits."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import MAX_PIXELS
+
+_SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
+_HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
+
+
+def parse_pgm(data: bytes, where: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Decode (H, W) uint8 or uint16.
+
+    Raises
+    ------
+    InputError
+        Naming `where`, if it is something else, or cut off.
+    """
+    header = _HEADER.match(data)
+    if header is None:
+        raise InputError("is no binary PGM image", where=where, remedy="copy the file again")
+    width, height, most = (int(each) for each in header.groups())
+    if not 0 < width * height <= MAX_PIXELS or not 0 < most < 65536:
+        raise InputError(f"claims {width} x {height} pixels up to {most}", where=where)
+    dtype = np.dtype(">u2" if most > 255 else "u1")
+    size = width * height * dtype.itemsize
+    if len(data) < header.end() + size:
+        raise InputError("is cut off before its end", where=where, remedy="copy the file again")
+    image = np.frombuffer(data, dtype, width * height, header.end()).reshape(height, width)
+    return image.astype(dtype.newbyteorder("="))

@@ -1,0 +1,123 @@
+"""Reader of Android's DEPTH16: 13 bits of depth and 3 of confidence, as ARCore and others give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.errors import InputError
+from tofuse.files.images import read_color
+from tofuse.files.reading import is_file, is_folder, list_folder, read_bytes
+from tofuse.parts import part
+from tofuse.recordings.camera_file import CameraFile, load_camera
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.phones import resized
+from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource
+
+_ENDS = ("_depth16.bin", ".depth16")
+_BITS = 13
+CONFIDENCE_MAX = 7.0
+
+
+@part("reader", "depth16", label="experimental")
+@dataclass(frozen=True)
+class Depth16:
+    """Folders of *_depth16.bin or *.depth16, with the camera in a camera.json."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = _files(path)
+        if not files:
+            return None
+        saw = f"{len(files)} DEPTH16 images"
+        if is_file(path / "camera.json"):
+            return Sniff(1.0, f"{saw} and camera.json")
+        settle = "give --format depth16 with --camera: size and lens are not in such files"
+        return Sniff(UNSURE, saw, settle)
+
+    def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
+        """See `Reader.open`."""
+        files = _files(path)
+        if not files:
+            raise InputError("has no *_depth16.bin or *.depth16", where=path, remedy="check it")
+        camera = options.camera or path / "camera.json"
+        if not is_file(camera):
+            raise InputError(
+                "is not there: such files hold neither size nor lens",
+                where=camera,
+                remedy="give a camera.json by --camera",
+            )
+        return Depth16Source(files, camera)
+
+
+class Depth16Source(FileSource):
+    """Depth in mm with confidence; colour where an image lies beside."""
+
+    concurrent = True
+
+    def __init__(self, files: list[Path], camera: Path) -> None:
+        self.description: CameraFile
+        self.description, self.camera = load_camera(camera)
+        rate = self.description.frame_rate_hz or 1.0
+        super().__init__(np.arange(len(files)) / rate)
+        self.files = files
+        self.color = [_color(file) for file in files]
+        self.metadata |= {
+            "depth_kind": self.description.depth_kind,
+            "depth_unit_m": 0.001,
+            "confidence_max": CONFIDENCE_MAX,
+        }
+        if self.description.sensor is not None:
+            self.metadata["sensor"] = self.description.sensor
+        colored = sum(path is not None for path in self.color)
+        if 0 < colored < len(files):
+            self.warnings.append(f"only {colored} of {len(files)} frames have colour")
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        path = self.files[index]
+        width, height = self.camera.width, self.camera.height
+        data = read_bytes(path, limit=1 << 26)
+        if len(data) != 2 * width * height:
+            raise InputError(
+                f"has {len(data)} bytes, not 2 for each of {width} x {height} pixels",
+                where=path,
+                remedy="give the camera of these images by --camera",
+            )
+        samples = np.frombuffer(data, "<u2").reshape(height, width)
+        depth = (samples & ((1 << _BITS) - 1)).astype(np.float32) * np.float32(0.001)
+        # 0 says nothing of confidence, and counts as sure; 1 is 0 %, 7 is six sevenths.
+        level = (samples >> _BITS).astype(np.uint8)
+        confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
+        color = self.color[index]
+        size = (width, height)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth,
+            self.description.depth_kind,
+            confidence_image=confidence.astype(np.uint8),
+            color_image=None if color is None else resized(read_color(color), size, color),
+        )
+
+
+def _files(path: Path) -> list[Path]:
+    if not is_folder(path):
+        return []
+    try:
+        return [p for p in list_folder(path) if p.name.lower().endswith(_ENDS) and is_file(p)]
+    except InputError:
+        return []
+
+
+def _color(file: Path) -> Path | None:
+    end = next(end for end in _ENDS if file.name.lower().endswith(end))
+    path = file.with_name(f"{file.name[: -len(end)]}_image.jpg")
+    return path if is_file(path) else None

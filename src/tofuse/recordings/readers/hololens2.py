@@ -1,0 +1,232 @@
+"""Reader of HoloLens 2 research mode, as Microsoft's sample StreamRecorder writes it."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.pgm import parse_pgm
+from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
+from tofuse.files.tables import read_numbers
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import RayTable
+from tofuse.parts import part
+from tofuse.recordings.frames import Float32, RangeFrame
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.phones import POSES_BY, refuse_replacement
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.sources import FileSource, read_matrix_pose
+
+Float64 = NDArray[np.float64]
+
+# The streams in the order in which they are taken, and after what range they repeat, m.
+_STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}
+_NAME = re.compile(r"(?:.*/)?([0-9]{1,19})(_ab)?\.pgm", re.IGNORECASE)
+_TICKS = 1e7  # a second
+_MOST_BYTES = 1 << 24
+_REMEDY = "copy the recording again"
+
+
+@part("reader", "hololens2", label="experimental")
+@dataclass(frozen=True)
+class HoloLens2:
+    """Folders with 'Depth Long Throw_lut.bin' and .tar, or those of 'Depth AHaT'."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        found = _streams(path)
+        return Sniff(1.0, f"{found[0]}_lut.bin") if found else None
+
+    def open(self, path: Path, options: ReaderOptions) -> HoloLens2Source:
+        """See `Reader.open`."""
+        refuse_replacement(options, "hololens2")
+        found = _streams(path)
+        if not found:
+            raise InputError(
+                "has no 'Depth Long Throw_lut.bin' with images", where=path, remedy=_REMEDY
+            )
+        source = HoloLens2Source(path, found[0])
+        if len(found) > 1:
+            source.warnings.append(f"{found[1]} is left out: {found[0]} reaches farther")
+        return source
+
+
+class HoloLens2Source(FileSource):
+    """Radial range in mm with active brightness, and the headset's own poses as reference."""
+
+    concurrent = True
+
+    def __init__(self, folder: Path, stream: str) -> None:
+        self.images = _images(folder, stream)
+        self.ticks = sorted(tick for tick, bright in self.images if not bright)
+        if not self.ticks:
+            raise InputError("holds no images", where=folder / f"{stream}.tar", remedy=_REMEDY)
+        super().__init__(np.array(self.ticks, float) / _TICKS)
+        self.ambiguity_m = _STREAMS[stream]
+        self.metadata |= {
+            "sensor": f"HoloLens 2, {stream} (ToF)",
+            "depth_kind": "range",
+            "depth_unit_m": 0.001,
+            POSES_BY: "HoloLens",
+        }
+        if self.ambiguity_m is not None:
+            self.metadata["ambiguity_m"] = self.ambiguity_m
+        self.camera = RayTable(_rays(folder / f"{stream}_lut.bin", self._size()))
+        self._read_poses(folder, stream)
+
+    def _size(self) -> tuple[int, int]:
+        """(height, width) of the first image that can be read."""
+        error: InputError | None = None
+        for tick in self.ticks:
+            try:
+                height, width = self._image(tick, bright=False).shape
+            except InputError as trouble:
+                error = error or trouble
+                continue
+            return height, width
+        assert error is not None
+        raise error
+
+    def _read_poses(self, folder: Path, stream: str) -> None:
+        """Take T_world_rig of each frame, and where the camera is in the rig."""
+        fixed, moving = folder / f"{stream}_extrinsics.txt", folder / f"{stream}_rig2world.txt"
+        if not is_file(fixed) or not is_file(moving):
+            missing = moving if is_file(fixed) else fixed
+            self.warnings.append(f"{missing.name} is missing: there are no poses to compare with")
+            return
+        try:
+            T_camera_rig = read_matrix_pose(read_numbers(fixed).reshape(4, 4), str(fixed))
+            table = read_numbers(moving)
+            if table.shape[-1] != 17:
+                raise InputError("has no rows of 17 numbers", where=moving, remedy=_REMEDY)
+        except (InputError, ValueError) as error:
+            self.warnings.append(f"no poses to compare with: {error}")
+            return
+        # Ticks have more digits than a float64 holds.
+        rows = np.where(np.isfinite(table[:, 0]), table[:, 0], -1).astype(float)
+        order = np.argsort(rows, kind="stable")
+        near = np.searchsorted(rows[order], np.array(self.ticks, float) - 64)
+        poses = np.full((len(self.ticks), 4, 4), np.nan)
+        wrong: list[InputError] = []
+        for k, (tick, place) in enumerate(zip(self.ticks, near.tolist(), strict=True)):
+            if place == len(rows) or abs(rows[order[place]] - tick) > 64:
+                continue
+            row = order[place]
+            try:
+                T_world_rig = read_matrix_pose(table[row, 1:].reshape(4, 4), f"{moving}, row {row}")
+            except InputError as error:
+                wrong.append(error)
+                continue
+            poses[k] = T_world_rig @ se3.inverse(T_camera_rig)
+        if wrong:
+            self.warnings.append(f"{len(wrong)} poses can't be read, the first: {wrong[0]}")
+        if np.isfinite(poses).any():
+            self.reference = poses
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        tick = self.ticks[index]
+        depth = self._image(tick, bright=False)
+        bright = self._image(tick, bright=True) if (tick, True) in self.images else None
+        for image in (depth, bright):
+            if image is not None and image.shape != (self.camera.height, self.camera.width):
+                raise InputError(
+                    f"is {image.shape[1]} x {image.shape[0]} pixels, the first image "
+                    f"{self.camera.width} x {self.camera.height}",
+                    where=f"{tick}.pgm",
+                    remedy=_REMEDY,
+                )
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            self.camera,
+            depth_from_counts(depth, 0.001),
+            "range",
+            None if bright is None else bright.astype(np.float32),
+            amplitude_kind="ir",
+            ambiguity_m=self.ambiguity_m,
+        )
+
+    def _image(self, tick: int, *, bright: bool) -> NDArray[np.generic]:
+        path, begin, size = self.images[tick, bright]
+        where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
+        if size > _MOST_BYTES:
+            raise InputError("is too large", where=where, remedy=_REMEDY)
+        try:
+            with path.open("rb") as file:
+                file.seek(begin)
+                data = file.read(size)
+        except OSError as error:
+            raise input_error(error, path) from error
+        image = parse_pgm(data, where)
+        if image.dtype != np.uint16 or min(image.shape) < 2:
+            raise InputError("is no image of 16 bits", where=where, remedy=_REMEDY)
+        return image
+
+
+def _streams(path: Path) -> list[str]:
+    """The depth streams of which there are a lens and images."""
+    if not is_folder(path):
+        return []
+    return [
+        name
+        for name in _STREAMS
+        if is_file(path / f"{name}_lut.bin")
+        and (is_file(path / f"{name}.tar") or is_folder(path / name))
+    ]
+
+
+# Where the bytes of an image lie: file, first byte, count; by its time and whether it is the light.
+_Images = dict[tuple[int, bool], tuple[Path, int, int]]
+
+
+def _images(folder: Path, stream: str) -> _Images:
+    """All images of a stream: in its folder, where it was unpacked, else in its archive."""
+    found: _Images = {}
+    if is_folder(folder / stream):
+        for path in list_folder(folder / stream):
+            match = _NAME.fullmatch(path.name)
+            if match and is_file(path):
+                found[int(match[1]), match[2] is not None] = (path, 0, path.stat().st_size)
+    path = folder / f"{stream}.tar"
+    if found or not is_file(path):
+        return found
+    try:
+        with tarfile.open(path, "r:") as archive:
+            for member in archive:
+                match = _NAME.fullmatch(member.name)
+                if match and member.isfile():
+                    place = (path, member.offset_data, member.size)
+                    found[int(match[1]), match[2] is not None] = place
+    except OSError as error:
+        raise input_error(error, path) from error
+    except (tarfile.TarError, ValueError, EOFError) as error:
+        if not found:
+            raise InputError("is a damaged archive", where=path, remedy=_REMEDY) from error
+    return found
+
+
+def _rays(path: Path, shape: tuple[int, int]) -> Float32:
+    """(H, W, 2) of the table of unit vectors; NaN where the lens has none."""
+    data = read_bytes(path, limit=_MOST_BYTES)
+    height, width = shape
+    if len(data) != 12 * height * width:
+        raise InputError(
+            f"has {len(data)} bytes, not 12 for each of {width} x {height} pixels",
+            where=path,
+            remedy=_REMEDY,
+        )
+    table = np.frombuffer(data, "<f4").reshape(height, width, 3).astype(float)
+    with np.errstate(all="ignore"):
+        rays = table[..., :2] / table[..., 2:]
+        good = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
+    return np.where(good[..., None], rays, np.nan).astype(np.float32)

@@ -1,0 +1,126 @@
+"""Reader of what kinect2_viewer of iai_kinect2 saves: Kinect v2 by libfreenect2."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import is_file, is_folder, list_folder, read_text
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.depth_images import DepthImageSource
+from tofuse.recordings.phones import first_size
+from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
+
+_DEPTH = re.compile(r"([0-9]{1,9})_depth\.png", re.IGNORECASE)
+# Which camera an image is seen by, and how much smaller than its calibration, by its size.
+_VIEWS = {
+    (512, 424): ("calib_ir.yaml", 1.0),
+    (960, 540): ("calib_color.yaml", 0.5),
+    (1920, 1080): ("calib_color.yaml", 1.0),
+}
+_MATRIX = re.compile(r"^cameraMatrix:.*?data:\s*\[(.*?)\]", re.DOTALL | re.MULTILINE)
+
+
+@part("reader", "kinect2", label="experimental")
+@dataclass(frozen=True)
+class Kinect2:
+    """Folders of NNNN_depth.png and NNNN_color.jpg, with kinect2_bridge's calib_*.yaml."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        files = _depth_files(path)
+        if not files:
+            return None
+        if any(_calibration(path, name) is not None for name, _ in _VIEWS.values()):
+            return Sniff(1.0, f"{len(files)} *_depth.png and calib_*.yaml")
+        return Sniff(
+            UNSURE,
+            f"{len(files)} *_depth.png but no calibration",
+            "put kinect2_bridge's calib_ir.yaml and calib_color.yaml beside them",
+        )
+
+    def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
+        """See `Reader.open`."""
+        files = _depth_files(path)
+        if not files:
+            raise InputError("has no NNNN_depth.png", where=path, remedy="check the path")
+        color = [_color(file) for file in files]
+        source = DepthImageSource(
+            files,
+            np.arange(len(files), dtype=float),
+            None if options.camera else _camera(path, first_size(files)),
+            0.001,
+            color=color if any(color) else None,
+            options=options,
+        )
+        source.metadata["sensor"] = "Kinect v2 (ToF)"
+        source.warnings.append("no time stamps: frames are numbered in seconds")
+        return source
+
+
+def _depth_files(path: Path) -> list[Path]:
+    if not is_folder(path):
+        return []
+    try:
+        return [p for p in list_folder(path) if _DEPTH.fullmatch(p.name) and is_file(p)]
+    except InputError:
+        return []
+
+
+def _color(file: Path) -> Path | None:
+    stem = file.name[: -len("_depth.png")]
+    found = (file.with_name(f"{stem}_color{suffix}") for suffix in (".jpg", ".png"))
+    return next((path for path in found if is_file(path)), None)
+
+
+def _calibration(folder: Path, name: str) -> Path | None:
+    """The calibration beside the images, or in the one folder with it: the camera's number."""
+    if is_file(folder / name):
+        return folder / name
+    try:
+        found = [p / name for p in list_folder(folder) if is_folder(p) and is_file(p / name)]
+    except InputError:
+        return None
+    return found[0] if len(found) == 1 else None
+
+
+def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
+    """The images are rectified: pinhole cameras with the calibration's matrix."""
+    if size not in _VIEWS:
+        raise InputError(
+            f"holds images of {size[0]} x {size[1]} pixels, which no Kinect v2 gives",
+            where=folder,
+            remedy="give their camera by --camera",
+        )
+    name, scale = _VIEWS[size]
+    path = _calibration(folder, name)
+    if path is None:
+        raise InputError(
+            f"has no {name}",
+            where=folder,
+            remedy="copy it from kinect2_bridge/data/ and your camera's number, or give --camera",
+        )
+    match = _MATRIX.search(read_text(path, limit=1 << 20))
+    numbers = _numbers(match[1]) if match else np.zeros(0)
+    if numbers.shape != (9,):
+        raise InputError("holds no cameraMatrix of 9 numbers", where=path, remedy="copy it again")
+    K = scale * numbers.reshape(3, 3)
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
+
+
+def _numbers(text: str) -> NDArray[np.float64]:
+    try:
+        return np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        return np.zeros(0)

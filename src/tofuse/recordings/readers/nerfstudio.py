@@ -1,0 +1,293 @@
+"""Reader of transforms.json with depth: nerfstudio, instant-ngp, NeRFCapture, `tofuse export`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.images import read_color, read_image
+from tofuse.files.reading import is_file, name_order, read_head
+from tofuse.files.trajectory_formats import OPENGL
+from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
+from tofuse.parts import part
+from tofuse.recordings.camera_file import checked_lens, read_json
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import depth_from_counts
+from tofuse.recordings.phones import refuse_replacement, resized
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.sources import FARTHEST_M, FileSource, read_matrix_pose
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+NAME = "transforms.json"
+_DEPTH = ("depth_file_path", "depth_path")
+_IMAGES = ("", ".png", ".jpg", ".jpeg")  # NeRFCapture leaves suffixes out
+_MODELS = {
+    "PERSPECTIVE": "pinhole",
+    "PINHOLE": "pinhole",
+    "SIMPLE_PINHOLE": "pinhole",
+    "OPENCV": "brown",
+    "OPENCV_FISHEYE": "fisheye",
+}
+_SNIFFED = 1 << 16
+_REMEDY = "correct it there"
+
+
+@part("reader", "nerfstudio", label="experimental")
+@dataclass(frozen=True)
+class Nerfstudio:
+    """Folders with a transforms.json whose frames have depth, or such a file."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        file = _file(path)
+        try:
+            head = read_head(file, _SNIFFED) if is_file(file) else b""
+        except InputError:
+            return None
+        if file.name == NAME and any(f'"{key}"'.encode() in head for key in _DEPTH):
+            return Sniff(1.0, f"{NAME} with depth")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> NerfstudioSource:
+        """See `Reader.open`."""
+        refuse_replacement(options, "nerfstudio")
+        return NerfstudioSource(_file(path))
+
+
+class NerfstudioSource(FileSource):
+    """Depth images, each with its own lens, and the poses of the file as reference."""
+
+    concurrent = True
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        about = read_json(file)
+        listed = about.get("frames")
+        if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
+            raise InputError("has no list of frames", where=file, remedy=_REMEDY)
+        self.frames = [_Frame(about, each, k, file) for k, each in enumerate(listed)]
+        with_depth = [frame for frame in self.frames if frame.path(*_DEPTH) is not None]
+        if not with_depth:
+            raise InputError(
+                "has no frames with depth_file_path",
+                where=file,
+                remedy="record depth too: colour alone is not enough",
+            )
+        left_out = len(self.frames) - len(with_depth)
+        self.frames = _in_order(with_depth)
+        times = np.array([frame.time for frame in self.frames])
+        timed = bool(np.isfinite(times).all())
+        super().__init__(times if timed else np.arange(len(self.frames), dtype=float))
+        self.unit_m = _unit(about, file, any("depth_file_path" in f.own for f in self.frames))
+        self.sigma_unit_m = _number(about, "sigma_unit_scale_factor", file, 1e-4)
+        self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
+        if left_out:
+            self.warnings.append(f"{file}: {left_out} frames have no depth: left out")
+        if not timed:
+            self.warnings.append(f"{file}: no times: frames are numbered in seconds")
+        self._read_poses()
+
+    def _read_poses(self) -> None:
+        poses = np.full((len(self.frames), 4, 4), np.nan)
+        unknown: list[InputError] = []
+        for k, frame in enumerate(self.frames):
+            try:
+                poses[k] = frame.pose()
+            except InputError as error:
+                unknown.append(error)
+        if unknown:
+            self.warnings.append(f"{len(unknown)} poses can't be read, the first: {unknown[0]}")
+        if np.isfinite(poses).any():
+            self.reference = poses
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        frame = self.frames[index]
+        path = frame.path(*_DEPTH)
+        assert path is not None
+        depth = self._depth(path)
+        size = (depth.shape[1], depth.shape[0])
+        camera = frame.lens(size)
+        color = frame.image()
+        sigma = frame.path("sigma_file_path")
+        sigma_image = None
+        if sigma is not None:
+            counts = read_image(sigma, size=size, dtype="uint16")
+            sigma_z = counts.astype(np.float32) * np.float32(self.sigma_unit_m)
+            sigma_image = np.nan_to_num(sigma_z * ray_lengths(camera))
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            camera,
+            depth,
+            color_image=None if color is None else resized(read_color(color), size, color),
+            sigma_image=sigma_image,
+        )
+
+    def _depth(self, path: Path) -> Float32:
+        if path.suffix.lower() == ".npy":
+            table = _array(path) * np.float32(self.unit_m)
+            return np.where(np.abs(table) < FARTHEST_M, table, np.float32(0))
+        return depth_from_counts(read_image(path, dtype="uint16"), self.unit_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """What the file says of one frame; what it does not say holds for all."""
+
+    common: dict[str, Any]
+    own: dict[str, Any]
+    number: int
+    file: Path
+
+    @property
+    def where(self) -> str:
+        return f"{self.file}: frame {self.number}"
+
+    @property
+    def time(self) -> float:
+        """Seconds; NaN where not told."""
+        value = self.own.get("timestamp")
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e18:
+            return math.nan
+        return float(value)
+
+    @property
+    def key(self) -> list[tuple[int, int, str]]:
+        return name_order(Path(str(self.own.get("file_path", self.number))))
+
+    def path(self, *names: str) -> Path | None:
+        """The first of these files that the frame names."""
+        named = next((self.own[name] for name in names if name in self.own), None)
+        if not isinstance(named, str) or not named or "\0" in named:
+            return None
+        return self.file.parent / named.replace("\\", "/")
+
+    def image(self) -> Path | None:
+        base = self.path("file_path")
+        if base is None:
+            return None
+        found = (base.with_name(base.name + suffix) for suffix in _IMAGES)
+        return next((path for path in found if is_file(path)), None)
+
+    def pose(self) -> Float64:
+        where = f"{self.where}: transform_matrix"
+        try:
+            table = np.array(self.own.get("transform_matrix"), float)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError("isn't made of numbers", where=where, remedy=_REMEDY) from error
+        if table.shape == (3, 4):
+            table = np.concatenate([table, [[0, 0, 0, 1]]])
+        return read_matrix_pose(np.atleast_2d(table), where) @ OPENGL
+
+    def number_of(self, name: str, default: float | None = None) -> float:
+        if name in self.own:
+            return _number(self.own, name, self.where, default)
+        return _number(self.common, name, self.file, default)
+
+    def lens(self, size: tuple[int, int]) -> Pinhole:
+        """The camera of depth images of a size (width, height), of which colour may have more."""
+        word = self.own.get("camera_model", self.common.get("camera_model", "OPENCV"))
+        model = _MODELS.get(word) if isinstance(word, str) else None
+        if model is None:
+            raise InputError(
+                f"is {word!r:.60}",
+                where=f"{self.where}: camera_model",
+                remedy=f"use one of {', '.join(_MODELS)}",
+            )
+        width, height = self.number_of("w", size[0]), self.number_of("h", size[1])
+        if not (2 <= width <= 16384 and 2 <= height <= 16384):
+            raise InputError(f"is {width:g}, h {height:g}", where=f"{self.where}: w")
+        fx = self.number_of("fl_x", self._by_angle("camera_angle_x", width))
+        # Here the corner of the first pixel, there its centre is at the origin.
+        values = {
+            "fx": fx,
+            "fy": self.number_of("fl_y", self._by_angle("camera_angle_y", height) or fx),
+            "cx": self.number_of("cx", width / 2) - 0.5,
+            "cy": self.number_of("cy", height / 2) - 0.5,
+        } | {name: self.number_of(name, 0.0) for name in DISTORTION_ORDER[model]}
+        if model == "brown":
+            if self.number_of("k4", 0.0):
+                raise InputError("is not 0", where=f"{self.where}: k4", remedy="undistort first")
+            if not any(values[name] for name in DISTORTION_ORDER[model]):
+                model = "pinhole"
+                values = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
+        camera = checked_lens(MODELS[model], (int(width), int(height)), values, self.where)
+        if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
+            raise InputError(
+                f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: another shape",
+                where=self.where,
+                remedy=_REMEDY,
+            )
+        return scaled(camera, *size)
+
+    def _by_angle(self, name: str, pixels: float) -> float | None:
+        """Focal length by the angle that an image shows; None where it isn't told."""
+        angle = self.own.get(name, self.common.get(name))
+        if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0 < angle < 3.1:
+            return None
+        return pixels / 2 / math.tan(angle / 2)
+
+
+def _file(path: Path) -> Path:
+    return path if path.name == NAME and not path.is_dir() else path / NAME
+
+
+def _in_order(frames: list[_Frame]) -> list[_Frame]:
+    """By time, or by the names of their images where some have no time."""
+    if all(math.isfinite(frame.time) for frame in frames):
+        return sorted(frames, key=lambda frame: frame.time)
+    return sorted(frames, key=lambda frame: frame.key)
+
+
+def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
+    """Metres of one count: as the file says, or nerfstudio's millimetre."""
+    for name in ("depth_unit_scale_factor", "integer_depth_scale"):
+        if name in about:
+            unit = _number(about, name, file)
+            if not 1e-9 <= unit <= 1:
+                raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="give metres")
+            return unit
+    if not nerfstudio:
+        raise InputError(
+            "is missing",
+            where=f"{file}: integer_depth_scale",
+            remedy="write how many metres one count of depth is",
+        )
+    return 0.001
+
+
+def _number(
+    data: dict[str, Any], name: str, where: Path | str, default: float | None = None
+) -> float:
+    value = data.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        problem = "is missing" if value is None else f"is {value!r:.60}"
+        raise InputError(problem, where=f"{where}: {name}", remedy="give a number")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError("is too large", where=f"{where}: {name}", remedy=_REMEDY) from error
+
+
+def _array(path: Path) -> Float32:
+    """Depth (H, W) of a .npy file."""
+    try:
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # its header is Python, and damaged Python raises anything
+        raise InputError("is no array", where=path, remedy="write it by numpy.save") from error
+    if table.ndim == 3 and table.shape[2] == 1:
+        table = table[..., 0]
+    if table.ndim != 2 or table.dtype.kind not in "fiu" or min(table.shape) < 2:
+        raise InputError(f"is of shape {table.shape}", where=path, remedy="write (H, W) numbers")
+    return np.asarray(table, np.float32)

@@ -1,0 +1,137 @@
+"""Reader of Polycam's raw data (iPhone and iPad with LiDAR)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.geometry.cameras import Pinhole
+from tofuse.parts import part
+from tofuse.recordings.camera_file import read_json
+from tofuse.recordings.frames import UInt8
+from tofuse.recordings.phones import (
+    CONFIDENCE_MAX,
+    POSES_BY,
+    PhoneSource,
+    arkit_pose,
+    first_size,
+    lens,
+    refuse_replacement,
+)
+from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.sources import poses_beside
+
+Float64 = NDArray[np.float64]
+
+_POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+_LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
+
+
+@part("reader", "polycam", label="experimental")
+@dataclass(frozen=True)
+class Polycam:
+    """Folders with keyframes/depth, images, cameras and maybe confidence, corrected_cameras."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        folder = _keyframes(path)
+        if is_folder(folder / "depth") and is_folder(folder / "cameras"):
+            return Sniff(1.0, f"{folder.name}/ with depth/ and cameras/")
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
+        """See `Reader.open`."""
+        refuse_replacement(options, "polycam")
+        return PolycamSource(_keyframes(path))
+
+
+class PolycamSource(PhoneSource):
+    """Frames with ARKit's lens, and the poses that Polycam optimised, or else ARKit's."""
+
+    def __init__(self, folder: Path) -> None:
+        files = files_with(folder / "depth", ".png") if is_folder(folder / "depth") else []
+        if not files:
+            raise InputError(
+                "has no .png files", where=folder / "depth", remedy="export 'raw data' again"
+            )
+        size = first_size(files)
+        super().__init__(
+            files,
+            _times(files),
+            confidence=[_found(folder / "confidence" / file.name) for file in files],
+            color=[_found(folder / "images" / f"{file.stem}.jpg") for file in files],
+        )
+        for file in files:
+            path = folder / "cameras" / f"{file.stem}.json"
+            try:
+                self.cameras.append(_lens(read_json(path), size, path))
+            except InputError as error:
+                self.cameras.append(error)  # without its lens this frame alone can't be used
+        self._read_poses(folder)
+
+    def _read_poses(self, folder: Path) -> None:
+        """Take the poses that Polycam optimised, or ARKit's; they differ too much to be mixed."""
+        paths = [folder / "corrected_cameras" / f"{file.stem}.json" for file in self.files]
+        if any(is_file(path) for path in paths):
+            self.metadata[POSES_BY] = "Polycam"
+        else:
+            paths = [folder / "cameras" / path.name for path in paths]
+        poses = poses_beside(self, paths, lambda path: _pose(read_json(path), path))
+        if np.isfinite(poses).any():
+            self.reference = poses
+
+    def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
+        """See `PhoneSource.read_confidence`."""
+        stored = super().read_confidence(path, size)
+        return np.round(stored * (CONFIDENCE_MAX / _LEVELS)).astype(np.uint8)
+
+
+def _keyframes(path: Path) -> Path:
+    return path / "keyframes" if is_folder(path / "keyframes") else path
+
+
+def _times(files: list[Path]) -> Float64:
+    """Seconds of files named by microseconds; their numbers where they are named otherwise."""
+    if all(file.stem.isdecimal() and len(file.stem) <= 18 for file in files):
+        return np.array([int(file.stem) for file in files], float) * 1e-6
+    return np.arange(len(files), dtype=float)
+
+
+def _lens(facts: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhole:
+    fx, fy, cx, cy, width, height = _numbers(
+        facts, ("fx", "fy", "cx", "cy", "width", "height"), path
+    )
+    if not (np.isfinite([width, height]).all() and 2 <= width <= 16384 and 2 <= height <= 16384):
+        raise InputError(f"is {width:g}, height {height:g}", where=f"{path}: width")
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return lens(K, (int(width), int(height)), size, path)
+
+
+def _pose(facts: dict[str, Any], path: Path) -> Float64:
+    table = np.eye(4)
+    table[:3] = np.reshape(_numbers(facts, _POSE, path), (3, 4))
+    return arkit_pose(table, str(path))
+
+
+def _numbers(facts: dict[str, Any], names: tuple[str, ...] | list[str], path: Path) -> Float64:
+    for name in names:
+        value = facts.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            problem = "is missing" if value is None else f"is {value!r:.60}"
+            raise InputError(problem, where=f"{path}: {name}", remedy="export 'raw data' again")
+    try:
+        return np.array([facts[name] for name in names], float)
+    except OverflowError as error:
+        raise InputError("holds a number that is too large", where=path) from error
+
+
+def _found(path: Path) -> Path | None:
+    return path if is_file(path) else None
