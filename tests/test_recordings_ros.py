@@ -19,7 +19,7 @@ from tofuse.errors import InputError
 from tofuse.files.images import png_bytes
 from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational
-from tofuse.geometry.se3 import exp, inverse
+from tofuse.geometry.se3 import exp, inverse, log
 from tofuse.recordings import bags
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
@@ -54,14 +54,28 @@ class Bag:
             self.writer = rosbag2.Writer(self.path, version=9, storage_plugin=plugin)
         self.writer.open()
         self.connections: dict[str, Any] = {}
+        if "tf2_msgs/msg/TFMessage" not in self.store.types:
+            parse = importlib.import_module("rosbags.typesys").get_types_from_msg
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(parse(text, "tf2_msgs/msg/TFMessage"))
 
     def make(self, name: str, *values: Any) -> Any:
         return self.store.types[name](*values)
 
-    def header(self, time: float) -> Any:
+    def header(self, time: float, frame: str = "depth") -> Any:
         stamp = self.make("builtin_interfaces/msg/Time", int(time), round(time % 1 * 1e9))
         first = (7,) if self.kind == "ros1" else ()
-        return self.make("std_msgs/msg/Header", *first, stamp, "depth")
+        return self.make("std_msgs/msg/Header", *first, stamp, frame)
+
+    def tf(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
+        q = quaternion.from_matrix(T[:3, :3])
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        motion = self.make("geometry_msgs/msg/Transform", vector, turn)
+        kind = "geometry_msgs/msg/TransformStamped"
+        stamped = self.make(kind, self.header(time, parent), child, motion)
+        name = "tf2_msgs/msg/TFMessage"
+        self.write(topic, name, time, self.make(name, [stamped]))
 
     def write(self, topic: str, kind: str, time: float, message: Any) -> None:
         if topic not in self.connections:
@@ -79,6 +93,7 @@ class Bag:
         encoding: str,
         pad: int = 0,
         width: int | None = None,
+        frame: str = "depth",
     ) -> None:
         height, width = len(image), width or image.shape[1]
         rows = np.ascontiguousarray(image).view(np.uint8).reshape(height, -1)
@@ -88,14 +103,16 @@ class Bag:
             ros.IMAGE,
             time,
             self.make(
-                ros.IMAGE, self.header(time), height, width, encoding, 0, rows.shape[1],
+                ros.IMAGE, self.header(time, frame), height, width, encoding, 0, rows.shape[1],
                 rows.ravel(),
             ),
         )  # fmt: skip
 
-    def compressed(self, topic: str, time: float, data: bytes, format_: str) -> None:
+    def compressed(
+        self, topic: str, time: float, data: bytes, format_: str, frame: str = "depth"
+    ) -> None:
         content = np.frombuffer(data, np.uint8)
-        message = self.make(ros.COMPRESSED, self.header(time), format_, content)
+        message = self.make(ros.COMPRESSED, self.header(time, frame), format_, content)
         self.write(topic, ros.COMPRESSED, time, message)
 
     def transform(self, topic: str, T: np.ndarray) -> None:
@@ -595,3 +612,126 @@ def test_without_rosbags_it_is_said_how_to_get_it(
     monkeypatch.setattr(bags.importlib, "import_module", missing)
     with pytest.raises(InputError, match=r"is a ROS bag; give `pip install 'tofuse\[ros\]'`"):
         open_recording(tmp_path / "a.bag")
+
+
+COLOR_TOPIC = "/camera/color/image_raw"
+RGB_LENS = Pinhole(32, 24, 40.0, 42.0, 15.5, 11.5)
+T_RIG_DEPTH, T_RIG_COLOR = exp(
+    np.array([[0.1, 0.2, 0.3, 0.1, 0.2, 0.3], [0.12, 0.2, 0.3, 0, 0, 0]])
+)
+T_WORLD_RIG = exp(np.random.default_rng(101).normal(size=(3, 6)) * 0.1)
+
+
+def depth_bag(bag: Bag) -> None:
+    bag.info("/camera/depth/camera_info", D=())
+    for k in range(3):
+        bag.image(TOPIC, 10 + 0.1 * k, COUNTS[k], "16UC1")
+
+
+def color_at(k: int) -> np.ndarray:
+    """The column and the row as red and green, the number of the frame as blue."""
+    v, u = np.mgrid[0:24, 0:32]
+    return np.stack([8 * u, 10 * v, np.full_like(u, 50 + k)], -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("compressed", [False, True])
+def test_colour_of_a_camera_beside(tmp_path: Path, kind: str, compressed: bool) -> None:
+    """By tf_static, with frames between; each point takes the colour of where it lands."""
+    bag = Bag(tmp_path, kind)
+    depth_bag(bag)
+    bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
+    bag.tf("/tf_static", 9.0, "rig", "middle", T_RIG_DEPTH)
+    bag.tf("/tf_static", 9.0, "middle", "depth", np.eye(4))
+    bag.tf("/tf_static", 9.0, "rig", "color", T_RIG_COLOR)
+    for k in range(2):  # the third frame has none
+        image, time = color_at(k), 10.005 + 0.1 * k
+        if compressed:
+            name = f"{COLOR_TOPIC}/compressed"
+            bag.compressed(name, time, png_bytes(image), "rgb8; png", frame="color")
+        else:
+            swapped = np.ascontiguousarray(image[..., ::-1])
+            bag.image(COLOR_TOPIC, time, swapped, "bgr8", frame="color", width=32)
+    recording = open_recording(bag.close())
+    assert recording.metadata["color_topic"].startswith(COLOR_TOPIC)
+    T = inverse(T_RIG_COLOR) @ T_RIG_DEPTH
+    for k, frame in enumerate(recording):
+        assert isinstance(frame, RangeFrame)
+        np.testing.assert_allclose(frame.depth, COUNTS[k] / 1000, atol=1e-6)
+        assert (frame.color_image is None) == (k == 2)
+        if frame.color_image is None:
+            continue
+        seen = frame.color_image.any(-1)
+        assert seen.sum() > 30
+        points = frame.point_image[seen] @ T[:3, :3].T + T[:3, 3]
+        uv = np.rint(RGB_LENS.project(points))
+        np.testing.assert_array_equal(frame.color_image[seen][:, 0], 8 * uv[:, 0])
+        np.testing.assert_array_equal(frame.color_image[seen][:, 1], 10 * uv[:, 1])
+        assert (frame.color_image[seen][:, 2] == 50 + k).all()
+
+
+def test_colour_at_the_pixels_of_depth(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    topic = "/camera/aligned_depth_to_color/image_raw"
+    bag.info("/camera/aligned_depth_to_color/camera_info", D=())
+    bag.image(topic, 10.0, COUNTS[0], "16UC1")
+    image = np.ascontiguousarray(color_at(0)[:12, :16])
+    bag.image(COLOR_TOPIC, 10.0, image, "rgb8", frame="color", width=16)
+    frame = open_recording(bag.close())[0]
+    assert isinstance(frame, RangeFrame)
+    np.testing.assert_array_equal(frame.color_image, image)
+
+
+def test_colour_without_a_place_is_left_out(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
+    recording = open_recording(bag.close())
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    assert frame.color_image is None
+    assert any(f"colour is left out: how {COLOR_TOPIC} shows" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_poses_by_tf(tmp_path: Path, kind: str) -> None:
+    """Odometry below a map that corrects it; between two messages a frame moves evenly."""
+    bag = Bag(tmp_path, kind)
+    depth_bag(bag)
+    slash = "/" if kind == "ros1" else ""
+    bag.tf("/tf_static", 9.0, f"{slash}base_link", f"{slash}depth", T_RIG_DEPTH)
+    T_MAP_ODOM = exp(np.array([1.0, 2.0, 0.5, 0.0, 0.0, 0.4]))
+    for k, T in enumerate(T_WORLD_RIG):  # at 9.95, 10.05, 10.15: halfway; the last frame has none
+        bag.tf("/tf", 9.95 + 0.1 * k, "odom", "base_link", T)
+        bag.tf("/tf", 9.95 + 0.1 * k, "map", "odom", T_MAP_ODOM)
+    recording = open_recording(bag.close())
+    assert recording.odometry is not None
+    assert recording.reference is not None
+    for k in range(2):
+        A, B = T_WORLD_RIG[k], T_WORLD_RIG[k + 1]
+        half = A @ exp(log(inverse(A) @ B) / 2)
+        np.testing.assert_allclose(recording.odometry[k], half @ T_RIG_DEPTH, atol=1e-6)
+        expected = T_MAP_ODOM @ half @ T_RIG_DEPTH
+        np.testing.assert_allclose(recording.reference[k], expected, atol=1e-6)
+    assert np.isnan(recording.reference[2]).all()
+    assert np.isnan(recording.odometry[2]).all()
+
+
+def test_transforms_that_make_no_sense(tmp_path: Path) -> None:
+    """A loop of frames, a quaternion of no length, and a still tree: no poses, and no trouble."""
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    bag.tf("/tf", 10.0, "depth", "a", np.eye(4))
+    bag.tf("/tf", 10.0, "a", "depth", np.eye(4))
+    bag.tf("/tf_static", 10.0, "world", "b", np.eye(4))
+    broken = bag.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 0.0)
+    vector = bag.make("geometry_msgs/msg/Vector3", float("nan"), 0.0, 0.0)
+    motion = bag.make("geometry_msgs/msg/Transform", vector, broken)
+    stamped = bag.make(
+        "geometry_msgs/msg/TransformStamped", bag.header(10.0, "map"), "odom", motion
+    )
+    name = "tf2_msgs/msg/TFMessage"
+    bag.write("/tf", name, 10.0, bag.make(name, [stamped]))
+    recording = open_recording(bag.close())
+    assert len(list(recording)) == 3
+    assert recording.odometry is None

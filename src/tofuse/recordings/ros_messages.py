@@ -20,7 +20,7 @@ UInt8 = NDArray[np.uint8]
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = {"mono8": "u1", "8UC1": "u1", **ENCODINGS}
 # Bytes a pixel, and the channels that are red, green and blue, or how YUV is packed.
-_COLORS: dict[str, tuple[int, list[int] | str]] = {
+_ALL_COLORS: dict[str, tuple[int, list[int] | str]] = {
     "rgb8": (3, [0, 1, 2]),
     "bgr8": (3, [2, 1, 0]),
     "rgba8": (4, [0, 1, 2]),
@@ -29,6 +29,7 @@ _COLORS: dict[str, tuple[int, list[int] | str]] = {
     **dict.fromkeys(("yuv422", "uyvy"), (2, "uyvy")),
     **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "yuyv")),
 }
+COLORS = frozenset(_ALL_COLORS) - {"mono8"}
 _JPEG = b"\xff\xd8"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COMPRESSED_HEAD = 12
@@ -85,9 +86,9 @@ def color_image(message: Any, where: str) -> UInt8:
     if data.startswith(_JPEG):
         return as_color(parse_image(data, where, size=(width, height)))
     encoding = str(message.encoding).lower()
-    if encoding not in _COLORS:
+    if encoding not in _ALL_COLORS:
         raise InputError(f"has the encoding {message.encoding!r:.40}", where=where)
-    channels, order = _COLORS[encoding]
+    channels, order = _ALL_COLORS[encoding]
     step = int(message.step)
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE) or step < width * channels:
         raise InputError(f"claims {width} x {height} pixels of {step} bytes a row", where=where)
@@ -120,6 +121,11 @@ def decompressed(message: Any, where: str) -> NDArray[Any]:
     with np.errstate(all="ignore"):
         depth = np.float32(a) / (counts.astype(np.float32) - np.float32(b))
     return np.where(counts > 0, depth, np.float32(np.nan)).astype(np.float32)
+
+
+def decompressed_color(message: Any, where: str) -> UInt8:
+    """Return the (H, W, 3) RGB image of compressed_image_transport: JPEG or PNG."""
+    return as_color(parse_image(bytes(message.data), where))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
-from tofuse.geometry.cameras import Camera
+from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.parts import part
 from tofuse.recordings.bags import (
     APART_S,
@@ -22,28 +22,37 @@ from tofuse.recordings.bags import (
     damaged,
     open_bag,
 )
-from tofuse.recordings.camera_file import check_size, load_camera
+from tofuse.recordings.camera_file import ColorCamera, check_size, load_camera
+from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, Frame, RangeFrame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import ReaderOptions, Sniff
+from tofuse.recordings.ros_frames import Transforms, frame_name
 from tofuse.recordings.ros_messages import (
+    COLORS,
     ENCODINGS,
     GREY,
     Cloud,
     cloud,
+    color_image,
     decompressed,
+    decompressed_color,
     image,
     lens,
 )
 from tofuse.recordings.sources import FARTHEST_M, FileSource, cloud_frame
 
 Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 # Depth in whole numbers is in mm by convention (REP 118).
 _UNIT_M = {"u": 0.001, "f": 1.0}
 _AMPLITUDE_WORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
+_COLOR_WORDS = ("color", "colour", "rgb")
+# Frames that odometry drifts in; what is above them is corrected.
+_ODOMETRY = "odom"
 
 
 @part("reader", "ros")
@@ -100,9 +109,13 @@ class RosSource(FileSource):
         self.unit: float | None = None
         self.camera: Camera | None = None
         self.amplitude: Track | None = None
+        self.color: Track | None = None
+        self.color_camera: ColorCamera | None = None
+        transforms = self._transforms()
         if self.connection.msgtype != CLOUD:
             self._read_camera(options)
             self.amplitude = self._find_amplitude()
+            self._find_color(transforms)
             self.metadata["depth_kind"] = self.kind
             if self.connection.msgtype == IMAGE:
                 kind = np.dtype(ENCODINGS[self._encoding(self.connection)]).kind
@@ -113,6 +126,7 @@ class RosSource(FileSource):
                     "means nothing for clouds", where="--camera", remedy="leave it out"
                 )
             self.camera = self._organised()
+        self._read_poses(transforms)
         self.metadata |= {"topic": self.connection.topic}
         others = sorted({c.topic for c in self._candidates()} - {self.connection.topic})
         if others and options.topic is None:
@@ -130,7 +144,7 @@ class RosSource(FileSource):
             if self.connection.msgtype == CLOUD:
                 return self._cloud(cloud(message, where), index, time)
             assert self.camera is not None
-            return RangeFrame(
+            frame = RangeFrame(
                 index,
                 time,
                 self.camera,
@@ -139,6 +153,7 @@ class RosSource(FileSource):
                 amplitude_beside(self.amplitude, time, self.camera, where),
                 amplitude_kind="ir",
             )
+            return self._colored(frame, f"{where}, colour")
         except InputError:
             raise
         except Exception as error:
@@ -184,9 +199,8 @@ class RosSource(FileSource):
             about, self.camera = load_camera(options.camera)
             self.kind, self.unit = about.depth_kind, about.depth_unit_m
             return
-        folder = self.connection.topic.rsplit("/", 1)[0]
         infos = [c for c in self.bag.connections if c.msgtype == INFO]
-        near = [c for c in infos if c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])]
+        near = self._infos_beside(self.connection)
         chosen = near or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
         if not chosen:
             raise InputError(
@@ -194,11 +208,109 @@ class RosSource(FileSource):
                 where=self.path,
                 remedy="give the depth camera by --camera camera.json",
             )
-        where = f"{self.path}: {chosen[0].topic}"
-        for _, _, raw in self.bag.messages(connections=[chosen[0]]):
-            self.camera = lens(self.bag.deserialize(raw, chosen[0].msgtype), where)
+        self.camera = self._lens_of(chosen[0])
+
+    def _infos_beside(self, connection: Any) -> list[Any]:
+        """The connections of CameraInfo that belong to one of images."""
+        folder = connection.topic.rsplit("/", 1)[0]
+        return [
+            c
+            for c in self.bag.connections
+            if c.msgtype == INFO and c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])
+        ]
+
+    def _transforms(self) -> Transforms:
+        try:
+            return Transforms.read(self.bag)
+        except Exception as error:  # whatever rosbags says of damage
+            self.warnings.append(f"tf is left out: {damaged(error, self.path)}")
+            return Transforms({})
+
+    def _frame_of(self, track: Track) -> str:
+        """Name of the frame that messages are in."""
+        return frame_name(track.message(0).header.frame_id)
+
+    def _read_poses(self, transforms: Transforms) -> None:
+        """Take where the depth camera was in the frames above it, by tf."""
+        if not transforms:
             return
+        try:
+            frame = self._frame_of(self.track)
+        except Exception as error:  # of a damaged message, which costs that frame alone
+            self.warnings.append(f"tf is left out: {damaged(error, self._where(0))}")
+            return
+        above = transforms.above(frame)
+        odometry = next((each for each in above if _ODOMETRY in each.lower()), None)
+        if odometry is not None and transforms.moves(odometry, frame):
+            poses = transforms.poses(odometry, frame, self.timestamps)
+            if np.isfinite(poses).any():
+                self.odometry = poses
+        if above[-1] != odometry and transforms.moves(above[-1], frame):
+            poses = transforms.poses(above[-1], frame, self.timestamps)
+            if np.isfinite(poses).any():
+                self.reference = poses
+
+    def _find_color(self, transforms: Transforms) -> None:
+        """Find images of a colour camera of which is known how they show what depth shows."""
+        assert self.camera is not None
+        missing: list[str] = []
+        for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
+            if not self._is_color(connection):
+                continue
+            track = Track(self.bag, connection)
+            if not len(track):
+                continue
+            try:
+                first = self._color_image(track, 0, f"{self.path}: {connection.topic}")
+                own, other = self._frame_of(self.track), self._frame_of(track)
+                moved = _rank(self.connection) == 1  # depth, moved into the view of colour
+                same_size = first.shape[:2] == (self.camera.height, self.camera.width)
+                T = transforms.fixed(other, own)
+                infos = self._infos_beside(connection)
+                if same_size and (moved or own == other):
+                    self.color = track
+                elif T is not None and infos:
+                    self.color_camera = ColorCamera(self._lens_of(infos[0]), T)
+                    self.color = track
+                else:
+                    missing.append(connection.topic)
+                    continue
+            except Exception as error:  # of ours, or of rosbags about a damaged message
+                told = error if isinstance(error, InputError) else damaged(error, self.path)
+                missing.append(f"{connection.topic} ({told.problem})")
+                continue
+            self.metadata["color_topic"] = connection.topic
+            return
+        if missing:
+            self.warnings.append(
+                f"colour is left out: how {missing[0]} shows what depth shows is not in the bag "
+                "(its camera_info, and tf_static between the two cameras)"
+            )
+
+    def _is_color(self, connection: Any) -> bool:
+        topic = connection.topic.lower()
+        if "depth" in topic or not any(word in topic for word in _COLOR_WORDS):
+            return False
+        if connection.msgtype == COMPRESSED:
+            return True
+        return connection.msgtype == IMAGE and self._encoding(connection).lower() in COLORS
+
+    def _lens_of(self, info: Any) -> Pinhole:
+        where = f"{self.path}: {info.topic}"
+        for _, _, raw in self.bag.messages(connections=[info]):
+            return lens(self.bag.deserialize(raw, info.msgtype), where)
         raise InputError("has no message", where=where, remedy="give --camera camera.json")
+
+    def _color_image(self, track: Track, index: int, where: str) -> UInt8:
+        turn = decompressed_color if track.connection.msgtype == COMPRESSED else color_image
+        return turn(track.message(index), where)
+
+    def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
+        k = None if self.color is None else self.color.near(frame.timestamp, APART_S)
+        if self.color is None or k is None:
+            return frame
+        seen = self._color_image(self.color, k, where)
+        return replace(frame, color_image=sampled_color(frame, seen, self.color_camera, where))
 
     def _find_amplitude(self) -> Track | None:
         """Return the active brightness of the same sensor: of the depth images' size, in step."""
