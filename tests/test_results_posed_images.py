@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
+import made_dumps
+import made_phones
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
 from tofuse.files.ply import read_ply, write_ply
@@ -226,6 +228,37 @@ def test_the_corrected_camera_is_written(tmp_path: Path) -> None:
     assert data["fl_x"] == pytest.approx(40.0 / 1.05)
     z = cv2.imread(str(folder / data["frames"][0]["depth_file_path"]), cv2.IMREAD_UNCHANGED)
     assert z[18, 23] == pytest.approx(1000 * plane(PLAIN, 0)[18, 23] + 100, abs=1)
+
+
+def test_colour_of_phones_is_as_large_as_recorded(tmp_path: Path) -> None:
+    """Depth stays as it is; the lens is that of the image. A frame without colour has no image."""
+    recording = tmp_path / "scan"
+    made_dumps.make_polycam(recording)
+    (recording / "keyframes" / "images" / "5250000.jpg").unlink()
+    result = tmp_path / "result"
+    result.mkdir()
+    frames = [
+        {"index": k, "timestamp": 5 + 0.25 * k, "status": "tracked", "covariance": None}
+        for k in range(3)
+    ]
+    about = {"path": str(recording), "opening": Opening((recording,)).to_dict()}
+    run = {"schema": 1, "version": "0", "verdict": "good", "frames": frames, "input": about}
+    (result / "run.json").write_text(json.dumps(run | {"config": {}}))
+    write_tum(result / "trajectory.txt", 5 + 0.25 * np.arange(3), POSES[:3])
+    write_ply(result / "cloud.ply", np.zeros((1, 3), np.float32))
+    (folder,) = export(result, ["nerfstudio"])
+    data = json.loads((folder / "transforms.json").read_text())
+    names = [Path(frame["file_path"]).name for frame in data["frames"]]
+    assert names == ["frame_000000.png", "frame_000002.png"]
+    for k, frame in zip((0, 2), data["frames"], strict=True):
+        image = cv2.imread(str(folder / frame["file_path"]))
+        depth = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        assert image.shape[:2] == (frame["h"], frame["w"]) == (192, 256)
+        assert depth.shape == (24, 32)
+        # The lens is given for 1920 x 1440 pixels, from the middle of the first.
+        assert frame["fl_x"] == pytest.approx((made_phones.FX + k) * 256 / 1920)
+        assert frame["cx"] == pytest.approx((made_phones.CX + 0.5) * 256 / 1920)
+    assert read_ply(folder / "points.ply").color.tolist() == [[128, 128, 128]]
 
 
 def _gone(result: Path) -> None:

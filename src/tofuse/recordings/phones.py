@@ -123,7 +123,7 @@ class PhoneSource(FileSource):
             camera,
             self.read_depth(index, size),
             confidence_image=None if confidence is None else self.read_confidence(confidence, size),
-            color_image=self.read_color(index, size),
+            color_image=self._read_color(index, size),
         )
 
     def read_depth(self, index: int, size: tuple[int, int]) -> Float32:
@@ -134,10 +134,18 @@ class PhoneSource(FileSource):
         """Return the confidence (H, W) in an image, 0 to `CONFIDENCE_MAX`."""
         return read_image(path, size=size, dtype="uint8").astype(np.uint8, copy=False)
 
-    def read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
-        """Return the colour (H, W, 3) of a frame at the pixels of depth, or None."""
+    def whole_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.whole_color`."""
         path = self.color[index]
-        return None if path is None else resized(read_color(path), size, path)
+        return None if path is None else read_color(path)
+
+    def color_path(self, index: int) -> Path:
+        """Return the file that the colour of a frame is in."""
+        return self.color[index] or self.files[index]
+
+    def _read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
+        whole = self.whole_color(index)
+        return None if whole is None else resized(whole, size, self.color_path(index))
 
 
 def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:

@@ -49,6 +49,14 @@ class FileSource(ABC):
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
 
+    def whole_color(self, index: int) -> NDArray[np.uint8] | None:
+        """Return the colour of a frame as large as it was recorded, if it shows what depth shows.
+
+        (H, W, 3) RGB of the same view as depth, at another resolution; None where there is none.
+        Raise InputError if it can't be read.
+        """
+        return None
+
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         try:

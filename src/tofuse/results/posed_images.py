@@ -17,12 +17,13 @@ from tofuse.files.ply import read_ply
 from tofuse.filters.camera_errors import CameraErrors
 from tofuse.filters.correction import Corrector
 from tofuse.fusion.texture import LitView
-from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths
+from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.parts import name_of
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
+from tofuse.recordings.sources import FileSource
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.reopening import RecordedPart, recorded_parts, reopened
 
@@ -47,10 +48,10 @@ class PosedImage:
         Of the frame, as `run.json` counts.
     frame
         z depth, with the camera that the result believes in; rectified where asked for.
+    camera
+        Of the image: the same, at the resolution of the image.
     image
         (H, W, 3) uint8 RGB: the colour, or what a surface reflects as grey.
-    known
-        (H, W) where the image shows anything.
     sigma
         (H, W) standard deviation of the z depth in m, 0 where invalid.
     T_world_camera
@@ -63,7 +64,6 @@ class PosedImage:
     frame: RangeFrame
     camera: Pinhole
     image: UInt8
-    known: NDArray[np.bool_]
     sigma: Float32
     T_world_camera: Float64
     covariance: Float64 | None
@@ -77,13 +77,15 @@ class PosedImage:
 def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> Iterator[PosedImage]:
     """Give every so-many-th image of the main model of a result, in order.
 
-    Images of a camera that does not suit are rectified. What can't be read is left out.
+    Images of a camera that does not suit are rectified. What can't be read, or has neither colour
+    nor amplitude, is left out. Colour is as large as it was recorded, where it shows what depth
+    shows, and so larger than depth.
 
     Raises
     ------
     InputError
-        If the recording is gone, or another one by now; if it holds clouds, or images with neither
-        colour nor amplitude.
+        If the recording is gone, or another one by now; if it holds clouds, or if no image has
+        colour or amplitude.
     """
     run = read_run_json(folder / "run.json")
     indices, poses = main_poses(folder, run)
@@ -95,38 +97,49 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
         raise InputError(
             "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy="run again"
         ) from error
+    dark: list[str] = []
+    given = 0
     for part in parts:
         recording = reopened(part, folder)
         lighting = _Lighting(recording)
-        rectifiers: dict[Camera, Rectifier] = {}
+        camera: Camera | None = None
+        rectifier: Rectifier | None = None
         for frame in _frames(part, recording, chosen):
-            sigma = lighting.noise.sigma(frame)
-            frame = replace(frame, sigma_image=sigma)
-            light = lighting.image(frame)
-            frame = replace(frame, color_image=light)
-            if not suits(frame.camera) and frame.camera not in rectifiers:
-                rectifiers[frame.camera] = Rectifier(pinhole_of(frame.camera))
-            camera = frame.camera
-            frame = (
-                rectifiers[camera](frame)
-                if camera in rectifiers
-                else replace(frame, depth=frame.z, depth_kind="z")
-            )
+            image = lighting.image(frame)
+            if image is None:
+                dark.append(f"{recording.path}: frame {frame.index}")
+                continue
+            frame = replace(frame, sigma_image=lighting.noise.sigma(frame), color_image=image)
+            if rectifier is None or frame.camera != camera:
+                camera = frame.camera
+                rectifier = Rectifier(_shown_by(camera, suits))
+            seen = rectifier(frame)
+            image_camera = rectifier.pinhole
+            if image_camera == camera and (whole := _whole_color(recording, frame)) is not None:
+                image_camera = scaled(image_camera, whole.shape[1], whole.shape[0])
+                image = whole
+            else:
+                assert seen.color_image is not None
+                image = seen.color_image
             index = part.first + frame.index
             C = covariances.get(index)
-            assert isinstance(frame.camera, Pinhole)
-            assert frame.color_image is not None
-            assert frame.sigma_image is not None
+            assert seen.sigma_image is not None
             yield PosedImage(
                 index,
-                frame,
-                frame.camera,
-                frame.color_image,
-                np.asarray(frame.color_image.any(-1)),
-                np.where(frame.valid, frame.sigma_image / ray_lengths(frame.camera), 0),
+                seen,
+                image_camera,
+                image,
+                np.where(seen.valid, seen.sigma_image / ray_lengths(seen.camera), np.float32(0)),
                 chosen[index],
                 None if C is None else np.array(C, float).reshape(6, 6),
             )
+            given += 1
+    if dark and not given:
+        raise InputError(
+            "has neither colour nor amplitude",
+            where=dark[0],
+            remedy="record one of them: these programs start from images",
+        )
 
 
 def _frames(
@@ -149,6 +162,23 @@ def _frames(
         yield frame
 
 
+def _shown_by(camera: Camera, suits: Callable[[Camera], bool]) -> Pinhole:
+    """The camera itself, or the pinhole camera in its place."""
+    return camera if isinstance(camera, Pinhole) and suits(camera) else pinhole_of(camera)
+
+
+def _whole_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
+    """The colour of a frame as large as it was recorded; None where it is no larger than depth."""
+    source = recording.source
+    if frame.color_image is None or not isinstance(source, FileSource):
+        return None
+    try:
+        whole = source.whole_color(frame.index)
+    except InputError:
+        return None
+    return None if whole is None or len(whole) <= len(frame.color_image) else whole
+
+
 def _correctors(part: RecordedPart) -> list[Corrector]:
     """Of what is corrected, the errors of the camera alone move points."""
     return [
@@ -162,21 +192,16 @@ class _Lighting:
     """How frames of one recording are shown, as bright in all of them, and their noise."""
 
     def __init__(self, recording: Recording) -> None:
-        self.path = recording.path
         self.noise = noise_model_for(recording)
         self._white: float | None = None
 
-    def image(self, frame: RangeFrame) -> UInt8:
-        """(H, W, 3) RGB of a frame; black where nothing is known."""
+    def image(self, frame: RangeFrame) -> UInt8 | None:
+        """(H, W, 3) RGB of a frame, black where nothing is known; None where all is dark."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
         view = LitView.of(replace(frame, color_image=None))
         if view is None:
-            raise InputError(
-                f"frame {frame.index} has neither colour nor amplitude",
-                where=self.path,
-                remedy="record one of them: these programs start from images",
-            )
+            return None
         light = view.light[..., 0]
         lit = light > 0
         if self._white is None and lit.any():
@@ -200,11 +225,12 @@ class ImageFolder:
         self._png(IMAGES, posed.name, posed.image)
         self._png(DEPTH, posed.name, _counts(posed.frame.depth, DEPTH_UNIT_M))
         self._png(SIGMA, posed.name, _counts(posed.sigma, SIGMA_UNIT_M))
-        if posed.known.all():
-            self._whole.append((posed.name, posed.known.shape))
+        known = posed.image.any(-1)
+        if known.all():
+            self._whole.append((posed.name, known.shape))
         else:
             self.masked = True
-            self._png(MASKS, posed.name, np.where(posed.known, 255, 0).astype(np.uint8))
+            self._png(MASKS, posed.name, np.where(known, 255, 0).astype(np.uint8))
 
     def finish(self) -> None:
         """Give the others masks as well, if any frame needs one."""

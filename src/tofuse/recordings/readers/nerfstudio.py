@@ -17,7 +17,7 @@ from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, read_json
-from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.frames import RangeFrame, UInt8
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.phones import refuse_replacement, resized
 from tofuse.recordings.reader import ReaderOptions, Sniff
@@ -109,6 +109,11 @@ class NerfstudioSource(FileSource):
             self.warnings.append(f"{len(unknown)} poses can't be read, the first: {unknown[0]}")
         if np.isfinite(poses).any():
             self.reference = poses
+
+    def whole_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.whole_color`."""
+        path = self.frames[index].image()
+        return None if path is None else read_color(path)
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

@@ -22,7 +22,7 @@ from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import read_json
-from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.frames import RangeFrame, UInt8
 from tofuse.recordings.phones import (
     ARKIT_AXES,
     CONFIDENCE_MAX,
@@ -99,6 +99,11 @@ class Record3DSource(FileSource):
             self.metadata["confidence_max"] = CONFIDENCE_MAX
         else:
             self.warnings.append("the export holds no confidence")
+
+    def whole_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.whole_color`."""
+        color = self.store.color(self.store.numbers[index])
+        return None if color is None else as_color(parse_image(*color))
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""

@@ -23,7 +23,6 @@ from tofuse.recordings.phones import (
     first_size,
     lens,
     refuse_replacement,
-    resized,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff
 
@@ -90,11 +89,13 @@ class StraySource(PhoneSource):
         if self.imu is not None:
             self.gravity = gravity_at(self.timestamps, self.imu)
 
-    def read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
-        """See `PhoneSource.read_color`."""
-        if self.video is None:
-            return None
-        return resized(self.video.read(self.numbers[index]), size, self.video.path)
+    def whole_color(self, index: int) -> UInt8 | None:
+        """See `FileSource.whole_color`."""
+        return None if self.video is None else self.video.read(self.numbers[index])
+
+    def color_path(self, index: int) -> Path:
+        """See `PhoneSource.color_path`."""
+        return super().color_path(index) if self.video is None else self.video.path
 
     def _open_video(self, path: Path) -> Video | None:
         if not is_file(path):
