@@ -57,6 +57,41 @@ def frame(k: int, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes
     return b"0000L%09d\r\n0000star" % length + data + b"stop\r\n"
 
 
+def make_h5(path: Path, *, model: int = 0, heads: int = 1) -> None:
+    """As the maker's recorder has it: one record for each frame."""
+    import h5py
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    size = (HEIGHT, WIDTH)
+    dtype = np.dtype(
+        [
+            ("_data_timestamp", "<u8"),
+            ("width", "<u2"),
+            ("height", "<u2"),
+            ("distance", "<u2", size),
+            ("distanceNoise", "<u2", size),
+            ("distanceResolution", "<f4"),
+            ("amplitude", "<u2", size),
+            ("timestamp_ns", "<u8", (3,)),
+            ("confidence", "<u2", size),
+            ("intrinsicCalibModelID", "<u4"),
+            ("intrinsicCalibModelParameters", "<f4", (32,)),
+        ]
+    )
+    rows = np.zeros(3, dtype)
+    rows["distance"], rows["distanceNoise"], rows["amplitude"] = COUNTS, NOISE, AMPLITUDE
+    rows["confidence"], rows["distanceResolution"] = FLAGS, UNIT
+    rows["timestamp_ns"] = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(3)[:, None]
+    rows["intrinsicCalibModelID"] = model
+    numbers = BOUGUET if model == 0 else FISHEYE
+    rows["intrinsicCalibModelParameters"][:, : len(numbers)] = numbers
+    with h5py.File(path, "w") as file:
+        for head in range(heads):
+            file.create_group("streams") if not head else None
+            file["streams"].create_dataset(f"o3r_tof_{head}", data=rows, chunks=(1,))
+            rows["distance"] //= 2
+
+
 def make_o3r(path: Path, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"".join(frame(k, model, numbers) for k in range(3)))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import made_arrays
+import made_dumps
 import made_exports
 import made_ifm
 import made_kinect
@@ -80,6 +81,8 @@ TAKES: dict[str, tuple[str, Callable[[Path], Path], bool]] = {
         True,
     ),
     "orbbec-bag": ("orbbec-bag", lambda folder: orbbec(folder, (0.0,) * 8), True),
+    "kinect2": ("kinect2", inside(made_dumps.make_kinect2), True),
+    "depth16": ("depth16", inside(made_dumps.make_depth16), True),
     "ros": ("ros", ros_counts, True),
     "ros-metres": ("ros", ros_metres, False),
 }
@@ -95,6 +98,10 @@ REFUSES: dict[str, Callable[[Path], Path]] = {
     "3dscannerapp": inside(made_phones.make_scanner_app),
     "stray": inside(made_phones.make_stray),
     "record3d": inside(made_phones.make_record3d),
+    "polycam": inside(made_dumps.make_polycam),
+    "nerfstudio": inside(made_dumps.make_nerfstudio),
+    "hololens2": inside(made_dumps.make_hololens),
+    "ifm-h5": empty,
     "ifm-o3r": inside(made_ifm.make_o3r, "a.data"),
     "pcd": inside(make_pcd),
     "ply": inside(make_ply),

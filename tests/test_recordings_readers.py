@@ -173,6 +173,23 @@ def test_redwood(tmp_path: Path, color: str) -> None:
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 321.0, 241.0)
 
 
+def test_redwood_with_some_colour_or_other_names(tmp_path: Path) -> None:
+    make_redwood(tmp_path)
+    (tmp_path / "color" / "000001.png").unlink()
+    recording = open_recording(tmp_path, format="redwood")
+    colors = [frame.color_image for frame in recording]  # type: ignore[union-attr]
+    assert colors[0] is None
+    for k, image in enumerate(colors[1:], 1):
+        assert image is not None
+        assert (image == k).all()
+    count = len(colors)
+    assert f"only {count - 1} of {count} frames have colour" in recording.warnings
+    for path in (tmp_path / "color").iterdir():
+        path.rename(path.with_name(f"photo {path.name}"))
+    recording = open_recording(tmp_path, format="redwood")
+    assert any("their names don't tell which belong together" in w for w in recording.warnings)
+
+
 def test_redwood_without_a_camera_is_unsure(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     (tmp_path / "trajectory.log").unlink()

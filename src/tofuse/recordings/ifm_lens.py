@@ -18,6 +18,7 @@ Float64 = NDArray[np.float64]
 BOUGUET, FISHEYE = 0, 2
 # version, units of distance and amplitude, 3 factors, 6 of the mounting, then model and numbers.
 _INFO = struct.Struct("<I2f3f6fI32f")
+_NUMBERS = 10
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,20 @@ def read_info(data: bytes, where: str) -> HeadInfo:
         raise InputError("is cut off", where=where, remedy="copy the file again")
     _, unit, *rest = _INFO.unpack_from(data)
     model, numbers = rest[10], tuple(rest[11:21])
-    if not 1e-6 < unit < 1 or not np.isfinite(numbers).all():
+    return checked_info(float(unit), int(model), numbers, where)
+
+
+def checked_info(unit: float, model: int, numbers: tuple[float, ...], where: str) -> HeadInfo:
+    """Make it of the unit in m, the model and its first ten numbers.
+
+    Raises
+    ------
+    InputError
+        If they make no sense.
+    """
+    if not 1e-6 < unit < 1 or len(numbers) != _NUMBERS or not np.isfinite(numbers).all():
         raise InputError("makes no sense", where=where, remedy="copy it again")
-    return HeadInfo(float(unit), int(model), numbers)
+    return HeadInfo(unit, model, numbers)
 
 
 @lru_cache(maxsize=16)

@@ -57,7 +57,7 @@ class Depth16:
 
 
 class Depth16Source(FileSource):
-    """Depth in mm with confidence; colour where an image lies beside."""
+    """Depth with confidence; colour where an image lies beside."""
 
     concurrent = True
 
@@ -70,7 +70,7 @@ class Depth16Source(FileSource):
         self.color = [_color(file) for file in files]
         self.metadata |= {
             "depth_kind": self.description.depth_kind,
-            "depth_unit_m": 0.001,
+            "depth_unit_m": self.description.depth_unit_m,
             "confidence_max": CONFIDENCE_MAX,
         }
         if self.description.sensor is not None:
@@ -91,7 +91,8 @@ class Depth16Source(FileSource):
                 remedy="give the camera of these images by --camera",
             )
         samples = np.frombuffer(data, "<u2").reshape(height, width)
-        depth = (samples & ((1 << _BITS) - 1)).astype(np.float32) * np.float32(0.001)
+        counts = samples & ((1 << _BITS) - 1)
+        depth = counts.astype(np.float32) * np.float32(self.description.depth_unit_m)
         # 0 says nothing of confidence, and counts as sure; 1 is 0 %, 7 is six sevenths.
         level = (samples >> _BITS).astype(np.uint8)
         confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))

@@ -124,17 +124,28 @@ def _timestamps(files: list[Path]) -> Float64:
     return np.arange(len(files), dtype=float)
 
 
-def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Path] | None:
+def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Path | None] | None:
     folder = next((path / n for n in _COLOR_FOLDERS if is_folder(path / n)), None)
     if folder is None:
         return None
     color = files_with(folder, ".png", ".jpg", ".jpeg")
     if len(color) == len(files):
-        return color
+        return list(color)
+    numbered = {number: each for each in color if (number := _number(each)) is not None}
+    found = [numbered.get(number) if (number := _number(f)) is not None else None for f in files]
+    if any(found):
+        return found
     warnings.append(
-        f"{folder.name}/ has {len(color)} images, depth/ {len(files)}: colour is left out"
+        f"{folder.name}/ has {len(color)} images, depth/ {len(files)}, and their names don't tell "
+        "which belong together: colour is left out"
     )
     return None
+
+
+def _number(path: Path) -> int | None:
+    """Number of an image, with which its name begins."""
+    first = path.stem.split("-")[0]
+    return int(first) if first.isdecimal() and len(first) <= 18 else None
 
 
 def _poses(path: Path, count: int) -> Float64:

@@ -63,17 +63,17 @@ class Tum:
             )
         warnings: list[str] = []
         check_timestamps(times, path / "depth.txt", warnings)
-        color: list[Path] | None = None
+        color: list[Path | None] | None = None
         if is_file(path / "rgb.txt"):
             color_times, color_files = _read_list(path / "rgb.txt")
             # A depth image without its own takes a neighbour's: colour is for looks.
             pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
-            if (pairs >= 0).all():
-                color = [color_files[k] for k in pairs]
+            if (pairs >= 0).any():
+                color = [color_files[k] if k >= 0 else None for k in pairs]
             else:
                 warnings.append(
-                    f"{int((pairs < 0).sum())} of {len(pairs)} depth images have no colour image "
-                    f"within {COLOR_LIMIT_S} s: colour is left out"
+                    f"no depth image has a colour image within {COLOR_LIMIT_S} s: "
+                    "colour is left out"
                 )
         source = DepthImageSource(files, times, camera, DEPTH_UNIT_M, color=color, options=options)
         source.warnings += warnings

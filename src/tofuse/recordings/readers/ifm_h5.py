@@ -1,0 +1,184 @@
+"""Reader of ifm's .h5 recordings of O3R heads (ifm Vision Assistant), by the package h5py."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_head
+from tofuse.parts import part
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.ifm_lens import HeadInfo, checked_info, head_camera
+from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
+from tofuse.recordings.readers.ifm_o3r import INVALID
+from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.sources import FileSource
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_STREAM = "o3r_tof_"
+_NEEDED = (
+    "distance",
+    "distanceResolution",
+    "intrinsicCalibModelID",
+    "intrinsicCalibModelParameters",
+)
+_MOST_FRAMES, _MOST_BYTES = 1_000_000, 1 << 26  # of a file, and of a frame
+_LENS_NUMBERS = 10
+
+
+@part("reader", "ifm-h5", label="experimental")
+@dataclass(frozen=True)
+class IfmH5:
+    """A .h5 file with streams o3r_tof_0 and so on: range, noise, amplitude, lens."""
+
+    joinable: ClassVar[bool] = False
+
+    def sniff(self, path: Path) -> Sniff | None:
+        """See `Reader.sniff`."""
+        file = file_of(path, ".h5", ".hdf5")
+        try:
+            if file is not None and read_head(file, 8) == _MAGIC:
+                return Sniff(0.95, "an HDF5 file")
+        except InputError:
+            pass
+        return None
+
+    def open(self, path: Path, options: ReaderOptions) -> IfmH5Source:
+        """See `Reader.open`."""
+        refuse_camera(options, "ifm-h5")
+        return IfmH5Source(needed_file(path, ".h5", ".hdf5"), options.topic)
+
+
+class IfmH5Source(FileSource):
+    """Radial range of one head, with the camera's own noise and lens."""
+
+    def __init__(self, path: Path, stream: str | None) -> None:
+        self.path = path
+        try:
+            h5py = importlib.import_module("h5py")
+        except ImportError as error:
+            raise InputError("is an HDF5 file", where=path, remedy="pip install h5py") from error
+        self._one_at_a_time = threading.Lock()
+        try:
+            file = h5py.File(path, "r")
+            weakref.finalize(self, file.close)
+            self._find(file, stream)
+            times = self._times()
+        except InputError:
+            raise
+        except Exception as error:  # of a damaged file, h5py raises what it likes
+            raise self._damaged(error) from error
+        super().__init__(times)
+        self.metadata |= {"sensor": "ifm O3R (ToF)", "depth_kind": "range", "amplitude_kind": "raw"}
+        if len(self.names) > 1 and stream is None:
+            others = ", ".join(self.names[1:])
+            self.warnings.append(
+                f"the stream {self.names[0]} is read; there are also {others}: choose by --topic"
+            )
+        if (np.diff(self.timestamps) < 0).any():
+            self.warnings.append("time goes back; frames stay in the order of the file")
+
+    def _find(self, file: Any, stream: str | None) -> None:
+        streams = file.get("streams", {})
+        self.names = sorted(name for name in streams if name.startswith(_STREAM))
+        if not self.names or (stream is not None and stream not in self.names):
+            raise InputError(
+                f"has no stream {stream or _STREAM + '0'} "
+                f"(there are: {', '.join(streams)[:300] or 'none'})",
+                where=self.path,
+                remedy="record the heads' ToF data",
+            )
+        self.name = stream or self.names[0]
+        self.rows = streams[self.name]
+        self.fields = self.rows.dtype.names or ()
+        for name in _NEEDED:
+            if name not in self.fields:
+                raise InputError(f"has no {name}", where=f"{self.path}: {self.name}")
+        if not 0 < len(self.rows) <= _MOST_FRAMES or self.rows.dtype.itemsize > _MOST_BYTES:
+            raise InputError(
+                f"holds {len(self.rows)} frames of {self.rows.dtype.itemsize} bytes",
+                where=f"{self.path}: {self.name}",
+                remedy="check the file",
+            )
+
+    def _times(self) -> NDArray[np.float64]:
+        """Seconds: of the first exposure, or else when the data were taken; else the number."""
+        for name, unit in (("timestamp_ns", 1e-9), ("_data_timestamp", 1e-6)):
+            if name in self.fields:
+                ticks = np.asarray(self.rows[name], float).reshape(len(self.rows), -1)[:, 0]
+                if np.isfinite(ticks).all() and (len(ticks) == 1 or np.ptp(ticks) > 0):
+                    return ticks * unit
+        return np.arange(len(self.rows), dtype=float)
+
+    def load(self, index: int) -> RangeFrame:
+        """See `FileSource.load`."""
+        where = f"{self.path}: {self.name}, frame {index}"
+        try:
+            with self._one_at_a_time:
+                row = self.rows[index]
+            return self._frame(row, index, where)
+        except InputError:
+            raise
+        except Exception as error:
+            raise self._damaged(error, where) from error
+
+    def _frame(self, row: Any, index: int, where: str) -> RangeFrame:
+        counts = self._image(row, "distance", where)
+        numbers = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
+        unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
+        found = tuple(numbers[:_LENS_NUMBERS].tolist())
+        info: HeadInfo = checked_info(unit, model, found, where)
+        distance = self._metres(counts, unit)
+        if "confidence" in self.fields:
+            flags = self._image(row, "confidence", where, counts.shape)
+            if flags.dtype.kind not in "ui":
+                raise InputError("has flags that are no whole numbers", where=where)
+            distance = np.where(flags & INVALID, np.float32(0), distance)
+        noise = amplitude = None
+        if "distanceNoise" in self.fields:
+            own = self._image(row, "distanceNoise", where, counts.shape)
+            noise = np.nan_to_num(self._metres(own, unit), posinf=0, neginf=0)
+        if "amplitude" in self.fields:
+            amplitude = self._image(row, "amplitude", where, counts.shape).astype(np.float32)
+            amplitude = np.nan_to_num(amplitude, posinf=0, neginf=0)
+        return RangeFrame(
+            index,
+            float(self.timestamps[index]),
+            head_camera(info, counts.shape[1], counts.shape[0], str(self.path)),
+            distance,
+            "range",
+            amplitude,
+            sigma_image=noise,
+        )
+
+    def _image(
+        self, row: Any, name: str, where: str, shape: tuple[int, ...] | None = None
+    ) -> NDArray[Any]:
+        image = np.asarray(row[name])
+        if image.ndim != 2 or min(image.shape) < 2 or image.dtype.kind not in "uif":
+            raise InputError(f"{name} is of shape {image.shape}", where=where)
+        if shape is not None and image.shape != shape:
+            raise InputError(f"{name} is of shape {image.shape}, distance {shape}", where=where)
+        return image
+
+    @staticmethod
+    def _metres(counts: NDArray[Any], unit: float) -> NDArray[np.float32]:
+        """Whole numbers are counts of the unit; floats are in metres."""
+        scale = unit if counts.dtype.kind in "ui" else 1.0
+        return counts.astype(np.float32) * np.float32(scale)
+
+    def _damaged(self, error: Exception, where: str | None = None) -> InputError:
+        line = " ".join(str(error).split())[:200]
+        return InputError(
+            f"can't be read ({type(error).__name__}: {line})",
+            where=where or self.path,
+            remedy="copy the file again",
+        )
