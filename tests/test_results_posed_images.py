@@ -28,7 +28,6 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.opening import Opening
 from tofuse.results.export import export
-from tofuse.results.output import OutputFolder, exported_folders
 
 SIZE = (48, 36)
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)
@@ -311,13 +310,8 @@ def test_folders_are_replaced_only_where_they_are_ours(tmp_path: Path) -> None:
     (folder / "images" / "frame_000001.png").unlink()
     export(result, ["colmap"], overwrite=True)
     assert (folder / "images" / "frame_000001.png").is_file()
-    assert exported_folders(result) == ("colmap",)
     (folder / "trained.ckpt").write_text("mine")
     with pytest.raises(OutputError, match=r"holds trained\.ckpt"):
         export(result, ["colmap"], overwrite=True)
     assert (folder / "trained.ckpt").read_text() == "mine"
-    assert exported_folders(result) == ()
-    with OutputFolder(result, overwrite=True).staging(instead_of=exported_folders(result)):
-        pass
-    assert folder.is_dir()
     assert not [p for p in result.iterdir() if p.name.startswith(".")]
