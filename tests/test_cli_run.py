@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from test_inspection import wrapping
+from tofuse import cli
 from tofuse.cli import main
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.errors import TofuseError
@@ -601,7 +602,7 @@ def test_a_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
         _, said = job.communicate(timeout=120)
         if how == signal.SIGINT:
             assert job.returncode == 130
-            assert said == "tofuse: interrupted; existing files are unchanged\n"
+            assert said == f"tofuse: interrupted; {cli._WHOLE}\n"
     found = contents(out)
     assert {k: v for k, v in found.items() if STAGING not in k} == before
     left = [p.name for p in new.iterdir()] if new.exists() else []

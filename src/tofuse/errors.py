@@ -21,6 +21,14 @@ class TofuseError(Exception):
         super().__init__(" ".join("".join(parts).split()))
 
 
+class Ended(BaseException):
+    """The system asked this process to end, by a signal of that `number`."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(number)
+
+
 class InputError(TofuseError):
     """A recording, file, option or array from outside can't be used."""
 

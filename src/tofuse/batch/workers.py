@@ -95,13 +95,6 @@ class LocalWorkers(Workers):
             process.kill()
 
 
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def machine_memory() -> int | None:
     """Bytes of memory that this process may use at most; None where that is not known."""
     if sys.platform == "win32":

@@ -10,14 +10,17 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from difflib import get_close_matches
 
+from rich.console import Console
+
 from tofuse.batch.batch import pending, run_batch, status_of
 from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job, read_jobs
 from tofuse.batch.table import write_table
-from tofuse.batch.workers import LocalWorkers, Workers, usable_cores
+from tofuse.batch.workers import LocalWorkers, Workers
 from tofuse.cli.progress import emit, progress_for
 from tofuse.cli.run_words import run_words
-from tofuse.errors import InputError, TofuseError
+from tofuse.errors import Ended, InputError, TofuseError
+from tofuse.kernels.cores import usable_cores
 
 _RETRIES = 3
 _TOLD = 10  # recordings without a result, that are named in the end
@@ -39,11 +42,11 @@ def batch(arguments: argparse.Namespace) -> int:
     else:
         try:
             _work(arguments, jobs, left, folder)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Ended) as error:
             done = sum(r is not None and r.state == "done" for r in map(folder.record, chosen))
             words = f"{done} of {len(chosen)} recordings are done; the same command goes on"
             print(f"tofuse: interrupted, {words}", file=sys.stderr)
-            return 130
+            return 128 + error.number if isinstance(error, Ended) else 130
         except TofuseError as error:
             if status_of(chosen, folder) == 2:
                 raise
@@ -118,7 +121,7 @@ def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
 
 def _tell(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
     """Say in a few lines what came out, and return the exit status."""
-    from tofuse.cli.commands import COLORS, Output
+    from tofuse.cli.commands import COLORS
 
     records = {job.name: folder.record(job) for job in chosen}
     verdicts = Counter(r.verdict for r in records.values() if r is not None and r.state == "done")
@@ -141,7 +144,7 @@ def _tell(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
             }
         )
         return status
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     counts = [
         f"[{COLORS[v]}]{verdicts[v]} {v}[/]" for v in ("good", "degraded", "failed") if verdicts[v]
     ]

@@ -27,14 +27,6 @@ _BELIEFS = {True: "green", False: "red", None: "yellow"}
 COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
 
-class Output(Console):
-    """Standard output; a reader that goes away is for `main` to deal with."""
-
-    def on_broken_pipe(self) -> None:
-        """See `Console`."""
-        raise BrokenPipeError
-
-
 def run(arguments: argparse.Namespace) -> int:
     """``tofuse run``."""
     from tofuse.errors import InputError
@@ -227,7 +219,7 @@ def register(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
         return exit_status(result)
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     head, tail = belief(result)
     color = _BELIEFS[result.found.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
@@ -260,7 +252,7 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**found.rig.to_dict(), "how": found.how, "notes": list(found.notes)})
         return rigging.exit_status(found)
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     for table in rigging.tables(found.rig):
         console.print(table)
     for note in rigging.notes(found):
@@ -288,7 +280,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit(rigging.check_json(cameras))
         return rigging.check_status(cameras)
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     for line in rigging.check_lines(cameras):
         console.print(line, markup=False)
     for note in found.notes:
@@ -321,7 +313,7 @@ def judge(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**plain(found.to_dict()), "out": None if options.out is None else str(options.out)})
         return status
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     console.print(f"[bold {COLORS[found.verdict]}]{found.verdict}[/]")
     _print_reasons(console, found.reasons)
     console.print(sentence(found, arguments.trajectory.name), markup=False)
@@ -414,7 +406,7 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
             }
         )
         return
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     console.print(f"[bold {COLORS[d.verdict]}]{d.verdict}[/]")
     _print_reasons(console, d.reasons)
     for line in sessions:
@@ -488,7 +480,7 @@ def inspect(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit(found.to_dict())
         return 0
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     width = max(map(len, found.facts))
     for name, value in found.facts.items():
         console.print(f"[bold]{name:<{width}}[/]  {_escape(value)}")
@@ -516,7 +508,7 @@ def convert(arguments: argparse.Namespace) -> int:
         done = convert_recording(recording, arguments.out)
     else:
         done = convert_to(recording, arguments.out, arguments.to)
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
     for warning in (*recording.warnings, *done.warnings):
         console.print(f"[yellow]warning:[/] {_escape(warning)}")
@@ -529,7 +521,7 @@ def record(arguments: argparse.Namespace) -> int:
     from tofuse.live.device import device, devices, is_installed
     from tofuse.live.recorder import record as record_stream
 
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     if arguments.device is None:
         table = Table("camera", "needs", "")
         for name, kind in devices().items():
@@ -564,18 +556,23 @@ def record(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _interrupted() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C sets: what was recorded is kept. A second one ends at once."""
+    """Give an event that Ctrl-C sets: what was recorded is kept. A second one ends at once.
+
+    So does SIGTERM, which is how a system that shuts down asks.
+    """
     event = threading.Event()
 
     def ask(number: int, frame: object) -> None:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before[number])
         event.set()
 
-    before = signal.signal(signal.SIGINT, ask)
+    numbers: list[int] = [signal.SIGINT, signal.SIGTERM]
+    before = {number: signal.signal(number, ask) for number in numbers}
     try:
         yield event
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def calibrate(arguments: argparse.Namespace) -> int:
@@ -585,7 +582,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     subjects = {
         "lens": calibrating.lens,
         "depth": calibrating.depth,
@@ -626,7 +623,7 @@ def noise(arguments: argparse.Namespace) -> int:
         label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
         measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
         table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
-    console = Output(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     console.print(table)
     console.print(
         f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} still "
@@ -671,7 +668,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         if m["rms_m"] is not None:
             value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
-    Output(highlight=False, soft_wrap=True).print(table)
+    Console(highlight=False, soft_wrap=True).print(table)
     return 0
 
 

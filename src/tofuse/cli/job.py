@@ -20,10 +20,12 @@ _PICTURE = (336, 210)  # pixels
 
 def main(words: Sequence[str]) -> int:
     """Run the job and return the exit status of its run."""
-    from tofuse.cli import told
+    from tofuse.cli import ended_by_signals, faults_told, prepare_process, told
 
+    prepare_process()
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    return told(lambda: _job(words[0], words[1:]))
+    with ended_by_signals():
+        return faults_told(lambda: told(lambda: _job(words[0], words[1:])))
 
 
 def _end_with_parent() -> None:

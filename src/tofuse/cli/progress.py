@@ -97,8 +97,8 @@ class TerminalProgress(Silent):
     When the job is done all of it goes away, and what came out is said in its place.
     """
 
-    def __init__(self, stream: TextIO = sys.stderr) -> None:
-        self._console = Console(file=stream, highlight=False)
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._console = Console(file=stream or sys.stderr, highlight=False)
         self._tick = "[green]\u2713[/]" if self._console.encoding.startswith("utf") else "+"
         wide = self._console.width >= _WIDE
         self._bar = Progress(

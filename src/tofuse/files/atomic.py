@@ -92,8 +92,11 @@ def write_bytes(path: str | Path, *parts: Buffer) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a whole UTF-8 file with line feeds on every system; see `replacing`."""
-    write_bytes(path, text.encode())
+    """Write a whole UTF-8 file with line feeds on every system; see `replacing`.
+
+    Bytes of names of files that are no UTF-8 are written as escapes.
+    """
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def sync(path: str | Path) -> None:

@@ -7,16 +7,17 @@ call of a GIL-free kernel, and results are combined in chunk order.
 from __future__ import annotations
 
 import itertools
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+from tofuse.kernels.cores import usable_cores
+
 R = TypeVar("R")
 
-_count = max(1, os.cpu_count() or 1)
+_count = usable_cores()
 # A pool for each number of threads that was asked for: none is ever shut down, as another Python
 # thread may be using it.
 _pools: dict[int, ThreadPoolExecutor] = {}

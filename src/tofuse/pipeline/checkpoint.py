@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.errors import InputError, OutputError
+from tofuse.errors import Ended, InputError, OutputError
 from tofuse.files.arrays import Arrays, read_npz, write_npz
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 from tofuse.pipeline.states import StateError, decode, encode
@@ -103,6 +103,7 @@ class Checkpoints(Stages):
         self._key = key
         self._note = note
         self._works = True
+        self._finished = False
         self._begun = self._last = perf_counter()
         self._cost_s = 0.0
         self._strange: list[Path] = []
@@ -182,10 +183,15 @@ class Checkpoints(Stages):
         """Remove all that was kept."""
         _clear(self.folder)
 
+    def finish(self) -> None:
+        """Remove all that was kept: there is a result."""
+        self._finished = True
+        self.discard()
+
     def give_up(self, error: BaseException) -> None:
         """Remove what was kept, unless it was much work and trying again may help."""
-        can_help = isinstance(error, OutputError | OSError | MemoryError)
-        if not (can_help and perf_counter() - self._begun >= _WORTH_KEEPING_S):
+        can_help = isinstance(error, OutputError | OSError | MemoryError | Ended)
+        if self._finished or not (can_help and perf_counter() - self._begun >= _WORTH_KEEPING_S):
             self.discard()
 
     def unusable(self, error: Exception) -> InputError:

@@ -159,6 +159,7 @@ def run(
                 write_result(
                     result, out, lambda r, f: write_report_files(recording, config, r, f), texture
                 )
+            kept.finish()
         except _STRANGE as error:
             kept.give_up(error)
             if kept.used:  # somebody changed it; without it, an error is ours
@@ -167,7 +168,6 @@ def run(
         except BaseException as error:
             kept.give_up(error)
             raise
-        kept.discard()
     return result
 
 

@@ -1,0 +1,258 @@
+"""Runs of the program in surroundings that lack something.
+
+What is promised of each: a result and a status that says so, or none and one line on standard error
+that says why; never a traceback, nor status 0 without a result, nor anything else of what was there
+before touched.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+LIMIT_S = 120.0
+_MB = 1 << 20
+
+# Runs in the child before anything of the program is loaded.
+_BEGIN = """
+import os, sys
+sys.argv[0] = "tofuse"
+{setup}
+from tofuse.cli import console
+sys.exit(console())
+"""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """One of the surroundings.
+
+    Attributes
+    ----------
+    setup
+        Python that the child runs first.
+    shell
+        Where its streams lead, as a shell has it.
+    variables
+        Of the environment, that are changed.
+    words
+        Added to the command.
+    must
+        "work", "refuse", or "either".
+    says
+        What standard error has to say where it refuses.
+    leaves
+        Whether hidden files may stay, for the next run to remove.
+    """
+
+    name: str
+    setup: str = ""
+    shell: str = ""
+    variables: tuple[tuple[str, str], ...] = ()
+    words: tuple[str, ...] = ()
+    must: str = "work"
+    says: str = ""
+    leaves: bool = False
+    folder: str = "out"
+
+
+def _limit(what: str, soft: int, hard: int | None = None) -> str:
+    return f"import resource; resource.setrlimit(resource.{what}, ({soft}, {hard or soft}))"
+
+
+def _at(function: str, action: str, count: int = 1) -> str:
+    """Do something at a certain call of one of our functions, given as module:name."""
+    module, name = function.split(":")
+    return f"""
+import importlib, signal
+def begin(count=[0]):
+    module = importlib.import_module({module!r})
+    path = {name!r}.split(".")
+    owner = module
+    for part in path[:-1]:
+        owner = getattr(owner, part)
+    real = getattr(owner, path[-1])
+    def call(*words, **options):
+        count[0] += 1
+        if count[0] == {count}:
+            {action}
+        return real(*words, **options)
+    setattr(owner, path[-1], call)
+begin()
+"""
+
+
+_NO_THREADS = """
+import threading
+def fail(*words, **options):
+    raise RuntimeError("can't start new thread")
+threading.Thread.start = fail
+"""
+_CLOCK = """
+import time, itertools
+passed = itertools.count()
+time.time = lambda: 2e9 - 1000.0 * next(passed)
+time.time_ns = lambda: int(1e9 * time.time())
+"""
+_STAGES = (
+    ("opening", "tofuse.pipeline.run:learnt"),
+    ("tracking", "tofuse.pipeline.reconstruct:push_frames"),
+    ("a model", "tofuse.pipeline.backend:BackEnd.run"),
+    ("writing", "tofuse.results.output:_write_files"),
+    ("moving", "tofuse.results.folder:move_all"),
+    ("moves", "tofuse.files.moving:_Plan.carry_out"),
+    ("the end", "tofuse.pipeline.checkpoint:Checkpoints.finish"),
+)
+_SIGNALS = ("SIGINT", "SIGTERM")
+
+ENVIRONMENTS: tuple[Environment, ...] = (
+    Environment("nothing lacks"),
+    *(
+        Environment(f"{mb} MB of addresses", _limit("RLIMIT_AS", mb * _MB), must="refuse",
+                    says="not enough memory")
+        for mb in (512, 700, 1024, 1536)
+    ),
+    *(
+        Environment(f"{mb} MB of addresses, one thread", _limit("RLIMIT_AS", mb * _MB),
+                    words=("--threads", "1"), must="either")
+        for mb in (1800, 2048, 4096)
+    ),
+    *(
+        Environment(f"{count} file handles", _limit("RLIMIT_NOFILE", count), must="either",
+                    leaves=True)
+        for count in (7, 9, 12, 16, 24, 32, 64)
+    ),
+    Environment("no threads", _NO_THREADS, must="either", says=""),
+    Environment("no threads, and one asked for", _NO_THREADS, words=("--threads", "1"),
+                must="either"),
+    Environment("files of 20 kB at most", _limit("RLIMIT_FSIZE", 20_000), must="refuse",
+                says="can't be written"),
+    Environment("stdout closed", shell=">&-"),
+    Environment("stderr closed", shell="2>&-"),
+    Environment("both closed", shell=">&- 2>&-"),
+    Environment("stdin closed", shell="<&-"),
+    Environment("all closed", shell="<&- >&- 2>&-"),
+    Environment("stdout full", shell="> /dev/full"),
+    Environment("stderr full", shell="2> /dev/full"),
+    Environment("lines to a full disk", shell="> /dev/full", words=("--json",)),
+    Environment("a reader that leaves", shell="| head -c 1 > /dev/null", words=("--json",)),
+    Environment("a reader that never reads", shell="| true", words=("--json",)),
+    Environment("a reader of errors that leaves", shell="2>&1 | head -c 1 > /dev/null"),
+    Environment("ASCII", variables=(("PYTHONIOENCODING", "ascii"), ("PYTHONUTF8", "0"))),
+    Environment("Windows-1252", variables=(("PYTHONIOENCODING", "cp1252"), ("PYTHONUTF8", "0"))),
+    Environment("the C locale", variables=(("LC_ALL", "C"), ("PYTHONCOERCECLOCALE", "0"),
+                                           ("PYTHONUTF8", "0"))),
+    Environment("a name that is no UTF-8", folder="o\udcffu\udce9t"),
+    Environment("a name in ASCII streams", variables=(("PYTHONIOENCODING", "ascii"),),
+                folder="süd\udcff☃"),
+    Environment("a name with markup", folder="[red]<b>x '\"&{{7*7}}%s\n$(id)"),
+    Environment("a home that can't be written", variables=(("HOME", "/proc"),
+                                                           ("XDG_CACHE_HOME", "/proc/x"))),
+    Environment("no home", variables=(("HOME", "/nonexistent"), ("XDG_CACHE_HOME", ""))),
+    Environment("no folder for temporary files", variables=(("TMPDIR", "/nonexistent"),)),
+    Environment("a clock that goes backwards", _CLOCK),
+    Environment("bound to one core", "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"),
+    Environment("the output folder is read-only", must="refuse", folder="/proc/out",
+                says="can't be written"),
+    *(
+        Environment(f"{name} at {stage}",
+                    _at(function, f"os.kill(os.getpid(), signal.{name})"), must="either")
+        for stage, function in _STAGES
+        for name in _SIGNALS
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a run: its status, what it said, whether there is a result, and the faults."""
+
+    status: int | None
+    said: str
+    result: bool
+    faults: tuple[str, ...]
+
+
+def attempt(environment: Environment, recording: Path, where: Path, *words: str) -> Outcome:
+    """Run the program on a recording in such an environment, over an earlier result."""
+    out = Path(environment.folder) if environment.folder[0] == "/" else where / environment.folder
+    mine = None
+    if out.is_relative_to(where):
+        out.mkdir()
+        mine = {"run.json": b'{"schema": 1, "version": "0", "verdict": "good"}',
+                "notes.txt": b"mine"}  # fmt: skip
+        for name, data in mine.items():
+            (out / name).write_bytes(data)
+    command = [
+        sys.executable,
+        "-c",
+        _BEGIN.format(setup=environment.setup),
+        "run",
+        str(recording),
+        "--out",
+        str(out),
+        "--overwrite",
+        *words,
+        *environment.words,
+    ]
+    with tempfile.TemporaryFile() as err, tempfile.TemporaryFile() as code:
+        # The status of the program itself, not that of what it is piped to.
+        script = f'{{ "$@"; echo $? >&{code.fileno()}; }} {environment.shell}'
+        try:
+            subprocess.run(
+                ["/bin/bash", "-c", script, "bash", *command],
+                stdout=subprocess.DEVNULL,
+                stderr=err,
+                pass_fds=(code.fileno(),),
+                env={**os.environ, **dict(environment.variables)},
+                timeout=LIMIT_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return Outcome(None, "", False, (f"it took more than {LIMIT_S:.0f} s",))
+        err.seek(0)
+        code.seek(0)
+        said = err.read().decode(errors="replace")
+        status = int(code.read() or b"-1")
+    return _judged(environment, status, said, out, mine)
+
+
+def _judged(
+    environment: Environment, status: int, said: str, out: Path, mine: dict[str, bytes] | None
+) -> Outcome:
+    whole = {"run.json", "trajectory.txt", "cloud.ply", "pose_graph.g2o", "report.html"}
+    there = {p.name for p in out.iterdir()} if out.is_dir() else set()
+    result = whole <= there
+    old = mine is not None and (out / "run.json").read_bytes() == mine["run.json"]
+    faults = []
+    if "Traceback" in said or "Exception ignored" in said:
+        faults.append("a traceback")
+    if status in (0, 3) and not result:
+        faults.append(f"status {status} without a result")
+    if status == 1:
+        faults.append("status 1")
+    if status not in (0, 3) and not old and mine is not None and not result:
+        faults.append("neither the old result nor a new one")
+    if mine is not None and (out / "notes.txt").read_bytes() != mine["notes.txt"]:
+        faults.append("a file of somebody else has changed")
+    if result and old:
+        faults.append("a mixture of two results")
+    hidden = sorted(name for name in there if name.startswith(".tofuse-"))
+    if hidden and not environment.leaves and status >= 0 and status not in (134, 137, 139):
+        faults.append(f"left {hidden}")
+    if status in (134, 139):
+        faults.append("it crashed")
+    lines = [line for line in said.splitlines() if line.startswith("tofuse: ")]
+    if status not in (0, 3) and not lines and "2>" not in environment.shell:
+        faults.append("it does not say why")
+    if environment.must == "work" and status not in (0, 3):
+        faults.append(f"status {status}")
+    if environment.must == "refuse" and status != 2:
+        faults.append(f"status {status}, not 2")
+    if environment.must == "refuse" and environment.says not in said:
+        faults.append(f"does not say {environment.says!r}")
+    return Outcome(status, said, result, tuple(faults))

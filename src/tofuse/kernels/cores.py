@@ -1,0 +1,72 @@
+"""How many cores this process may use: what it is bound to, and what its container is allowed."""
+
+from __future__ import annotations
+
+import math
+import os
+from functools import cache
+from pathlib import Path
+
+
+@cache
+def usable_cores() -> int:
+    """Return how many threads can work at once: cores it may run on, and no more than its quota."""
+    allowed = quota()
+    return max(1, _bound() if allowed is None else min(_bound(), math.ceil(allowed)))
+
+
+def _bound() -> int:
+    """Cores that this process is bound to, or all."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def quota(root: Path = Path("/")) -> float | None:
+    """Cores' worth of time that the control groups of this process leave it; None where all.
+
+    Parameters
+    ----------
+    root
+        Of the file system.
+    """
+    limits = [limit for folder in _groups(root) if (limit := _limit(folder)) is not None]
+    return min(limits, default=None)
+
+
+def _groups(root: Path) -> list[Path]:
+    """Folders of the control groups of this process, of both versions, with those above them."""
+    mounted = root / "sys/fs/cgroup"
+    found: list[Path] = []
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if number == "0" and not controllers:
+            top = mounted
+        elif "cpu" in controllers.split(","):
+            top = mounted / "cpu"
+        else:
+            continue
+        inside = [part for part in path.split("/") if part not in ("", ".", "..")]
+        # In a container the path may be the host's, while the mount is its own.
+        found += [top.joinpath(*inside[:k]) for k in range(len(inside) + 1)]
+    return found
+
+
+def _limit(folder: Path) -> float | None:
+    words = _read(folder / "cpu.max").split() or [
+        *_read(folder / "cpu.cfs_quota_us").split(),
+        *_read(folder / "cpu.cfs_period_us").split(),
+    ]
+    try:
+        time, period = (float(word) for word in words)
+    except ValueError:  # "max", or nothing
+        return None
+    return time / period if time > 0 and period > 0 else None
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii")
+    except (OSError, ValueError):
+        return ""
