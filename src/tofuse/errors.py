@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+_LONGEST = 600  # characters of a problem: what is quoted of a file may have any length
+
+
+def _clipped(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+
 
 class TofuseError(Exception):
     """Base of every error that the package raises on purpose.
@@ -14,10 +20,11 @@ class TofuseError(Exception):
     def __init__(
         self, problem: str, *, where: str | Path | None = None, remedy: str | None = None
     ) -> None:
-        self.problem = problem
+        self.problem = _clipped(problem)
         self.where = None if where is None else str(where)
         self.remedy = remedy
-        parts = [f"{self.where}: " if self.where else "", problem, f"; {remedy}" if remedy else ""]
+        parts = [f"{self.where}: " if self.where else "", self.problem]
+        parts += [f"; {remedy}"] if remedy else []
         super().__init__(" ".join("".join(parts).split()))
 
 

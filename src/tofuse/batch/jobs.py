@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tofuse.errors import InputError
-from tofuse.files.reading import name_order, read_text
+from tofuse.files.reading import name_order, parsed, read_text
 from tofuse.files.stamps import Stamp, stamp, stamps_in
 
 RESERVED = ("batch.csv", "batch.html", "jobs")  # names in the output folder that are no job's
@@ -157,10 +157,7 @@ def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
 
 
 def _toml_rows(text: str, path: Path) -> Iterator[_Row]:
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is not TOML ({error})", where=path, remedy="check the file") from error
+    data = parsed(tomllib.loads, text, where=path, what="TOML")
     shared, tables = data.pop("all", {}), data.pop("job", [])
     if data or not isinstance(shared, dict) or not isinstance(tables, list):
         raise InputError(

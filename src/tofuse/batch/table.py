@@ -93,6 +93,7 @@ def _html(
     ended: Sequence[tuple[Job, Record]], total: int, running: int, folder: BatchFolder
 ) -> str:
     from tofuse.report.html import asset, template
+    from tofuse.report.policy import secured
 
     rows = [_row(job, record, folder) for job, record in ended]
     counts = Counter(row.tone for row in rows)
@@ -108,7 +109,7 @@ def _html(
         facts.append(("to come", f"{total - len(ended)}"))
     seconds = sum(record.seconds or 0 for _, record in ended)
     facts.append(("time of all runs", duration(seconds)))
-    return template("batch.html.j2").render(
+    page = template("batch.html.j2").render(
         title=folder.path.name,
         version=__version__,
         style=asset("style.css"),
@@ -117,6 +118,7 @@ def _html(
         running=running,
         refresh=_REFRESH_S if len(ended) < total else None,
     )
+    return secured(page)
 
 
 def _row(job: Job, record: Record, folder: BatchFolder) -> Row:

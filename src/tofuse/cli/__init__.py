@@ -140,6 +140,9 @@ def told(command: Callable[[], int]) -> int:
         except MemoryError:
             _say(_MEMORY)
             return 2
+        except RecursionError:
+            _say("something that was given is nested too deeply to be understood; check the files")
+            return 2
         except RuntimeError as error:
             if "start new thread" not in str(error):
                 raise

@@ -33,7 +33,8 @@ def _end_with_parent() -> None:
         pass
     if sys.platform == "win32":
         os._exit(137)
-    os.kill(os.getpid(), signal.SIGKILL)
+    else:
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _job(picture: str, words: Sequence[str]) -> int:

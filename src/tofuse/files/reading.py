@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from tofuse.errors import InputError
 
@@ -69,6 +71,22 @@ def read_head(path: str | Path, size: int) -> bytes:
         raise input_error(error, path) from error
 
 
+def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: str) -> Any:
+    """Return what a parser of JSON or TOML makes of a text from outside.
+
+    Raises
+    ------
+    InputError
+        If it is broken, or nested more deeply than any that means something.
+    """
+    try:
+        return parse(text)
+    except RecursionError as error:
+        raise InputError(f"is not {what} (nested too deeply)", where=where) from error
+    except ValueError as error:
+        raise InputError(f"is not {what} ({error})", where=where) from error
+
+
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES) -> str:
     """Return the content of a UTF-8 file (a byte order mark is dropped); errors as `read_bytes`."""
     try:
@@ -104,8 +122,12 @@ def list_folder(path: str | Path) -> list[Path]:
 
 
 def files_with(path: str | Path, *suffixes: str) -> list[Path]:
-    """Return the files of a folder with one of the suffixes (any case), in name order."""
-    return [p for p in list_folder(path) if p.suffix.lower() in suffixes and is_file(p)]
+    """Return what a folder holds with one of the suffixes (any case), in name order.
+
+    Also what is no file, or a link that leads nowhere: it stands for a frame, which can't be read,
+    and left out it would move all others in time. What has another suffix is none.
+    """
+    return [p for p in list_folder(path) if p.suffix.lower() in suffixes]
 
 
 def is_file(path: Path) -> bool:

@@ -9,8 +9,11 @@ Stamp = tuple[str, int, int]
 
 
 def stamp(path: Path) -> Stamp:
-    """Path, size in bytes and time of change in ns of a file."""
-    status = path.stat()
+    """Path, size in bytes and time of change in ns of a file; of a link to nowhere, its own."""
+    try:
+        status = path.stat()
+    except OSError:
+        status = path.lstat()
     return str(path), status.st_size, status.st_mtime_ns
 
 

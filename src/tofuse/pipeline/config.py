@@ -12,6 +12,7 @@ import numpy as np
 
 from tofuse import parts
 from tofuse.errors import InputError
+from tofuse.files.reading import parsed, read_text
 from tofuse.filters.base import Filter
 from tofuse.filters.correction import Correction
 from tofuse.fusion.options import Fusion
@@ -146,14 +147,8 @@ def read_changes(path: str | Path) -> dict[str, Any]:
         if not isinstance(config, dict):
             raise InputError("holds no config", where=path, remedy="give a run.json of tofuse")
         return config
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"can't be read ({error.strerror})", where=path, remedy="check the path"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"is not TOML ({error})", where=path) from error
+    found: dict[str, Any] = parsed(tomllib.loads, read_text(path), where=path, what="TOML")
+    return found
 
 
 def _merge(base: Any, change: Any) -> Any:

@@ -86,6 +86,8 @@ def open_recording(
                 "have no meaning for a rig", where="min_depth, max_depth", remedy="leave them out"
             )
         return Recording.of(rig, str(paths[0]), "rig")
+    for path in paths:
+        _check_kind(Path(path))
     found = [item for path in paths for item in _resolve(Path(path), format)]
     sources = [item.reader.open(item.path, options) for item in found]
     source: Source = sources[0]
@@ -135,6 +137,18 @@ def _rig_source(
 class _Found:
     path: Path
     reader: Reader
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse what can't be read to its end: reading it could wait for ever."""
+    try:
+        odd = path.exists() and not path.is_file() and not path.is_dir()
+    except (OSError, ValueError):
+        return  # told where it is opened
+    if odd:
+        raise InputError(
+            "is neither a file nor a folder", where=path, remedy="give a recording's path"
+        )
 
 
 def _resolve(path: Path, format: str | None) -> list[_Found]:  # noqa: A002

@@ -145,6 +145,11 @@ def read_rig(path: str | Path) -> Rig:
     return Rig(cameras, pairs, _unplaced(data.get("unplaced", []), path))
 
 
+def is_plain_name(name: str) -> bool:
+    """Whether a name can't lead out of the folder that it is looked for in, on any system."""
+    return name not in (".", "..") and not any(c in "/\\:" or ord(c) < 32 for c in name)
+
+
 def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     at = f"cameras[{k}]"
     if not isinstance(row, dict):
@@ -152,6 +157,12 @@ def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     name, recording = row.get("name"), row.get("recording", "")
     if not isinstance(name, str) or not name.strip():
         raise InputError(f"{at}.name is {name!r}, no name", where=path, remedy=_REMEDY)
+    if not is_plain_name(name):
+        raise InputError(
+            f"{at}.name is {name!r:.80}, which is no name of a folder",
+            where=path,
+            remedy="give it one without / \\ : and not . or ..",
+        )
     if not isinstance(recording, str):
         raise InputError(f"{at}.recording is no path", where=path, remedy=_REMEDY)
     T = check_pose(

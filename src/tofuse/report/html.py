@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tofuse._version import __version__
 from tofuse.files.atomic import write_text
 from tofuse.report.extras import ReportExtras
+from tofuse.report.policy import secured
 from tofuse.report.sections import sections
 from tofuse.results.types import Reconstruction
 
@@ -26,7 +27,7 @@ def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> No
     OutputError
         If the file can't be written; an earlier one is left as it was.
     """
-    write_text(path, render(result, extras))
+    write_text(path, secured(render(result, extras)))
 
 
 def render(result: Reconstruction, extras: ReportExtras) -> str:

@@ -21,6 +21,7 @@ from tofuse.report.pair_scene import (
     pair_scene,
     stills,
 )
+from tofuse.report.policy import secured
 from tofuse.results.pair import LocalView, PairResult
 
 _TONES = {True: "good", False: "failed", None: "degraded"}
@@ -35,7 +36,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
     OutputError
         If the file can't be written; an earlier one is left as it was.
     """
-    write_text(path, render_pair(result))
+    write_text(path, secured(render_pair(result)))
 
 
 def render_pair(result: PairResult) -> str:

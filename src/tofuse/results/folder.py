@@ -31,6 +31,7 @@ from tofuse.files.moving import (
     places,
     recover,
 )
+from tofuse.files.reading import read_text
 
 STAGING = f"{UNFINISHED}unfinished"
 LOCK = f"{UNFINISHED}lock"
@@ -293,8 +294,8 @@ def is_result(folder: Path) -> bool:
 def json_of(path: Path) -> dict[str, object] | None:
     """Return the table in a JSON file; None where there is none."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        data = json.loads(read_text(path))
+    except (InputError, ValueError, RecursionError):
         return None
     return data if isinstance(data, dict) else None
 

@@ -17,6 +17,7 @@ from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
+from tofuse.files.reading import parsed, read_text
 from tofuse.files.trajectory import read_tum, write_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
@@ -382,12 +383,7 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
         If it can't be read or is not one of ours.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"can't be read ({error.strerror})", where=path) from error
-    except ValueError as error:
-        raise InputError(f"is not JSON ({error})", where=path) from error
+    data = parsed(json.loads, read_text(path), where=path, what="JSON")
     if not isinstance(data, dict) or data.get("schema") != 1:
         raise InputError("is not a run.json of schema 1", where=path)
     return data

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
+from tofuse.files.arrays import read_npz
 from tofuse.files.atomic import replacing
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+_MAX_BYTES = 1 << 30
 KEYS = ("range_m", "bias_m", "pixel_bias_m")
 
 
@@ -114,20 +114,10 @@ class DepthCorrection:
             If the file can't be read, or a key is missing or holds no fit array.
         """
         try:
-            # Opened here, as NumPy leaves a broken file open.
-            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                arrays = {key: file[key] for key in KEYS if key in file.files}
-        except (
-            OSError,
-            ValueError,
-            AttributeError,
-            TypeError,
-            EOFError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ) as error:
+            arrays = read_npz(path, limit=_MAX_BYTES, only=frozenset(KEYS))
+        except InputError as error:
             raise InputError(
-                f"can't be read as an .npz file ({error})",
+                error.problem,
                 where=path,
                 remedy="write it by DepthCorrection.save, or delete it to go without",
             ) from error

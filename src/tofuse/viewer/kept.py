@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import read_bytes
+from tofuse.files.arrays import read_npz
 from tofuse.report.pictures import KINDS, Pictures
 from tofuse.results.types import Reconstruction
 
@@ -93,23 +91,23 @@ def read_kept(folder: Path) -> Kept | None:
     path = folder / NAME
     if not path.is_file():
         return None
+    data = read_npz(path)
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as data:
-            index, before = data["index"].tolist(), data["before"].astype(float)
-            points, color = data["points"].astype(np.float32), data["color"].astype(np.uint8)
-            frames = data["picture"].tolist()
-            images: list[dict[str, bytes]] = [{} for _ in frames]
-            for kind in KINDS:
-                whole, start = data[f"{kind}_image"].tobytes(), 0
-                for k, size in enumerate(data[f"{kind}_size"].tolist()):
-                    if size:
-                        images[k][kind] = whole[start : start + size]
-                    start += size
-            if before.shape != (len(index), 4, 4) or points.shape != color.shape:
-                raise ValueError("its arrays do not fit each other")
-            if points.shape != (len(points), 3):
-                raise ValueError("its points are not (N, 3)")
-    except (ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
+        index, before = data["index"].tolist(), data["before"].astype(float)
+        points, color = data["points"].astype(np.float32), data["color"].astype(np.uint8)
+        frames = data["picture"].tolist()
+        images: list[dict[str, bytes]] = [{} for _ in frames]
+        for kind in KINDS:
+            whole, start = data[f"{kind}_image"].tobytes(), 0
+            for k, size in enumerate(data[f"{kind}_size"].tolist()):
+                if size:
+                    images[k][kind] = whole[start : start + size]
+                start += size
+        if before.shape != (len(index), 4, 4) or points.shape != color.shape:
+            raise ValueError("its arrays do not fit each other")
+        if points.shape != (len(points), 3):
+            raise ValueError("its points are not (N, 3)")
+    except (ValueError, TypeError, KeyError, IndexError) as error:
         raise InputError(
             f"can't be read ({error})", where=path, remedy="remove it, or run again"
         ) from error

@@ -1,19 +1,33 @@
-"""The server behind the page: on this machine alone, and found missing in one line."""
+"""The server behind the page: on this machine alone, and found missing in one line.
+
+It answers only who came here by this machine's own name: a page of somebody else, whose name was
+made to lead here (DNS rebinding), is told from ours by the names that its browser sends along.
+"""
 
 from __future__ import annotations
 
+import gzip
 import io
 import logging
 import socket
-from contextlib import redirect_stdout
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from typing import TYPE_CHECKING, Any
 
 from tofuse.errors import InputError
+from tofuse.report.policy import script_hashes
 
 if TYPE_CHECKING:
     from viser import ViserServer
 
 HOST, PORT = "127.0.0.1", 8080
+# The script in viser's page makes another one of what is packed in it: of version 1.1.1.
+_UNPACKED = {
+    "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='": (
+        "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='"
+    )
+}
+_NAMES = ("127.0.0.1", "localhost")  # by which a browser on this machine finds it
 _TRIED = 100  # ports, where none is asked for
 
 
@@ -43,8 +57,15 @@ def serve(port: int | None = None) -> ViserServer:
         raise InputError("is taken", where=f"--port {port}", remedy="give another, or none")
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     # Standard output is for results.
-    with redirect_stdout(io.StringIO()):
+    with redirect_stdout(io.StringIO()), _guarded() as guards:
         server = viser.ViserServer(host=HOST, port=chosen, label="tofuse", verbose=False)
+    if not guards:
+        stop(server)
+        raise InputError(
+            f"can't be guarded with viser {viser.__version__}",
+            where="the viewer",
+            remedy="pip install 'viser==1.1.1'",
+        )
     server.gui.configure_theme(
         control_width="medium",
         dark_mode=True,
@@ -52,6 +73,80 @@ def serve(port: int | None = None) -> ViserServer:
         show_share_button=False,
     )
     return server
+
+
+@contextmanager
+def _guarded() -> Iterator[list[int]]:
+    """Let the server that is made in the block look at each request first.
+
+    viser has no place for that, so it is put between it and its library. Gives a list that is not
+    empty when it was.
+    """
+    import websockets.asyncio.server as library
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request, Response
+
+    guards: list[int] = []
+    real = library.serve
+
+    def serve_guarded(*words: Any, process_request: Any = None, **options: Any) -> Any:
+        def process(connection: Any, request: Request) -> Response | None:
+            host, origin = request.headers.get_all("Host"), request.headers.get_all("Origin")
+            if not is_ours(host, origin):
+                return Response(403, "Forbidden", Headers(), b"not from this machine\n")
+            response: Response | None = None
+            if process_request is not None:
+                response = process_request(connection, request)
+            if response is not None:
+                for name, value in page_headers(response.headers, bytes(response.body)).items():
+                    response.headers[name] = value
+            return response
+
+        guards.append(1)
+        return real(*words, process_request=process, **options)
+
+    library.serve = serve_guarded  # type: ignore[misc,assignment]
+    try:
+        yield guards
+    finally:
+        library.serve = real  # type: ignore[misc]
+
+
+def is_ours(hosts: Sequence[str], origins: Sequence[str]) -> bool:
+    """Whether a request came by this machine's own name, and from our own page or no page at all.
+
+    Parameters
+    ----------
+    hosts, origins
+        Values of the headers of those names.
+    """
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    name, _, port = hosts[0].lower().partition(":")
+    if name not in _NAMES or not ((port.isascii() and port.isdecimal()) or not port):
+        return False
+    return all(o.lower() in (f"http://{hosts[0].lower()}",) for o in origins)
+
+
+def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
+    """Return headers that keep a page from running what is not its own, for an answer."""
+    found = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+    if not headers.get("Content-Type", "").startswith("text/html"):
+        return found
+    if headers.get("Content-Encoding") == "gzip":
+        body = gzip.decompress(body)
+    hashes = script_hashes(body.decode("utf-8", "replace"))
+    unpacked = [_UNPACKED[outer] for outer in hashes if outer in _UNPACKED]
+    # The script of other versions unpacks one that we do not know.
+    scripts = " ".join([*hashes, *unpacked]) if unpacked else "'unsafe-inline'"
+    policy = (
+        f"default-src 'self'; script-src 'self' blob: 'unsafe-eval' {scripts}; "
+        "worker-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; "
+        "object-src 'none'; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # a notebook beside it
+    )
+    return {**found, "Content-Security-Policy": policy}
 
 
 def stop(server: ViserServer) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import input_error, read_head
+from tofuse.files.arrays import read_npz
+from tofuse.files.reading import read_head
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable
 from tofuse.parts import part
 from tofuse.recordings.camera_file import (
@@ -245,24 +246,4 @@ class NpzSource(FileSource):
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays, unless they unpack to more than memory should hold."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(item.file_size for item in archive.infolist())
-            if size > MAX_BYTES:
-                raise InputError(
-                    f"unpacks to {size >> 20} MiB, more than {MAX_BYTES >> 20} MiB",
-                    where=path,
-                    remedy="write it as a native folder",
-                )
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: np.asarray(arrays[name]) for name in arrays.files}
-    except InputError:
-        raise
-    except OSError as error:
-        raise input_error(error, path) from error
-    except Exception as error:  # NumPy parses the headers as Python: anything may come out
-        raise InputError(
-            f"is a damaged NumPy archive ({type(error).__name__})",
-            where=path,
-            remedy="save it again by numpy.savez",
-        ) from error
+    return read_npz(path, limit=MAX_BYTES)

@@ -90,7 +90,8 @@ class Redwood:
 
 def _camera_file(path: Path) -> Path | None:
     """Return the .json with an intrinsic_matrix, if there is one; refuse several that differ."""
-    found = [f for f in files_with(path, ".json") if "intrinsic_matrix" in read_text(f)]
+    files = [f for f in files_with(path, ".json") if is_file(f)]
+    found = [f for f in files if "intrinsic_matrix" in read_text(f)]
     if len({read_text(f) for f in found}) > 1:
         raise InputError(
             f"has several cameras: {', '.join(f.name for f in found)}",

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_folder, read_text
+from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
@@ -71,7 +71,8 @@ def _settings(path: Path) -> Path | None:
     """Return the .toml that tells a lens, if there is one."""
     if not is_folder(path):
         return None
-    found = [p for p in files_with(path, ".toml") if "camera_fx" in read_text(p, limit=1 << 20)]
+    files = [p for p in files_with(path, ".toml") if is_file(p)]
+    found = [p for p in files if "camera_fx" in read_text(p, limit=1 << 20)]
     return found[0] if found else None
 
 

@@ -1,0 +1,465 @@
+"""Damaged files for every reader: seeded mutations of small valid files of each format.
+
+What is promised: a recording, a frame that can't be read, or an error of ours on one line; within a
+few seconds and with bounded memory. Each subject is read in a process of its own, so that one that
+crashes is found out and the others go on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TESTS = Path(__file__).parents[2] / "tests"
+_SECONDS = 20  # for one file
+_MORE_BYTES = 3 << 30  # of addresses, than what is loaded has
+_DEEP = 100_000
+_WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b"1e-300", b"1e300",
+          b"0", b"9" * 5000, b"[", b'{"a":', b"null")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is damaged: `make` writes it into a folder, `read` reads what lies there."""
+
+    make: Callable[[Path], None]
+    read: Callable[[Path], object]
+
+
+def subjects() -> dict[str, Subject]:
+    """Return all, by name; those whose optional packages are missing are left out."""
+    if str(TESTS) not in sys.path:
+        sys.path.insert(0, str(TESTS))
+    import made_exports
+    import test_recordings_fuzz as plain
+    import test_recordings_fuzz_cameras as cameras
+
+    found = {
+        name: Subject(_in(make, "freiburg1"), _recording("freiburg1", name))
+        for name, make in plain.MAKERS.items()
+    }
+    for name, (make, file, format_) in cameras.MAKERS.items():
+        inside = f"original/{file}" if file else "original"
+        found[name] = Subject(_in(make, inside), _recording(inside, format_))
+    for name in ("blaze", "royale", "tiff3d"):
+        make = getattr(made_exports, f"make_{name}")
+        found[name] = Subject(_in(make, "original"), _recording("original", None))
+    return found | _scans() | _bags() | _small()
+
+
+def _in(make: Callable[[Path], Any], inside: str) -> Callable[[Path], None]:
+    def run(folder: Path) -> None:
+        (folder / inside).parent.mkdir(parents=True, exist_ok=True)
+        make(folder / inside)
+
+    return run
+
+
+def _recording(inside: str, format_: str | None) -> Callable[[Path], object]:
+    from tofuse.errors import TofuseError
+    from tofuse.recordings.open import open_recording
+
+    def read(folder: Path) -> None:
+        recording = open_recording(folder / inside, format=format_)
+        for item in recording.read_all():
+            if isinstance(item, TofuseError):
+                _check_line(item)
+            elif not np.isfinite(item.points).all():
+                raise AssertionError("a point is not finite")
+
+    return read
+
+
+def _scans() -> dict[str, Subject]:
+    from tofuse.files.e57 import write_e57
+    from tofuse.files.las import write_las
+
+    points = np.random.default_rng(5).normal(size=(60, 3))
+
+    def laz(path: Path) -> None:
+        import laspy
+
+        header = laspy.LasHeader(version="1.2", point_format=2)
+        header.scales = np.full(3, 1e-4)
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = points.T
+        data.write(path)
+
+    makers: dict[str, Callable[[Path], Any]] = {
+        "las": lambda path: write_las(path, points),
+        "laz": laz,
+        "e57": lambda path: write_e57(path, points),
+    }
+    return _possible(makers, lambda name: f"original/a.{name}")
+
+
+def _bags() -> dict[str, Subject]:
+    def make(kind: str) -> Callable[[Path], None]:
+        def write(path: Path) -> None:
+            import test_recordings_ros as bags
+
+            path.mkdir()
+            bag = bags.Bag(path, kind)
+            bag.info("/camera/depth/camera_info")
+            for k in range(2):
+                bag.image(bags.TOPIC, 10 + k, bags.COUNTS[k], "16UC1")
+            bag.close()
+
+        return write
+
+    try:
+        import test_recordings_ros as bags
+
+        kinds = {f"rosbag {kind}": make(kind) for kind in bags.KINDS}
+    except ImportError:
+        return {}
+    found = _possible(kinds, lambda name: f"original/{name}")
+    return {name: Subject(s.make, _below(s.read)) for name, s in found.items()}
+
+
+def _below(_read: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Read what lies in the one folder: a bag is a file or a folder."""
+
+    def read(folder: Path) -> None:
+        (inside,) = (folder / "original").iterdir()
+        for path in sorted(inside.iterdir()):
+            _recording(str(path.relative_to(folder)), "ros")(folder)
+
+    return read
+
+
+def _possible(
+    makers: dict[str, Callable[[Path], Any]], inside: Callable[[str], str]
+) -> dict[str, Subject]:
+    found = {}
+    for name, make in makers.items():
+        subject = Subject(_in(make, inside(name)), _recording(inside(name), None))
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                subject.make(Path(folder))
+            except Exception:  # a package is missing
+                continue
+        found[name] = subject
+    return found
+
+
+def _small() -> dict[str, Subject]:
+    """Single files: graphs, poses, descriptions, results, states."""
+    from tofuse.batch.jobs import read_jobs
+    from tofuse.calibration.lens_files import read_lens_file
+    from tofuse.cli.batching import run_words
+    from tofuse.files.arrays import read_npz, write_npz
+    from tofuse.files.pose import read_pose
+    from tofuse.files.tables import read_columns
+    from tofuse.files.trajectory_formats import read_poses
+    from tofuse.pipeline.config import changed, from_method, read_changes
+    from tofuse.pipeline.states import StateError, decode, encode
+    from tofuse.posegraph.g2o import read_g2o
+    from tofuse.posegraph.given import read_loops
+    from tofuse.recordings.camera_file import read_camera_file
+    from tofuse.recordings.rig import read_rig
+    from tofuse.sensor.noise import NoiseModel
+
+    pose = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    vertices = [f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1" for k in range(3)]
+    information = " ".join("100" if a == b else "0" for a in range(6) for b in range(a, 6))
+    edges = [f"EDGE_SE3:QUAT {k} {k + 1} 1 0 0 0 0 0 1 {information}" for k in range(2)]
+    tum = "".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(4))
+    camera = {"schema": 1, "model": "brown", "width": 40, "height": 30, "fx": 40.0, "fy": 40.0,
+              "cx": 19.5, "cy": 14.5, "distortion": [0.1, 0.01, 0, 0, 0], "depth_unit_m": 0.001,
+              "depth_kind": "z", "frame_rate_hz": 30.0, "ambiguity_m": 7.5}  # fmt: skip
+    rig = {"schema": 1, "cameras": [
+        {"name": name, "recording": "", "T_rig_camera": pose, "covariance": [0.0] * 36,
+         "time_offset_s": 0.0, "depth_offset_m": 0.0} for name in ("a", "b")],
+        "disagreement": [{"a": "a", "b": "b", "median_m": 0.01, "pixels": 9}]}  # fmt: skip
+    toml = "method = 'default'\ntolerance_m = 0.03\n[fusion]\nvoxel_m = 0.01\n"
+    toml += "[[filters]]\npart = 'distance'\nminimum = 0.1\nmaximum = 4.0\n"
+    jobs = "[all]\nevery = 2\n[[job]]\nrecording = 'original'\nseed = 1\n"
+
+    def configure(path: Path) -> None:
+        changed(from_method("default"), read_changes(path), where=str(path))
+
+    def state(path: Path) -> None:
+        nodes, arrays = encode({"a": [np.arange(5.0), (1, 2.5, None)], "b": {3: "x"}})
+        text = np.frombuffer(json.dumps(nodes).encode(), np.uint8)
+        with path.open("wb") as file:
+            write_npz(file, {"nodes": text, **arrays})
+
+    def resume(path: Path) -> None:
+        arrays = read_npz(path)
+        try:
+            decode(json.loads(arrays.pop("nodes").tobytes()), arrays)
+        except (StateError, ValueError, KeyError, RecursionError):
+            return  # as `checkpoint` tells it
+
+    texts: dict[str, tuple[str, str, Callable[[Path], object]]] = {
+        "g2o": ("a.g2o", "\n".join([*vertices, *edges]) + "\n", read_g2o),
+        "tum poses": ("a.txt", tum, read_poses),
+        "pose": ("a.txt", "\n".join(" ".join(map(str, row)) for row in pose), read_pose),
+        "pose in json": ("a.json", json.dumps({"T_target_source": pose}), read_pose),
+        "transforms.json": ("transforms.json", json.dumps({"frames": [
+            {"file_path": f"{k}.png", "transform_matrix": pose} for k in range(3)]}), read_poses),
+        "camera.json": ("camera.json", json.dumps(camera), read_camera_file),
+        "a lens": ("a.json", json.dumps(camera), read_lens_file),
+        "rig.json": ("rig.json", json.dumps(rig), read_rig),
+        "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
+        "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
+        "config": ("a.toml", toml, configure),
+        "jobs": ("a.toml", jobs, lambda path: read_jobs(path, run_words)),
+        "noise.json": ("noise.json", json.dumps({"schema": 1}), NoiseModel.load),
+    }  # fmt: skip
+    found = {}
+    for name, (file, text, read) in texts.items():
+        found[name] = Subject(
+            lambda folder, file=file, text=text: _text(folder / file, text),
+            lambda folder, file=file, read=read: read(folder / file),
+        )
+    found["a state"] = Subject(lambda f: state(f / "a.state"), lambda f: resume(f / "a.state"))
+    found["a result"] = Subject(lambda f: _result(f / "out"), lambda f: _load(f / "out"))
+    found["a plan"] = Subject(lambda f: _stopped(f / "out"), lambda f: _settle(f / "out"))
+    return found
+
+
+def _text(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def _result(out: Path) -> None:
+    import made_results
+    from tofuse.results.folder import OutputFolder
+    from tofuse.results.output import write_result
+
+    write_result(made_results.torn(), OutputFolder(out))
+
+
+def _load(out: Path) -> None:
+    from tofuse.results.loading import load_result
+    from tofuse.viewer.kept import read_kept
+
+    load_result(out)
+    read_kept(out)
+
+
+def _stopped(out: Path) -> None:
+    """A result, and moves of another one that were stopped in the middle."""
+    import made_results
+    from attacks.power import Power, PowerCut
+    from tofuse.files import moving
+    from tofuse.results.folder import OutputFolder
+    from tofuse.results.output import write_result
+
+    _result(out)
+    (out / "precious.txt").write_text("mine")
+    for calls in range(10, 80):
+        power = Power(calls)
+        with power.connected(), suppress(PowerCut):
+            write_result(made_results.torn(seed=2), OutputFolder(out, overwrite=True))
+        if moving.is_stopped(out / ".tofuse-unfinished"):
+            break
+    assert moving.is_stopped(out / ".tofuse-unfinished")
+
+
+def _settle(out: Path) -> None:
+    from tofuse.results.folder import OutputFolder, settle
+
+    mine = out / "precious.txt"
+    before = mine.read_bytes() if mine.is_file() else None
+    try:
+        settle(out)
+        OutputFolder(out, overwrite=True).discard()
+    finally:
+        if before is not None and mine.read_bytes() != before:
+            raise AssertionError("what was mine has changed")
+
+
+def damage(folder: Path, rng: np.random.Generator) -> None:
+    """Damage one of the files of a folder, in one of many ways."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
+    if not files:
+        return
+    path = files[rng.integers(len(files))]
+    data = bytearray(path.read_bytes())
+    size = max(1, len(data))
+
+    def at(most: int = size) -> int:
+        return int(rng.integers(max(1, min(size, most))))
+
+    match int(rng.integers(14)):
+        case 0:
+            del data[at() :]
+        case 1:
+            for _ in range(1 + int(rng.integers(8))):
+                if data:
+                    data[at()] ^= 1 << int(rng.integers(8))
+        case 2:  # within the header, where it hurts
+            for _ in range(3):
+                if data:
+                    data[at(300)] = int(rng.integers(256))
+        case 3:  # a length or a count
+            where, width = at(600), int(rng.choice([1, 2, 4, 8]))
+            value = int(rng.choice([0, 1, 2**7, 2**15, 2**31 - 1, 2**31, 2**63 - 1, 2**64 - 1]))
+            order = "little" if rng.integers(2) else "big"
+            data[where : where + width] = (value % 256**width).to_bytes(width, order)
+        case 4:  # a number of a text
+            digits = [k for k, c in enumerate(data[:4000]) if 48 <= c < 58]
+            if digits:
+                k = digits[rng.integers(len(digits))]
+                data[k : k + 1] = _WORDS[rng.integers(len(_WORDS))]
+        case 5:  # a piece is taken out, or is there twice
+            a, b = sorted((at(), at()))
+            data[a:b] = data[a:b] * int(rng.integers(3))
+        case 6:  # a piece of another file
+            other = files[rng.integers(len(files))].read_bytes()
+            a = at()
+            data[a : a + 50] = other[:50]
+        case 7:
+            data[at() : at()] = bytes([int(rng.choice([0, 10, 34, 255]))]) * int(rng.integers(2000))
+        case 8:  # nested
+            k, bracket = at(), (b"[", b'{"a":', b"(", b"a.")[int(rng.integers(4))]
+            data[k:k] = bracket * _DEEP
+        case 9:
+            path.unlink()
+            _odd(path, rng)
+            return
+        case 10:
+            (path.parent / f"{rng.integers(99)}{path.suffix}").write_bytes(data[: at()])
+        case 11:
+            _odd(path.parent / f"stray-{rng.integers(99)}{path.suffix}", rng)
+        case 12:  # what its name says, and something else inside
+            data[:] = files[rng.integers(len(files))].read_bytes()
+        case _:
+            data[:] = rng.bytes(int(rng.integers(3000)))
+    path.write_bytes(data)
+
+
+def _odd(path: Path, rng: np.random.Generator) -> None:
+    """Something that is no file."""
+    import os
+
+    if os.path.lexists(path):
+        return
+    match int(rng.integers(6)):
+        case 0:
+            path.mkdir()
+        case 1:
+            os.mkfifo(path)
+        case 2:
+            path.symlink_to("/dev/zero")
+        case 3:
+            path.symlink_to("nowhere")
+        case 4:
+            path.symlink_to(path.name)
+        case _:
+            pass
+
+
+class _TooLong(BaseException):
+    pass
+
+
+def attack(name: str, subject: Subject, seed: int, folder: Path) -> str:
+    """Read one damaged copy; returns what happened: "read", "refused", or a fault."""
+    from tofuse.errors import TofuseError
+
+    rng = np.random.default_rng([seed, *name.encode()])
+    for _ in range(1 + int(rng.integers(2))):
+        damage(folder, rng)
+
+    def stop(_number: int, _frame: object) -> None:
+        raise _TooLong
+
+    signal.signal(signal.SIGALRM, stop)
+    signal.alarm(_SECONDS)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            subject.read(folder)
+    except TofuseError as error:
+        try:
+            _check_line(error)
+        except AssertionError as fault:
+            return f"{type(error).__name__}: {fault}"
+        return "refused"
+    except _TooLong:
+        return f"took more than {_SECONDS} s"
+    except (Exception, RecursionError) as error:
+        import traceback
+
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        said = " ".join(str(error).split())[:150]
+        return f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {said}"
+    finally:
+        signal.alarm(0)
+    return "read"
+
+
+def _check_line(error: Exception) -> None:
+    text = str(error)
+    if len(text.splitlines()) != 1 or len(text) > 2000:
+        raise AssertionError(f"{len(text)} characters on {len(text.splitlines())} lines")
+
+
+def _work(name: str, first: int, count: int) -> None:
+    """Attack one subject, and print a line for each seed."""
+    subject = subjects()[name]
+    with tempfile.TemporaryDirectory(prefix="attack-") as base:
+        original = Path(base) / "whole"
+        original.mkdir()
+        subject.make(original)
+        subject.read(original)  # and all is loaded
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + _MORE_BYTES,) * 2)
+        for seed in range(first, first + count):
+            copy = Path(base) / "copy"
+            shutil.copytree(original, copy, symlinks=True)
+            print(json.dumps([seed, attack(name, subject, seed, copy)]), flush=True)
+            shutil.rmtree(copy)
+
+
+def run(name: str, count: int, first: int = 0) -> Iterator[tuple[int, str]]:
+    """Attack one subject with so many seeds, in processes of its own; gives seed and outcome."""
+    done, end = first, first + count
+    while done < end:
+        command = [sys.executable, "-m", "attacks.mutation", name, str(done), str(end - done)]
+        worker = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            cwd=Path(__file__).parents[1],
+        )  # fmt: skip
+        assert worker.stdout is not None
+        assert worker.stderr is not None
+        for line in worker.stdout:
+            seed, outcome = json.loads(line)
+            yield seed, outcome
+            done = seed + 1
+        said = worker.stderr.read()
+        worker.stdout.close()
+        worker.stderr.close()
+        if worker.wait() == 0:
+            return
+        last = (said.strip().splitlines() or ["nothing was said"])[-1]
+        yield done, f"its process ended with {worker.returncode}: {last[:150]}"
+        done += 1
+
+
+def shares(names: list[str], total: int) -> dict[str, int]:
+    """How many of a total each subject gets."""
+    each = math.ceil(total / max(1, len(names)))
+    return dict.fromkeys(names, each)
+
+
+if __name__ == "__main__":
+    _work(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

@@ -1,0 +1,121 @@
+"""What lies in a recording and is no file: a bad frame, or nothing, and never a wait."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import tofuse
+from tofuse.cli import main
+from tofuse.errors import InputError
+from tofuse.files.arrays import read_npz
+from tofuse.files.stamps import stamp, stamps_in
+from tofuse.recordings.rig import is_plain_name, read_rig
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links and queues of other systems")
+
+
+@pytest.fixture
+def recording(room_recording: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(room_recording, tmp_path / "rec"))
+
+
+ODD: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda path: path.symlink_to("/dev/null"),
+    "without end": lambda path: path.symlink_to("/dev/zero"),
+    "a queue": lambda path: os.mkfifo(path),
+    "to nowhere": lambda path: path.symlink_to("nowhere"),
+    "to itself": lambda path: path.symlink_to(path.name),
+    "a folder": lambda path: path.mkdir(),
+    "to a folder": lambda path: path.symlink_to("/"),
+    "empty": lambda path: path.touch(),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_what_stands_for_a_frame_is_one_that_can_not_be_read(name, recording) -> None:
+    for k in (0, 3):
+        path = recording / "depth" / f"{k:06}.png"
+        path.unlink()
+        ODD[name](path)
+    found = tofuse.open(recording)
+    assert len(found) == 8
+    unread = [k for k, item in enumerate(found.read_all()) if isinstance(item, InputError)]
+    assert unread == [0, 3]  # and no other has another time
+    assert found.timestamps[4] == pytest.approx(tofuse.open(recording).timestamps[4])
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_what_stands_for_nothing_is_left_out(name, recording, tmp_path, capfd) -> None:
+    for path in (recording / "lock", recording / "depth" / ".#000001.png", recording / "truth/x"):
+        ODD[name](path)
+    assert len(stamps_in(recording, tmp_path / "out")) > 8
+    assert len(tofuse.open(recording)) == 8
+    if name == "to nowhere":  # which once refused the whole recording
+        words = ["run", str(recording), "--out", str(tmp_path / "out"), "--every", "4"]
+        assert main(words) == 0, capfd.readouterr().err
+
+
+def test_a_recording_that_is_no_file_is_refused_at_once(tmp_path, capfd) -> None:
+    os.mkfifo(tmp_path / "a.r3d")
+    for name in ("a.r3d", "/dev/zero"):
+        assert main(["inspect", str(tmp_path / name), "--format", "record3d"]) == 2
+        assert "is neither a file nor a folder" in capfd.readouterr().err
+
+
+def test_the_stamp_of_a_link_to_nowhere_is_its_own(tmp_path) -> None:
+    (tmp_path / "a").symlink_to("nowhere")
+    assert stamp(tmp_path / "a")[1] == len("nowhere")
+
+
+def test_links_out_of_a_recording_are_read(recording, tmp_path) -> None:
+    """The person gave the folder; a data set on another disk is linked to."""
+    image = recording / "depth" / "000002.png"
+    image.rename(tmp_path / "elsewhere.png")
+    image.symlink_to(tmp_path / "elsewhere.png")
+    assert not isinstance(list(tofuse.open(recording).read_all())[2], InputError)
+
+
+@pytest.mark.parametrize("name", ["..", ".", "../x", "/etc", "a/b", "a\\b", "C:", "C:x", "a\nb"])
+def test_names_of_cameras_lead_nowhere(name, tmp_path) -> None:
+    assert not is_plain_name(name)
+    camera = {"name": name, "recording": "", "T_rig_camera": [[1, 0, 0, 0], [0, 1, 0, 0],
+              [0, 0, 1, 0], [0, 0, 0, 1]]}  # fmt: skip
+    path = tmp_path / "rig.json"
+    path.write_text(json.dumps({"schema": 1, "cameras": [camera, camera | {"name": "b"}]}))
+    with pytest.raises(InputError, match="which is no name of a folder"):
+        read_rig(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("frame_rate_hz", 1e-300), ("frame_rate_hz", 1e300), ("ambiguity_m", 1e-9)],
+)
+def test_numbers_that_no_camera_has(field, value, recording, tmp_path, capfd) -> None:
+    path = recording / "camera.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
+    assert main(["run", str(recording), "--out", str(tmp_path / "out")]) == 2
+    said = capfd.readouterr().err
+    assert field in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 5000, "a = " + "[" * 900 + "]" * 900])
+def test_nested_tables(text, recording, tmp_path, capfd) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    words = ["run", str(recording), "--out", str(tmp_path / "out")]
+    assert main([*words, "--config", str(tmp_path / "a.toml")]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_what_is_quoted_of_a_file_has_an_end(tmp_path) -> None:
+    assert len(str(InputError("is " + "x" * 10**6, where="a", remedy="b"))) < 700
+    (tmp_path / "a.npz").write_bytes(b"x")
+    with pytest.raises(InputError, match="can't be read as"):
+        read_npz(tmp_path / "a.npz")

@@ -1,0 +1,114 @@
+"""Who the viewer's server answers, and what its page may do."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+
+import pytest
+
+from tofuse.report.policy import script_hashes, secured
+from tofuse.viewer.server import HOST, is_ours, page_headers
+
+HOSTS: dict[str, tuple[list[str], list[str], bool]] = {
+    "our own page": (["127.0.0.1:8080"], ["http://127.0.0.1:8080"], True),
+    "by name": (["localhost:8080"], ["http://localhost:8080"], True),
+    "typed in": (["localhost:8080"], [], True),
+    "through a tunnel": (["localhost:9000"], ["http://localhost:9000"], True),
+    "no port": (["localhost"], [], True),
+    "a name made to lead here": (["evil.example:8080"], ["http://evil.example:8080"], False),
+    "a page elsewhere": (["127.0.0.1:8080"], ["http://evil.example"], False),
+    "another port": (["127.0.0.1:8080"], ["http://127.0.0.1:3000"], False),
+    "a file": (["127.0.0.1:8080"], ["null"], False),
+    "no host": ([], [], False),
+    "two hosts": (["127.0.0.1:8080", "evil.example"], [], False),
+    "two origins": (["127.0.0.1"], ["http://127.0.0.1", "http://evil.example"], False),
+    "begins alike": (["127.0.0.1.evil.example:8080"], [], False),
+    "a user": (["127.0.0.1:8080@evil.example"], [], False),
+    "another address": (["192.168.1.5:8080"], [], False),
+}
+
+
+@pytest.mark.parametrize("name", HOSTS)
+def test_who_is_answered(name: str) -> None:
+    hosts, origins, ours = HOSTS[name]
+    assert is_ours(hosts, origins) is ours
+
+
+@pytest.fixture(scope="module")
+def port():
+    pytest.importorskip("viser")
+    from tofuse.viewer.server import serve, stop
+
+    server = serve()
+    yield server.get_port()
+    stop(server)
+
+
+def ask(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection(HOST, port, timeout=20)
+    connection.putrequest("GET", path, skip_host="Host" in headers, skip_accept_encoding=True)
+    for name, value in headers.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer
+
+
+def test_the_server_answers_this_machine_alone(port: int) -> None:
+    import viser
+
+    answer = ask(port, "/")
+    assert answer.status == 200
+    policy = answer.getheader("Content-Security-Policy")
+    assert policy is not None
+    scripts = policy.partition("script-src")[2].partition(";")[0]
+    assert ("'unsafe-inline'" in scripts) == (viser.__version__ != "1.1.1")
+    assert answer.getheader("X-Content-Type-Options") == "nosniff"
+    assert ask(port, "/", Host="evil.example").status == 403
+    assert ask(port, "/", Origin="http://evil.example").status == 403
+    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
+    upgrade |= {"Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+    assert ask(port, "/", **upgrade, Origin="http://evil.example").status == 403
+    assert ask(port, "/", **upgrade, Host="evil.example:80").status == 403
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc/passwd", "//etc"],
+)
+def test_no_path_leads_out(port: int, path: str) -> None:
+    assert ask(port, path).status in (400, 403, 404)
+
+
+def test_no_other_interface_is_listened_on(port: int) -> None:
+    name = socket.gethostbyname(socket.gethostname())
+    if name.startswith("127."):
+        pytest.skip("this machine has no other address")
+    with pytest.raises(OSError, match=r"refused|timed out"):
+        socket.create_connection((name, port), timeout=5)
+
+
+PAGE = """<!doctype html><head><meta charset="utf-8"></head>
+<script data-p="</script> > '">let a = 1;</script><script type="application/json">{"a": 1}</script>
+<script type="module">import "x";</script><script src="b.js"></script>"""
+
+
+def test_a_page_names_its_own_scripts_and_no_others() -> None:
+    hashes = script_hashes(PAGE)
+    assert len(hashes) == 2
+    assert all(h.startswith("'sha256-") and h.endswith("='") for h in hashes)
+    page = secured(PAGE)
+    assert f"script-src {' '.join(hashes)};" in page
+    assert page.index("Content-Security-Policy") < page.index("<script")
+    assert "default-src 'none'" in page
+    assert "script-src 'none'" in secured('<meta charset="utf-8">')
+    assert script_hashes("<script>a\r\nb</script>") == script_hashes("<script>a\nb</script>")
+
+
+def test_only_pages_have_a_policy() -> None:
+    assert "Content-Security-Policy" not in page_headers({"Content-Type": "font/woff2"}, b"")
+    found = page_headers({"Content-Type": "text/html"}, PAGE.encode())
+    assert "default-src 'self'" in found["Content-Security-Policy"]
