@@ -119,3 +119,19 @@ def test_what_is_quoted_of_a_file_has_an_end(tmp_path) -> None:
     (tmp_path / "a.npz").write_bytes(b"x")
     with pytest.raises(InputError, match="can't be read as"):
         read_npz(tmp_path / "a.npz")
+
+
+def test_absurd_numbers_beside_the_images_are_no_warnings_of_numpy(recording) -> None:
+    """Pytest turns those into errors."""
+    path = recording / "groundtruth.txt"
+    lines = path.read_text().splitlines()
+    words = lines[-1].split()
+    path.write_text("\n".join([*lines[:-1], " ".join([words[0], "1e300", *words[2:]])]) + "\n")
+    rows = "".join(f"{0.01 * k},1e308,1e308,1e308,1e308,0,0\n" for k in range(50))
+    (recording / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + rows)
+    try:
+        found = tofuse.open(recording)
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert all(not isinstance(item, InputError) for item in found.read_all())

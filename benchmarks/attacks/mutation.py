@@ -55,7 +55,8 @@ def subjects() -> dict[str, Subject]:
     for name, (make, file, format_) in cameras.MAKERS.items():
         inside = f"original/{file}" if file else "original"
         found[name] = Subject(_in(make, inside), _recording(inside, format_))
-    for name in ("blaze", "royale", "tiff3d"):
+    found["tiff"] = Subject(_in(made_exports.make_tiff3d, "original"), _tiffs)
+    for name in ("blaze", "royale"):
         make = getattr(made_exports, f"make_{name}")
         found[name] = Subject(_in(make, "original"), _recording("original", None))
     return found | _scans() | _bags() | _small()
@@ -82,6 +83,17 @@ def _recording(inside: str, format_: str | None) -> Callable[[Path], object]:
                 raise AssertionError("a point is not finite")
 
     return read
+
+
+def _tiffs(folder: Path) -> None:
+    from tofuse.errors import TofuseError
+    from tofuse.files.tiff import read_tiff
+
+    for path in sorted((folder / "original").iterdir()):
+        try:
+            read_tiff(path)
+        except TofuseError as error:
+            _check_line(error)
 
 
 def _scans() -> dict[str, Subject]:
