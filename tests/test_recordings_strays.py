@@ -129,9 +129,4 @@ def test_absurd_numbers_beside_the_images_are_no_warnings_of_numpy(recording) ->
     path.write_text("\n".join([*lines[:-1], " ".join([words[0], "1e300", *words[2:]])]) + "\n")
     rows = "".join(f"{0.01 * k},1e308,1e308,1e308,1e308,0,0\n" for k in range(50))
     (recording / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + rows)
-    try:
-        found = tofuse.open(recording)
-    except InputError as error:
-        assert "\n" not in str(error)
-    else:
-        assert all(not isinstance(item, InputError) for item in found.read_all())
+    assert not any(isinstance(item, InputError) for item in tofuse.open(recording).read_all())

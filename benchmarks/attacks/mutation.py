@@ -184,9 +184,11 @@ def _small() -> dict[str, Subject]:
     from tofuse.posegraph.given import read_loops
     from tofuse.recordings.camera_file import read_camera_file
     from tofuse.recordings.rig import read_rig
-    from tofuse.sensor.noise import NoiseModel
+    from tofuse.sensor.noise import NoiseModel, RangeLaw
 
     pose = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    still = np.eye(4).tolist()
+    noise = NoiseModel("a camera", RangeLaw(0.002, 0.001)).to_dict()
     vertices = [f"VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1" for k in range(3)]
     information = " ".join("100" if a == b else "0" for a in range(6) for b in range(a, 6))
     edges = [f"EDGE_SE3:QUAT {k} {k + 1} 1 0 0 0 0 0 1 {information}" for k in range(2)]
@@ -194,8 +196,14 @@ def _small() -> dict[str, Subject]:
     camera = {"schema": 1, "model": "brown", "width": 40, "height": 30, "fx": 40.0, "fy": 40.0,
               "cx": 19.5, "cy": 14.5, "distortion": [0.1, 0.01, 0, 0, 0], "depth_unit_m": 0.001,
               "depth_kind": "z", "frame_rate_hz": 30.0, "ambiguity_m": 7.5}  # fmt: skip
+    lens = {
+        "image_width": 40,
+        "image_height": 30,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [40.0, 0, 19.5, 0, 40, 14.5, 0, 0, 1]},
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.1, 0.01, 0, 0, 0]},
+    }
     rig = {"schema": 1, "cameras": [
-        {"name": name, "recording": "", "T_rig_camera": pose, "covariance": [0.0] * 36,
+        {"name": name, "recording": "", "T_rig_camera": still, "covariance": [0.0] * 36,
          "time_offset_s": 0.0, "depth_offset_m": 0.0} for name in ("a", "b")],
         "disagreement": [{"a": "a", "b": "b", "median_m": 0.01, "pixels": 9}]}  # fmt: skip
     toml = "method = 'default'\ntolerance_m = 0.03\n[fusion]\nvoxel_m = 0.01\n"
@@ -226,13 +234,13 @@ def _small() -> dict[str, Subject]:
         "transforms.json": ("transforms.json", json.dumps({"frames": [
             {"file_path": f"{k}.png", "transform_matrix": pose} for k in range(3)]}), read_poses),
         "camera.json": ("camera.json", json.dumps(camera), read_camera_file),
-        "a lens": ("a.json", json.dumps(camera), read_lens_file),
+        "a lens": ("a.json", json.dumps(lens), read_lens_file),
         "rig.json": ("rig.json", json.dumps(rig), read_rig),
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),
         "jobs": ("a.toml", jobs, lambda path: read_jobs(path, run_words)),
-        "noise.json": ("noise.json", json.dumps({"schema": 1}), NoiseModel.load),
+        "noise.json": ("noise.json", json.dumps(noise), NoiseModel.load),
     }  # fmt: skip
     found = {}
     for name, (file, text, read) in texts.items():

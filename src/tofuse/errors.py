@@ -23,8 +23,8 @@ class TofuseError(Exception):
         self.problem = _clipped(problem)
         self.where = None if where is None else str(where)
         self.remedy = remedy
-        parts = [f"{self.where}: " if self.where else "", self.problem]
-        parts += [f"; {remedy}"] if remedy else []
+        parts = [f"{_clipped(self.where)}: " if self.where else "", self.problem]
+        parts += [f"; {_clipped(remedy)}"] if remedy else []
         super().__init__(" ".join("".join(parts).split()))
 
 
