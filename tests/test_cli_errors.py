@@ -330,7 +330,7 @@ def test_no_command_shows_the_help(words, capsys) -> None:
 
 CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
     "bad toml": ("filters = [", ("is not TOML",)),
-    "not text": ("\xff\xfe", ("is not TOML",)),
+    "not text": ("\xff\xfe", ("is not text",)),
     "unknown option": ("colour = 1", ("unknown option 'colour'", "'filters'")),
     "unknown nested option": (
         "[odometry.registration]\nresolutoin = 1",

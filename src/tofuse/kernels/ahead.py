@@ -8,7 +8,6 @@ method: `python benchmarks/compilation.py --list` writes it anew.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from typing import Any
 import numba
 
 from tofuse.kernels import jit
+from tofuse.kernels.cores import usable_cores
 
 _LIST = Path(__file__).with_name("signatures.txt")
 _DONE = "compiled"
@@ -50,7 +50,7 @@ def compiled_beside() -> Iterator[None]:
 
 
 def _start() -> subprocess.Popen[bytes] | None:
-    if (os.cpu_count() or 1) < 2 or (Path(jit.cache_folder()) / _DONE).exists():
+    if usable_cores() < 2 or (Path(jit.cache_folder()) / _DONE).exists():
         return None
     try:
         return subprocess.Popen(
