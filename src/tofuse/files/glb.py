@@ -29,6 +29,7 @@ def write_glb(
     color: ArrayLike | None = None,
     uv: ArrayLike | None = None,
     texture: bytes | None = None,
+    T_scene_node: ArrayLike | None = None,
     name: str = "model",
     generator: str = "tofuse",
 ) -> None:
@@ -50,13 +51,16 @@ def write_glb(
         (N, 2) places in the texture, from its upper left corner, 0 to 1.
     texture
         A PNG or JPEG file.
+    T_scene_node
+        (4, 4) from the frame of the points into the scene; the points are in the scene's axes
+        without one.
 
     Raises
     ------
     InputError
         If the shapes disagree.
     """
-    document, body = _document(path, points, faces, normals, color, uv, texture, name, generator)
+    document, body = _document(path, points, faces, normals, color, uv, texture, T_scene_node, name, generator)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks: list[bytes | bytearray] = [struct.pack("<I4s", len(text), b"JSON"), text]
@@ -75,11 +79,12 @@ def write_gltf(
     color: ArrayLike | None = None,
     uv: ArrayLike | None = None,
     texture: bytes | None = None,
+    T_scene_node: ArrayLike | None = None,
     name: str = "model",
     generator: str = "tofuse",
 ) -> None:
     """Write a mesh as `write_glb` does, as one file of JSON with all data inside as base64."""
-    document, body = _document(path, points, faces, normals, color, uv, texture, name, generator)
+    document, body = _document(path, points, faces, normals, color, uv, texture, T_scene_node, name, generator)
     for buffer in document.get("buffers", ()):
         text = base64.b64encode(body).decode()
         buffer["uri"] = f"data:application/octet-stream;base64,{text}"
@@ -94,6 +99,7 @@ def _document(
     color: ArrayLike | None,
     uv: ArrayLike | None,
     texture: bytes | None,
+    T_scene_node: ArrayLike | None,
     name: str,
     generator: str,
 ) -> tuple[dict[str, Any], bytearray]:
@@ -143,9 +149,12 @@ def _document(
         surface["baseColorTexture"] = {"index": 0}
     attributes = {what: k for k, what in enumerate(columns)}
     primitive = {"attributes": attributes, "indices": len(columns), "material": 0, "mode": 4}
+    node: dict[str, Any] = {"mesh": 0, "name": name}
+    if T_scene_node is not None:  # stored column by column
+        node["matrix"] = np.asarray(T_scene_node, float).T.ravel().tolist()
     document |= {
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": name}],
+        "nodes": [node],
         "materials": [{"name": "surface", "doubleSided": True, "pbrMetallicRoughness": surface}],
         "meshes": [{"name": name, "primitives": [primitive]}],
         "accessors": accessors,

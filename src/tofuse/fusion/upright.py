@@ -16,31 +16,34 @@ _MAX_TILT, _ANGLE = np.radians(50.0), np.radians(12.0)
 _LEAST_SHARE, _MOST_BELOW = 0.04, 0.02
 
 
-def T_up_world(mesh: Mesh | None, poses: Float64) -> Float64:
+def T_up_world(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:
     """Return the motion (4, 4) of `upright`, which is a rotation about the world's origin."""
     T = np.eye(4)
-    T[:3, :3] = upright(mesh, poses)
+    T[:3, :3] = upright(mesh, poses, up)
     return T
 
 
-def upright(mesh: Mesh | None, poses: Float64) -> Float64:
+def upright(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:
     """Return the rotation (3, 3) from the world into axes x right, y up, z towards the viewer.
 
-    Up is the normal of the floor, where there is one: the largest plane across the cameras' up
-    that has hardly anything below it. Without one it is the mean of the cameras' up. The first
-    camera looks along -z.
+    Up is the normal of the floor, where there is one: the largest plane that faces about upwards
+    and has hardly anything below it. Without one it is what gravity says, and without gravity the
+    mean of the cameras' up. The first camera looks along -z.
 
     Parameters
     ----------
     poses
         (N, 4, 4) T_world_camera, NaN where there is none.
+    up
+        (3,) against gravity, in the world, as an accelerometer measured it; None without one.
     """
     known = poses[np.isfinite(poses).all((1, 2))]
     if len(known) == 0:
         known = np.eye(4)[None]
-    up = -known[:, :3, 1].mean(0)
-    length = np.linalg.norm(up)
-    up = up / length if length > 0.1 else -known[0, :3, 1]
+    if up is None:
+        up = -known[:, :3, 1].mean(0)
+        up = up if np.linalg.norm(up) > 0.1 else -known[0, :3, 1]
+    up = up / np.linalg.norm(up)
     floor = None if mesh is None else _floor(mesh, up)
     y = up if floor is None else floor
     back = -known[0, :3, 2]

@@ -288,6 +288,7 @@ class BackEnd:
             seed=0,
             threads=1,
             components=components,
+            up=closed.told.up(graph),
         )
 
     def graph(

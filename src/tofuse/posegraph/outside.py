@@ -112,6 +112,17 @@ class Told:
         vertices, rows = np.array(here, np.intp).T
         return Gravity(vertices, self.gravity[rows, :3], self.gravity[rows, 3], None, self.gate)
 
+    def up(self, graph: PoseGraph) -> Float64 | None:
+        """Return the unit vector (3,) against gravity in the graph's world, None without any."""
+        known = self.gravity_of(graph.ids.tolist())
+        if known is None:
+            return None
+        down = (graph.poses[known.vertices, :3, :3] @ known.directions[:, :, None])[..., 0]
+        # A median: an accelerometer that is shaken measures more than gravity.
+        up = -np.median(down, axis=0)
+        length = float(np.linalg.norm(up))
+        return up / length if length > 0.1 else None
+
     def between(self, ids: Sequence[int]) -> list[Measured]:
         """Relative poses of some frames in a row (ascending), where all steps between are known."""
         following = {step.i: step for step in self.steps}

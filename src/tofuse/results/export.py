@@ -79,7 +79,11 @@ class _Result:
     @cached_property
     def R_up_world(self) -> Float64:
         """The rotation (3, 3) that makes the mesh upright."""
-        return upright(self.mesh, self.trajectory[1])
+        T = read_run_json(self.folder / "run.json").get("T_up_world")
+        if T is None:  # of an earlier version
+            return upright(self.mesh, self.trajectory[1])
+        R: Float64 = np.array(T, float)[:3, :3]
+        return R
 
     @cached_property
     def painted(self) -> Shape:

@@ -97,6 +97,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         tuple(_component(folder, k, c) for k, c in enumerate(run["components"])),
         tuple(_session(each) for each in run.get("sessions", ())),
         tuple(SessionPair(**each) for each in run.get("session_pairs", ())),
+        up=np.array(run["T_up_world"], float)[1, :3] if "T_up_world" in run else None,
     )
 
 

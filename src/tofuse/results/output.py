@@ -21,7 +21,6 @@ from tofuse.files.reading import parsed, read_text
 from tofuse.files.trajectory import read_tum, write_tum
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
-from tofuse.fusion.upright import T_up_world, upright
 from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
@@ -110,7 +109,7 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
 
 
 def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
-    """Write `mesh.ply`, in the world frame, and `mesh.glb`, which stands upright."""
+    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node turns it upright."""
     write_ply(
         folder / "mesh.ply",
         mesh.vertices,
@@ -119,21 +118,22 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textu
         scalars={"views": mesh.views, "sigma": mesh.sigma},
         faces=mesh.faces,
     )
-    R = upright(mesh, result.trajectory)
+    upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
     if texture is None:
         write_glb(
             folder / "mesh.glb",
-            mesh.vertices @ R.T,
+            mesh.vertices,
             mesh.faces,
-            normals=mesh.normals @ R.T,
+            normals=mesh.normals,
             color=mesh.color,
             generator=generator,
+            **upright,
         )
         return
     atlas, image = texture.atlas, png_bytes(texture.image)
     points, normals = (
-        values[atlas.vertices] @ R.T for values in (texture.mesh.vertices, texture.mesh.normals)
+        values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
     )
     write_glb(
         folder / "mesh.glb",
@@ -143,7 +143,10 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textu
         uv=atlas.uv,
         texture=image,
         generator=generator,
+        **upright,
     )
+    R = result.T_up_world[:3, :3].T
+    points, normals = points @ R, normals @ R
     write_obj(folder / "mesh.obj", points, atlas.faces, normals=normals, uv=atlas.uv, texture=image)
 
 
@@ -184,7 +187,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 }
                 for f in d.frames
             ],
-            "T_up_world": T_up_world(result.mesh, result.trajectory),
+            "T_up_world": result.T_up_world,
             "components": [_component(c) for c in result.components],
             "sessions": [
                 {

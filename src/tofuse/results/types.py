@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from tofuse.evaluation.changes import Change
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.upright import T_up_world
 from tofuse.odometry.base import Status
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
@@ -294,6 +296,9 @@ class Reconstruction:
         empty for a run.
     changes
         What changed between two sessions in the main model, in its world.
+    up
+        (3,) unit vector against gravity in the world, as an accelerometer measured it; None without
+        one.
     """
 
     trajectory: Float64
@@ -310,6 +315,12 @@ class Reconstruction:
     sessions: tuple[SessionRecord, ...] = ()
     session_pairs: tuple[SessionPair, ...] = ()
     changes: tuple[SessionChange, ...] = ()
+    up: Float64 | None = None
+
+    @cached_property
+    def T_up_world(self) -> Float64:
+        """(4, 4) from the world into axes x right, y up, z towards the viewer (`upright`)."""
+        return T_up_world(self.mesh, self.trajectory, self.up)
 
     def __repr__(self) -> str:
         a = self.diagnostics.accuracy

@@ -144,11 +144,14 @@ def read_result(folder: Path) -> Result:
         {} if kept is None else kept.before,
         model_before,
         () if kept is None else kept.pictures,
-        _up(mesh, poses),
+        _up(run, mesh, poses),
     )
 
 
-def _up(mesh: Layer | None, poses: Float64) -> Float64:
+def _up(run: dict[str, Any], mesh: Layer | None, poses: Float64) -> Float64:
+    if "T_up_world" in run:
+        stated: Float64 = np.array(run["T_up_world"], float)[1, :3]
+        return stated
     n = 0 if mesh is None else len(mesh.points)
     if mesh is not None and n and mesh.normals is not None and mesh.faces is not None:
         nothing = np.zeros(n, np.int32)
