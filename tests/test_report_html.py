@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 from dataclasses import replace
@@ -25,8 +24,10 @@ from tofuse.report import plots
 from tofuse.report.extras import ReportExtras
 from tofuse.report.fields import fields
 from tofuse.report.html import write_report
+from tofuse.report.packing import squeezed, unsqueezed
 from tofuse.report.pictures import draw
-from tofuse.report.scene import MAX_FACES, make_scene, packed
+from tofuse.report.scene import MAX_FACES, UNSEEN, make_scene, packed, seen_colors
+from tofuse.report.subject import Subject
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
@@ -261,14 +262,14 @@ def shown(tmp_path_factory):
 
 
 ORDER = [
-    "verdict",
     "model",
+    "verdict",
+    "frames",
     "views",
     "cameras",
     "error",
     "objective",
     "filters",
-    "frames",
     "loops",
     "recording",
     "timings",
@@ -277,15 +278,14 @@ ORDER = [
 ]
 
 
-def test_sections_come_in_order_and_the_verdict_first(shown):
+def test_sections_come_in_order_and_the_model_first(shown):
     assert list(shown.sections) == [name for name in ORDER if name != "recording"]
     text = " ".join(shown.sections["verdict"].split())
-    assert (
-        "Degraded: use this model with care. 2 readable frames have no pose (frames 9-10)." in text
-    )
+    assert "Degraded: use this model with care." in text
+    assert "2 readable frames have no pose (frames 9-10)." in text
     for name, number in (("tracked", 20), ("predicted", 1), ("lost", 2), ("skipped", 1)):
-        assert f"frames {name}{number}" in text
-    assert f"{len(room()[0].cloud):,} points" in text
+        assert f"frames {name}{number}" in shown.sections["frames"]
+    assert f"{len(room()[0].cloud):,} points" in shown.sections["frames"]
 
 
 def test_nothing_is_fetched_from_elsewhere(shown, tmp_path):
@@ -470,17 +470,22 @@ def test_loops_timings_and_objective(shown):
     assert "no timestamps.txt" in shown.sections["settings"]
 
 
-def decode(text, kind):
-    return flat(text, kind).reshape(-1, 3)
-
-
-def flat(text, kind):
-    return np.frombuffer(base64.b64decode(text), kind)
+def test_arrays_come_back_as_they_were():
+    rng = np.random.default_rng(3)
+    for array in (
+        rng.integers(0, 2**16, (50, 3)).astype(np.uint16),
+        rng.integers(0, 2**32, (40, 3)).astype(np.uint32),
+        rng.integers(-128, 128, (30, 3)).astype(np.int8),
+        rng.normal(0, 1e3, (20, 12)).astype(np.float32),
+        np.arange(1).astype(np.uint8)[:, None],
+    ):
+        back = unsqueezed(squeezed(array), array.dtype.str, array.shape[1])
+        np.testing.assert_array_equal(back, array)
 
 
 def test_viewer_holds_a_surface_with_not_too_many_faces():
     # A wavy sheet of far more faces than a phone should draw.
-    n = 420
+    n = 520
     x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
     z = 2 + 0.05 * np.sin(6 * x)
     vertices = np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32)
@@ -498,29 +503,47 @@ def test_viewer_holds_a_surface_with_not_too_many_faces():
     assert len(scene.mesh.faces) <= MAX_FACES
     assert len(scene.mesh.faces) > MAX_FACES / 4
     data = packed(scene)
-    shown = decode(data["mesh"]["points"], "<u2") / 65535 * data["extent"] + data["low"]
+    model = data["model"]
+    shown = unsqueezed(model["points"], "<u2", 3) / 65535 * data["extent"] + data["low"]
     off = shown[:, 2] - (2 + 0.05 * np.sin(6 * shown[:, 0]))
     assert np.abs(off).max() < 0.003
-    triangles = decode(data["mesh"]["faces"], "<u4")
+    triangles = unsqueezed(model["faces"], "<u4", 3)
     assert triangles.max() == len(shown) - 1
-    assert len(decode(data["mesh"]["colors"], np.uint8)) == len(shown)
-    assert packed(make_scene(result, rows))["mesh"] is None
+    assert len(unsqueezed(model["colors"], "u1", 3)) == len(shown) == data["count"]
+    assert packed(make_scene(result, rows))["model"]["faces"] is None
+
+
+def test_nothing_is_black_where_no_image_showed_a_colour():
+    colors = np.array([[0, 0, 0], [0, 0, 1], [200, 10, 5]], np.uint8)
+    shown = seen_colors(colors)
+    assert shown[0].tolist() == list(UNSEEN)
+    np.testing.assert_array_equal(shown[1:], colors[1:])
 
 
 def test_viewer_holds_the_model_the_cameras_and_the_loops(shown):
-    result, _ = room()
+    result, extras = room()
+    subject = Subject.of(result, extras)
+    R = subject.straight
     scene = json.loads(shown.scripts[0])
-    points = np.array(scene["low"]) + decode(scene["points"], "<u2") / 65535 * scene["extent"]
-    np.testing.assert_allclose(points, result.cloud.points, atol=1e-4)
-    np.testing.assert_array_equal(decode(scene["colors"], np.uint8), result.cloud.color)
-    normals = decode(scene["normals"], np.int8) / 127
-    np.testing.assert_allclose(normals, result.cloud.normals, atol=0.01)
-    loops = decode(scene["lines"]["loops"], "<f4")
-    np.testing.assert_allclose(loops, result.trajectory[[0, 23], :3, 3], atol=1e-6)
+    model = scene["model"]
+    points = (
+        np.array(scene["low"]) + unsqueezed(model["points"], "<u2", 3) / 65535 * scene["extent"]
+    )
+    np.testing.assert_allclose(points, result.cloud.points @ R.T, atol=1e-4)
+    colors = unsqueezed(model["colors"], "u1", 3)
+    np.testing.assert_array_equal(colors, seen_colors(result.cloud.color))
+    normals = unsqueezed(model["normals"], "i1", 3) / 127
+    np.testing.assert_allclose(normals, result.cloud.normals @ R.T, atol=0.01)
+    loops = unsqueezed(scene["lines"]["loops"], "<f4", 3)
+    np.testing.assert_allclose(loops, result.trajectory[[0, 23], :3, 3] @ R.T, atol=1e-6)
+    frames = scene["frames"]
+    assert unsqueezed(frames["index"], "<u4", 1)[:, 0].tolist() == list(range(24))
+    assert frames["status"] == "000001000220000300000000"
     for name, poses in (("before", result.diagnostics.sequential), ("after", result.trajectory)):
-        ends = decode(scene["lines"][name], "<f4")
-        for center in poses[np.isfinite(poses[:, 0, 0]), :3, 3]:
-            assert np.abs(ends - center).max(1).min() < 1e-6
+        found = unsqueezed(frames[name], "<f4", 12).reshape(-1, 3, 4)
+        known = np.isfinite(poses[:, 0, 0])
+        np.testing.assert_allclose(found[known], R @ poses[known, :3], atol=1e-6)
+        assert not found[~known].any()
 
 
 def test_model_can_be_coloured_by_what_its_points_know():
@@ -534,17 +557,26 @@ def test_model_can_be_coloured_by_what_its_points_know():
         np.array([0.001, 0.002, 0.004, UNKNOWN_M], np.float32),
     )
     found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud), {}))}
-    assert list(found) == ["height", "accuracy", "views"]
-    of = {name: flat(f.packed()["points"], np.uint8).astype(int) for name, f in found.items()}
+    assert list(found) == ["accuracy", "height", "views"]
+    of = {
+        name: unsqueezed(f.packed()["values"], "u1", 1)[:, 0].astype(int)
+        for name, f in found.items()
+    }
     assert of["height"].tolist() == [255, pytest.approx(128, abs=3), 0, 0]
     assert (np.diff(of["views"]) > 0).all()
-    # The bar is of what is constrained; what is not has the colour of its end, and is named there.
+    # The bar is of what is constrained; what is not lies beyond its end, and is named there.
     accuracy = found["accuracy"]
     assert of["accuracy"][3] == 255
-    assert (np.diff(of["accuracy"][:3]) > 0).all()
+    np.testing.assert_allclose(np.diff(of["accuracy"][:3]), np.log(2) / np.log(1.0462), atol=1)
     assert accuracy.low == pytest.approx(0.00196, rel=0.1)
     assert accuracy.high == pytest.approx(0.00784, rel=0.1)
-    assert accuracy.said[1].endswith("mm or not constrained")
+    assert accuracy.said[2].endswith("mm or not constrained")
+    # The page reads it back from the byte, for the ± of a distance.
+    low, high = accuracy.span
+    assert low * (high / low) ** (of["accuracy"][1] / 255) == pytest.approx(0.00392, rel=0.03)
+    # Cameras are coloured by the same bar.
+    wider = fields(make_scene(lonely(cloud=cloud), {}), np.array([0.05, np.nan]))[0]
+    assert wider.high == pytest.approx(0.05)
 
 
 def test_viewer_thins_a_large_model(tmp_path):
@@ -552,8 +584,8 @@ def test_viewer_thins_a_large_model(tmp_path):
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32), np.array([100.0, 0, 0]))
     got = page(tmp_path, lonely(cloud=cloud), ReportExtras("large"))
     scene = json.loads(got.scripts[0])
-    assert scene["count"] == len(decode(scene["points"], "<u2")) == 150_000
-    assert scene["normals"] is None
+    assert scene["count"] == len(unsqueezed(scene["model"]["points"], "<u2", 3)) == 150_000
+    assert scene["model"]["normals"] is None
     assert scene["center"][0] == pytest.approx(100, abs=0.1)  # the offset counts
     assert "150,000 of 200,000 points are shown" in got.sections["model"]
 
@@ -710,7 +742,7 @@ def test_poor_results_give_a_sensible_report(name, tmp_path):
 def test_poor_results_say_what_is_missing(tmp_path):
     got = page(tmp_path, *POOR["one cloud"])
     assert "Nothing was optimised" in got.sections["objective"]
-    assert "No loop was found" in got.sections["loops"]
+    assert "No loop closure was found" in got.sections["loops"]
     assert "Every frame was tracked." in got.sections["frames"]
     assert "Good: the only frame has a pose" in got.sections["verdict"]
     (tmp_path / "report.html").unlink()

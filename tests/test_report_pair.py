@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-
 import numpy as np
 import pytest
 
@@ -12,6 +10,7 @@ from tofuse.geometry import se3
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
 from tofuse.report import images
+from tofuse.report.packing import unsqueezed
 from tofuse.report.pair_scene import (
     MAX_POINTS,
     distance_colors,
@@ -63,9 +62,9 @@ def test_colors_run_to_the_end_of_the_bar_and_then_to_grey() -> None:
 
 def decoded(data: dict, mode: str, which: str) -> np.ndarray:
     (layer,) = (x for x in data["layers"] if (x["mode"], x["view"]) == (mode, which))
-    steps = np.frombuffer(base64.b64decode(data["arrays"][layer["points"]]), "<u2")
-    assert len(steps) == 3 * layer["count"]
-    return layer["low"] + steps.reshape(-1, 3) / 65535 * np.array(layer["extent"])
+    steps = unsqueezed(data["arrays"][layer["points"]], "<u2", 3)
+    assert len(steps) == layer["count"]
+    return layer["low"] + steps / 65535 * np.array(layer["extent"])
 
 
 def test_layers_are_where_the_poses_put_them() -> None:

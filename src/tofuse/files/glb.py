@@ -60,7 +60,9 @@ def write_glb(
     InputError
         If the shapes disagree.
     """
-    document, body = _document(path, points, faces, normals, color, uv, texture, T_scene_node, name, generator)
+    document, body = _document(
+        path, points, faces, normals, color, uv, texture, T_scene_node, name, generator
+    )
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks: list[bytes | bytearray] = [struct.pack("<I4s", len(text), b"JSON"), text]
@@ -84,7 +86,9 @@ def write_gltf(
     generator: str = "tofuse",
 ) -> None:
     """Write a mesh as `write_glb` does, as one file of JSON with all data inside as base64."""
-    document, body = _document(path, points, faces, normals, color, uv, texture, T_scene_node, name, generator)
+    document, body = _document(
+        path, points, faces, normals, color, uv, texture, T_scene_node, name, generator
+    )
     for buffer in document.get("buffers", ()):
         text = base64.b64encode(body).decode()
         buffer["uri"] = f"data:application/octet-stream;base64,{text}"

@@ -27,6 +27,7 @@ from tofuse.pipeline.self_calibration import self_calibrated
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.noise import noise_model_for
+from tofuse.recordings.phones import ARKIT_UP, POSES_BY
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 from tofuse.sensor.noise import NOISE, NoiseModel
@@ -117,7 +118,10 @@ def _once(
                 remedy="check that the files are complete, or give --format",
             )
         result = tracked.mapper.finish(stages)
-    return described(result, describe(recording))
+    result = described(result, describe(recording))
+    if result.up is None and config.outside:
+        result = replace(result, up=device_up(recording, result))
+    return result
 
 
 def described(result: Reconstruction, recording: dict[str, Any]) -> Reconstruction:
@@ -253,6 +257,30 @@ def describe(recording: Recording) -> dict[str, Any]:
         "frames": len(recording),
         "warnings": list(recording.warnings),
     }
+
+
+def device_up(recording: Recording, result: Reconstruction) -> Float64 | None:
+    """Return the unit vector (3,) against gravity in the result's world, as a phone's poses say.
+
+    None where the poses of the recording come from no such device, or share no frame with these.
+    """
+    if recording.metadata.get(POSES_BY) != "ARKit" or recording.reference is None:
+        return None
+    rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
+    ups = [
+        result.trajectory[rows[index], :3, :3] @ T_device_camera[:3, :3].T @ ARKIT_UP
+        for index, T_device_camera in zip(
+            recording.indices.tolist(), recording.reference, strict=True
+        )
+        if index in rows
+    ]
+    known = np.array(ups, float).reshape(-1, 3)
+    known = known[np.isfinite(known).all(1)]
+    if not len(known):
+        return None
+    up: Float64 = np.median(known, axis=0)
+    length = float(np.linalg.norm(up))
+    return up / length if length > 0.1 else None
 
 
 def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 | None:

@@ -24,6 +24,7 @@ ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 SENSOR = "iPhone or iPad LiDAR (direct ToF)"
 # Of the metadata: which program found the poses that a phone recorded.
 POSES_BY = "poses_by"
+ARKIT_UP = np.array([0.0, 1.0, 0.0])  # against gravity, in the world of its poses
 IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, which its intrinsics are for
 CONFIDENCE_MAX = 2.0
 

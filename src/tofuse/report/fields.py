@@ -10,85 +10,113 @@ from numpy.typing import NDArray
 
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.report import words
-from tofuse.report.scene import Scene, base64_of, height_range
+from tofuse.report.packing import squeezed
+from tofuse.report.scene import Scene, height_range
 
 Float64 = NDArray[np.float64]
 
 # Of normally distributed errors, one in twenty exceeds so many standard deviations.
 OF_95_PERCENT = 1.96
+# Accuracies are kept as bytes from a tenth of a millimetre on, each 4.9 % more than the one before.
+_FINEST_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A value of every point (K,) and of every vertex of the mesh (V,) that is shown.
+    """A value (K,) of everything that is shown: every point, or every vertex of the surface.
 
     Attributes
     ----------
     low, high
         Values at the two ends of the colour bar; what is beyond has the colour of that end.
     said
-        What is written at these ends.
+        What is written at these ends, and in the middle.
+    span
+        Values that the bytes 0 and 255 stand for.
+    logarithmic
+        Whether equal steps are equal ratios.
     """
 
     name: str
     label: str
-    points: Float64
-    vertices: Float64
+    values: Float64
     low: float
     high: float
-    said: tuple[str, str]
+    said: tuple[str, str, str]
+    span: tuple[float, float]
+    logarithmic: bool = False
 
     def packed(self) -> dict[str, Any]:
-        """Return the field for the viewer: values as bytes between the ends of the bar."""
+        """Return the field for the viewer: values as bytes, and where the bar begins and ends."""
         return {
             "label": self.label,
             "said": self.said,
-            "points": base64_of(self._bytes(self.points)),
-            "vertices": base64_of(self._bytes(self.vertices)),
+            "ends": [float(self.shares(np.array(end))) for end in (self.low, self.high)],
+            "span": self.span,
+            "values": squeezed(np.round(255 * self.shares(self.values)).astype(np.uint8)),
         }
 
-    def _bytes(self, values: Float64) -> NDArray[np.uint8]:
-        share = (values - self.low) / max(self.high - self.low, 1e-9)
-        # What is not known has the colour of what is worst.
-        return np.round(255 * np.clip(np.nan_to_num(share, nan=1.0), 0, 1)).astype(np.uint8)
+    def shares(self, values: Float64) -> Float64:
+        """Return values as shares of the span, 0 to 1; what is not known is worst."""
+        low, high = self.span
+        if self.logarithmic:
+            values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
+        share: Float64 = (values - low) / max(high - low, 1e-9)
+        return np.clip(np.nan_to_num(share, nan=1.0), 0, 1)
 
 
-def fields(scene: Scene) -> list[Field]:
-    """Return what the scene can be coloured by: height always, and what its points know."""
-    out = [_height(scene)]
+def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
+    """Return what the scene can be coloured by: height always, and what its points know.
+
+    Parameters
+    ----------
+    errors
+        (N,) 95 % bounds in m of camera centres, which share the colours of the accuracies.
+    """
     mesh = scene.mesh
-    if scene.sigma is not None:
-        vertices = np.zeros(0) if mesh is None else OF_95_PERCENT * mesh.sigma.astype(float)
-        out.append(_accuracy(OF_95_PERCENT * scene.sigma.astype(float), vertices))
-    if scene.views is not None:
-        vertices = np.zeros(0) if mesh is None else mesh.views.astype(float)
-        points = scene.views.astype(float)
-        low, high = _ends(points, vertices)
-        said = (f"{low:.0f}", f"{high:.0f}")
-        out.append(Field("views", "Number of views", points, vertices, low, high, said))
+    points = scene.points if mesh is None else mesh.vertices.astype(float)
+    sigma = scene.sigma if mesh is None else mesh.sigma
+    views = scene.views if mesh is None else mesh.views
+    out = [] if sigma is None else [_accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
+    out.append(_height(-points[:, 1], height_range(points)))
+    if views is not None:
+        low, high = _ends(views.astype(float))
+        said = (f"{low:.0f}", "", f"{high:.0f}")
+        values = views.astype(float)
+        out.append(Field("views", "Number of views", values, low, high, said, (low, high)))
     return out
 
 
-def _height(scene: Scene) -> Field:
-    vertices = np.zeros(0) if scene.mesh is None else -scene.mesh.vertices[:, 1].astype(float)
-    points = -scene.points[:, 1]
-    low, high = height_range(scene.points) if len(points) else _ends(points, vertices)
-    said = (words.length(0.0), words.length(high - low))
-    return Field("height", "Height", points, vertices, low, high, said)
+def accuracy_shares(metres: Float64) -> Float64:
+    """Return 95 % bounds in m as shares of the span of every field of accuracies."""
+    return _accuracy(metres).shares(metres)
 
 
-def _accuracy(points: Float64, vertices: Float64) -> Field:
-    low, high = _ends(points, vertices)
-    unknown = high >= UNKNOWN_M
-    if unknown:  # what the others differ by is still to be seen
-        low, high = _ends(points[points < UNKNOWN_M], vertices[vertices < UNKNOWN_M])
-    said = (f"±{words.length(low)}", f"±{words.length(high)}{' or not constrained' * unknown}")
-    return Field("accuracy", "Accuracy (95 %)", points, vertices, low, high, said)
+def _height(heights: Float64, ends: tuple[float, float]) -> Field:
+    low, high = ends
+    said = (words.length(0.0), words.length((high - low) / 2), words.length(high - low))
+    return Field("height", "Height", heights, low, high, said, ends)
 
 
-def _ends(points: Float64, vertices: Float64) -> tuple[float, float]:
-    """Values that bound the middle 96 % of the vertices, or of the points where there are none."""
-    values = vertices if len(vertices) else points
+def _accuracy(values: Float64, errors: Float64 | None = None) -> Field:
+    unknown = OF_95_PERCENT * UNKNOWN_M
+    low, high = _ends(values[values < UNKNOWN_M])  # what these differ by is to be seen
+    if errors is not None and (errors < UNKNOWN_M).any():
+        others = _ends(errors[errors < UNKNOWN_M])
+        low, high = min(low, others[0]), max(high, others[1])
+    low = max(low, _FINEST_M)
+    high = max(high, 1.01 * low)
+    beyond = " or not constrained" if (values >= UNKNOWN_M).mean() > 0.001 else ""
+    middle = float(np.sqrt(low * high))
+    said = (
+        f"±{words.length(low)}", f"±{words.length(middle)}", f"±{words.length(high)}{beyond}"
+    )  # fmt: skip
+    span = (_FINEST_M, unknown)
+    return Field("accuracy", "Accuracy (95 %)", values, low, high, said, span, logarithmic=True)
+
+
+def _ends(values: Float64) -> tuple[float, float]:
+    """Values that bound the middle 96 %."""
     values = values[np.isfinite(values)]
     if not len(values):
         return 0.0, 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -40,14 +39,35 @@ def render(result: Reconstruction, extras: ReportExtras) -> str:
         **shown,
         version=__version__,
         style=asset("style.css"),
-        script=asset("viewer.js"),
+        script=script(),
         first_images={} if player is None else {k: v[0] for k, v in player["images"].items()},
         first_told="" if player is None else player["told"][0],
         last_picture=0 if player is None else len(player["index"]) - 1,
         player_json=None if player is None else htmlsafe_json_dumps(player),
-        # Only numbers and base64 are in it, so nothing can end the script element early.
-        scene_json=None if scene is None else json.dumps(scene, separators=(",", ":")),
+        scene_json=None if scene is None else htmlsafe_json_dumps(scene),
     )
+
+
+# What the pages' script is made of, each file a few functions that those behind it use.
+SCRIPTS = (
+    "bytes.js",
+    "eye.js",
+    "gestures.js",
+    "painter.js",
+    "section.js",
+    "measure.js",
+    "cameras.js",
+    "timeline.js",
+    "viewer.js",
+    "frames.js",
+    "main.js",
+)
+
+
+def script() -> str:
+    """Return the script of a page with a 3D view."""
+    parts = "\n".join(asset(f"js/{name}") for name in SCRIPTS)
+    return f'"use strict";\n(() => {{\n{parts}}})();'
 
 
 def asset(name: str) -> str:

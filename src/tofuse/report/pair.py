@@ -10,7 +10,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.files.atomic import write_text
 from tofuse.report import images, pair_words, words
-from tofuse.report.html import asset, template
+from tofuse.report.html import asset, script, template
 from tofuse.report.pair_scene import (
     MODES,
     SOURCE,
@@ -49,7 +49,7 @@ def render_pair(result: PairResult) -> str:
         title=f"{_short(result.source)} registered to {_short(result.target)}",
         version=__version__,
         style=asset("style.css"),
-        script=asset("viewer.js"),
+        script=script(),
         tone=_TONES[result.found.believed],
         head=head,
         tail=tail,

@@ -12,7 +12,8 @@ from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.shape import normals_at
 from tofuse.report import images
-from tofuse.report.scene import Scene, base64_of, choose, spacing_of, still
+from tofuse.report.packing import normal_bytes, squeezed, steps_of
+from tofuse.report.scene import Scene, choose, outline, spacing_of, still
 from tofuse.results.pair import LocalView, PairResult
 
 Float64 = NDArray[np.float64]
@@ -23,7 +24,6 @@ MODES = ("before", "after", "distance")
 MAX_POINTS = 45_000  # of each view; about 2 MB for both
 _MAX_SEARCHED = 400_000  # of each view, in which the nearest points are looked for
 _NEIGHBOURS = 30  # that a surface is fitted to
-_DIRECTIONS = 100  # in which the outermost points are framed
 _FROM_BASE = 0.2  # of viridis: its darkest colours are lost on a dark ground
 # The colour bar ends at so many median distances, of points that are not further than so many rms.
 _CAP_MEDIANS, _MAX_RMS = 4.0, 10.0
@@ -164,7 +164,7 @@ def distances(points: Float64, others: Float64, chosen: NDArray[np.intp]) -> Flo
 
 
 def packed(scene: PairScene) -> dict[str, Any]:
-    """Return the scene for the viewer: plain data, arrays as base64 (little endian)."""
+    """Return the scene for the viewer: plain data, arrays as `squeezed` packs them."""
     arrays: dict[str, str] = {}
     layers = []
     for mode in MODES:
@@ -174,15 +174,13 @@ def packed(scene: PairScene) -> dict[str, Any]:
             # What "after" and "distance" have in common is stored once.
             place = view if view == "target" or mode != "before" else "start"
             if place not in arrays:
-                steps = np.round((layer.points - low) / extent * 65535)
-                arrays[place] = base64_of(steps.astype("<u2"))
+                arrays[place] = squeezed(steps_of(layer.points, low, extent))
                 if layer.normals is not None:
-                    normals = np.round(np.nan_to_num(layer.normals.astype(float)) * 127)
-                    arrays[f"{place} normals"] = base64_of(normals.astype(np.int8))
+                    arrays[f"{place} normals"] = squeezed(normal_bytes(layer.normals))
             colors = None
             if mode == "distance":
                 colors = f"{view} colors"
-                arrays[colors] = base64_of(layer.colors)
+                arrays[colors] = squeezed(layer.colors)
             layers.append(
                 {
                     "mode": mode,
@@ -205,15 +203,11 @@ def packed(scene: PairScene) -> dict[str, Any]:
         "extent": np.ptp(whole, axis=0).tolist(),
         "center": whole.mean(0).tolist(),
         "size": max(float(np.linalg.norm(np.ptp(whole, axis=0))), 1e-3),
-        "box": whole.tolist(),
         "outlines": {mode: np.round(points, 4).tolist() for mode, points in seen.items()},
         "spacing": 0.01,
         "yaw": scene.yaw,
         "pitch": scene.pitch,
-        "points": "",
-        "colors": "",
-        "normals": None,
-        "mesh": None,
+        "model": None,
         "lines": {},
         "arrays": arrays,
         "layers": layers,
@@ -222,8 +216,8 @@ def packed(scene: PairScene) -> dict[str, Any]:
 
 def framing(scene: PairScene) -> dict[str, Float64]:
     """Return the outline (K, 3) of what each mode shows: the same one, unless the start is far."""
-    after = np.concatenate([_outline(layer.points) for layer in scene.layers["after"]])
-    before = np.concatenate([_outline(layer.points) for layer in scene.layers["before"]])
+    after = np.concatenate([outline(layer.points) for layer in scene.layers["after"]])
+    before = np.concatenate([outline(layer.points) for layer in scene.layers["before"]])
     both = np.concatenate([after, before])
     if np.linalg.norm(np.ptp(both, axis=0)) <= _FAR * np.linalg.norm(np.ptp(after, axis=0)):
         return dict.fromkeys(MODES, both)
@@ -283,18 +277,6 @@ def _stands_up(local: LocalView) -> bool:
 
 def _flat(color: tuple[int, int, int], count: int) -> UInt8:
     return np.tile(np.array(color, np.uint8), (count, 1))
-
-
-def _outline(points: Float64) -> Float64:
-    """The outermost ones (K, 3) of points in many directions, but for outliers."""
-    low, high = np.percentile(points, [2, 98], axis=0)
-    inside = points[((points >= low) & (points <= high)).all(1)]
-    points = inside if len(inside) else points
-    k = np.arange(_DIRECTIONS) + 0.5
-    height, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
-    across = np.sqrt(1 - height**2)
-    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height])
-    return points[np.unique((points @ directions).argmax(0))]
 
 
 def _eye(outline: Float64, R: Float64, size: tuple[int, int]) -> tuple[Float64, float]:

@@ -22,7 +22,7 @@ KINDS = ("color", "range", "amplitude", "fate")
 # Colours and words of what became of a pixel.
 FATES = {
     samples.KEPT: ((38, 150, 140), "in the model"),
-    samples.TRACKED: ((236, 170, 60), "tracked only"),
+    samples.TRACKED: ((236, 170, 60), "tracking only"),
     samples.REMOVED: (REMOVED, "removed by a filter"),
     samples.NOTHING: (GONE, "no measurement"),
 }

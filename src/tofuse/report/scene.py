@@ -1,8 +1,7 @@
-"""The 3D view's data: points, cameras and loops as compact arrays, and a still of them."""
+"""What the 3D view shows: the model, cameras and loops as compact arrays, and a still of them."""
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,6 +13,7 @@ from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.report import images
+from tofuse.report.packing import normal_bytes, squeezed, steps_of
 from tofuse.results.types import Reconstruction
 
 Float32 = NDArray[np.float32]
@@ -22,9 +22,12 @@ UInt8 = NDArray[np.uint8]
 Integers = NDArray[np.intp]
 
 MAX_POINTS = 150_000
-MAX_FACES = 120_000
+MAX_FACES = 300_000
 MAX_CAMERAS = 72
+_FAR = 1.8  # times the size of the model: then it is framed without the cameras
+_DIRECTIONS = 100  # in which the outermost points are framed
 YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
+UNSEEN = (142, 142, 142)  # where no image showed a colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +77,26 @@ class Scene:
     def box(self) -> Float64:
         """(2, 3) corners of the box around what is worth showing, without the outermost points.
 
-        Cameras count where they are not far off, as those that go round an object.
+        Cameras count where they are near; those that go around an object would make it small.
         """
         points, cameras = self.points, self.after[:, :3, 3]
         boxes = [np.percentile(p, [3, 97], axis=0) for p in (points, cameras) if len(p)]
         if not boxes:
             return np.zeros((2, 3))
         both = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
-        far = np.linalg.norm(np.ptp(both, axis=0)) > 4 * np.linalg.norm(np.ptp(boxes[0], axis=0))
-        return boxes[0] if far else both
+        reach, own = (float(np.linalg.norm(np.ptp(box, axis=0))) for box in (both, boxes[0]))
+        return boxes[0] if own > 0 and reach > _FAR * own else both
+
+    @property
+    def framed(self) -> Float64:
+        """(K, 3) outermost of what is in the box: what the view is to show all of."""
+        low, high = self.box
+        cameras = self.after[:, :3, 3]
+        near = cameras[((cameras >= low) & (cameras <= high)).all(1)]
+        shown = [
+            outline(part, outer) for part, outer in ((self.points, 0.5), (near, 0.0)) if len(part)
+        ]
+        return np.concatenate(shown) if shown else np.stack([low, high])
 
     @property
     def center(self) -> Float64:
@@ -147,54 +161,67 @@ def make_scene(
         finite(result.trajectory),
         finite(reference),
         loops[np.isfinite(loops).all((1, 2))],
-        result.mesh,
+        _seen(result.mesh),
         None if cloud.sigma is None else cloud.sigma[chosen],
         None if cloud.views is None else cloud.views[chosen],
     )
 
 
 def packed(scene: Scene) -> dict[str, Any]:
-    """Return the scene for the viewer: plain data, arrays as base64 (little endian)."""
-    placed = [scene.points] + ([] if scene.mesh is None else [scene.mesh.vertices.astype(float)])
-    both = np.concatenate(placed)
-    low = both.min(0) if len(both) else np.zeros(3)
-    high = both.max(0) if len(both) else np.ones(3)
-    extent = np.maximum(high - low, 1e-6)
-    steps = np.round((scene.points - low) / extent * 65535).astype("<u2")
-    normals = None if scene.normals is None else np.nan_to_num(scene.normals.astype(float))
-    step = -(-max(len(scene.after), len(scene.before), 1) // MAX_CAMERAS)
-    edge = 0.018 * scene.size
+    """Return the scene for the viewer: plain data, arrays as `squeezed` packs them.
+
+    Where there is a surface its vertices are the points that are shown.
+    """
+    mesh = scene.mesh
+    points = scene.points if mesh is None else mesh.vertices.astype(float)
+    low = points.min(0) if len(points) else np.zeros(3)
+    extent = np.maximum(np.ptp(points, axis=0), 1e-6) if len(points) else np.ones(3)
     return {
-        "count": len(scene.points),
+        "count": len(points),
         "low": low.tolist(),
         "extent": extent.tolist(),
         "center": scene.center.tolist(),
         "size": scene.size,
-        "box": scene.box.tolist(),
-        "spacing": scene.spacing,
+        "framed": np.round(scene.framed, 4).tolist(),
+        "spacing": scene.spacing if mesh is None else spacing_of(points),
         "yaw": YAW,
         "pitch": PITCH,
-        "points": base64_of(steps),
-        "colors": base64_of(scene.colors),
-        "normals": None if normals is None else base64_of(np.round(normals * 127).astype(np.int8)),
-        "mesh": None if scene.mesh is None else _packed_mesh(scene.mesh, low, extent),
+        "model": _packed_model(scene, steps_of(points, low, extent)) if len(points) else None,
         "lines": {
-            "before": base64_of(camera_lines(scene.before, edge, step).astype("<f4")),
-            "after": base64_of(camera_lines(scene.after, edge, step).astype("<f4")),
-            "reference": base64_of(path_lines(scene.reference).astype("<f4")),
-            "loops": base64_of(scene.loops.reshape(-1, 3).astype("<f4")),
+            "reference": squeezed(path_lines(scene.reference).astype("<f4")),
+            "loops": squeezed(scene.loops.reshape(-1, 3).astype("<f4")),
         },
     }
 
 
-def _packed_mesh(mesh: Mesh, low: Float64, extent: Float64) -> dict[str, str]:
-    color = height_colors(mesh.vertices.astype(float)) if mesh.color is None else mesh.color
+def _packed_model(scene: Scene, steps: NDArray[np.uint16]) -> dict[str, Any]:
+    mesh = scene.mesh
+    if mesh is None:
+        normals, colors, faces = scene.normals, scene.colors, None
+    else:
+        normals, faces, colors = mesh.normals, squeezed(mesh.faces.astype("<u4")), mesh.color
+        if colors is None:
+            colors = height_colors(mesh.vertices.astype(float))
     return {
-        "points": base64_of(np.round((mesh.vertices - low) / extent * 65535).astype("<u2")),
-        "colors": base64_of(color),
-        "normals": base64_of(np.round(mesh.normals * 127).astype(np.int8)),
-        "faces": base64_of(mesh.faces.astype("<u4")),
+        "points": squeezed(steps),
+        "colors": squeezed(colors),
+        "normals": None if normals is None else squeezed(normal_bytes(normals)),
+        "faces": faces,
     }
+
+
+def _seen(mesh: Mesh | None) -> Mesh | None:
+    if mesh is None or mesh.color is None:
+        return mesh
+    return replace(mesh, color=seen_colors(mesh.color))
+
+
+def seen_colors(colors: UInt8) -> UInt8:
+    """Return colours (N, 3) with a neutral grey where no image showed one, which are black."""
+    unseen = ~colors.any(1)
+    out = colors.copy()
+    out[unseen] = UNSEEN
+    return out
 
 
 def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:
@@ -290,6 +317,21 @@ def _sampled(lines: Float64, number: int = 24) -> Float64:
     return (ends[:, :1] * (1 - t) + ends[:, 1:] * t).reshape(-1, 3)
 
 
+def outline(points: Float64, outer: float = 2.0) -> Float64:
+    """Return the outermost ones (K, 3) of points in many directions, but for outliers.
+
+    Those are the `outer` percent at each end of each axis.
+    """
+    low, high = np.percentile(points, [outer, 100 - outer], axis=0)
+    inside = points[((points >= low) & (points <= high)).all(1)]
+    points = inside if len(inside) else points
+    k = np.arange(_DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - height**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height])
+    return points[np.unique((points @ directions).argmax(0))]
+
+
 def choose(number: int, most: int) -> Integers:
     """Choose `most` of the points at random, so that no even pattern of their order is left."""
     if number <= most:
@@ -299,7 +341,7 @@ def choose(number: int, most: int) -> Integers:
 
 def _colors(cloud: Cloud, chosen: Integers, points: Float64) -> UInt8:
     if cloud.color is not None:
-        return cloud.color[chosen]
+        return seen_colors(cloud.color[chosen])
     return height_colors(points)
 
 
@@ -326,8 +368,3 @@ def spacing_of(points: Float64) -> float:
     sample = points[:: max(1, len(points) // 2000)]
     near, _ = cKDTree(points).query(sample, k=2)
     return float(max(np.median(near[:, 1]), 1e-5))
-
-
-def base64_of(array: NDArray[Any]) -> str:
-    """Return the bytes of an array as text."""
-    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

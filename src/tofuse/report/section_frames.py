@@ -26,7 +26,7 @@ def frames(s: Subject) -> Values:
         "health_legend": [],
     }
     if not records:
-        return out | {"strip_label": "", "strip_hint": ""}
+        return out | {"strip_label": "", "strip_hint": "", "strip_hint_short": ""}
     components = s.result.components
     if len(components) > 1:
         out["lanes"].append("component")
@@ -50,9 +50,12 @@ def frames(s: Subject) -> Values:
     counts = [f"{sum(r.status == name for r in records)} {name}" for name in words.STATUSES]
     out["strip_label"] = "Status of each frame: " + ", ".join(counts)
     first, last = records[0].index, records[-1].index
+    out["strip_hint_short"] = (
+        f"{words.frame_range(first, last).capitalize()}: status above, accuracy below (dark = "
+        "accurate)."
+    )
     out["strip_hint"] = (
-        f"From left to right {words.frame_range(first, last)}. Point at a frame to see what "
-        "became of it."
+        f"From left to right: {words.frame_range(first, last)}. Point at a frame to see its status."
     )
     index = np.array([r.index for r in records], float)
     bad = index[[r.status in ("lost", "skipped") for r in records]]
@@ -61,8 +64,8 @@ def frames(s: Subject) -> Values:
     share = np.array([np.nan if r.inlier_share is None else r.inlier_share for r in records], float)
     rms = np.array([np.nan if r.rms_m is None else r.rms_m for r in records], float)
     for values, scale, ylabel, label in (
-        (share, 100.0, "points with a correspondence, %", "Share of correspondences over frames"),
-        (rms, 1000.0, "rms distance of correspondences, mm", "Rms distance over frames"),
+        (share, 100.0, "inliers, %", "Inliers over frames"),
+        (rms, 1000.0, "rms residual, mm", "Rms residual over frames"),
     ):
         if np.isfinite(values).any():
             series = [(values * scale, plots.AFTER, "-")]
@@ -71,7 +74,7 @@ def frames(s: Subject) -> Values:
     runs = words.runs((r.index, r.status, r.reason) for r in records)
     runs = [run for run in runs if run[3] != "tracked"]
     out["problems"] = [
-        (words.frame_range(a, b), f"{n:,}", status, why or "–")
+        (words.frame_range(a, b), f"{n:,}", status, why or "–", [[a, b]])
         for a, b, n, status, why in runs[:ROWS]
     ]
     if len(runs) > ROWS:
@@ -85,9 +88,9 @@ def told(record: FrameRecord, components: Sequence[Component] = ()) -> str:
     if record.reason:
         parts[0] += f" – {record.reason}"
     if record.inlier_share is not None:
-        parts.append(f"{words.share(record.inlier_share)} correspondences")
+        parts.append(f"{words.share(record.inlier_share)} inliers")
     if record.rms_m is not None:
-        parts.append(f"rms {words.length(record.rms_m)}")
+        parts.append(f"rms residual {words.length(record.rms_m)}")
     if len(record.unobservable):
         parts.append(f"{len(record.unobservable)} of 6 directions unobservable")
     if record.component is not None and len(components) > 1:
@@ -109,6 +112,7 @@ def loops(s: Subject) -> Values:
             words.length(p.rms_m),
             words.share(p.free_space_violation),
             words.share(p.margin),
+            [[p.i, p.i], [p.j, p.j]],
         )
         for p in loops
     ]

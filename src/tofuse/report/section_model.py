@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.report import images, plots, words
+from tofuse.report import cameras, images, plots, words
 from tofuse.report.fields import fields
-from tofuse.report.scene import packed, still
+from tofuse.report.scene import Scene, packed, still
 from tofuse.report.subject import OUTER, Figure, Subject, Values
 
 Float64 = NDArray[np.float64]
@@ -19,31 +19,62 @@ def model(s: Subject) -> Values:
     scene = s.scene
     if len(scene.points) == 0 and len(scene.after) == 0:
         return {"scene": None, "still": "", "toggles": [], "colorings": [], "thinned": ""}
-    toggles = [("points", "Points", "", scene.mesh is None)]
-    if scene.mesh is not None:
-        toggles.insert(0, ("mesh", "Surface", "", True))
-    if scene.normals is not None:
-        toggles.append(("peel", "Hide walls seen from behind", "", True))
-    if len(scene.before):
-        toggles.append(("before", "Cameras before", "#f0a03c", False))
-    if len(scene.after):
-        toggles.append(("after", "Cameras after", "#5ab0f5", True))
-    if len(scene.reference):
-        toggles.append(("reference", "Reference path", "#8a8f98", False))
-    if len(scene.loops):
-        toggles.append(("loops", "Loops", "#5fd08a", True))
     laid = scene.turned(s.straight)
-    by = {field.name: field for field in fields(laid)} if len(scene.points) else {}
-    own = [("", "Colour")] if s.result.cloud.color is not None else []
-    shown = len(scene.points)
-    thinned = "" if shown == scene.total else f"{shown:,} of {scene.total:,} points are shown."
-    return {
-        "scene": packed(laid) | {"fields": {name: field.packed() for name, field in by.items()}},
-        "still": images.data_uri(still(laid)),
-        "toggles": toggles,
-        "colorings": own + [(name, field.label) for name, field in by.items()],
-        "thinned": thinned,
+    by = (
+        {field.name: field for field in fields(laid, cameras.position_errors(s))}
+        if len(scene.points)
+        else {}
+    )
+    own = _own_colors(s)
+    data = packed(laid) | {
+        "fields": {name: field.packed() for name, field in by.items()},
+        "frames": cameras.packed(s),
     }
+    return {
+        "scene": data,
+        "still": images.data_uri(still(laid)),
+        "toggles": _toggles(scene),
+        "colorings": ([("", own)] if own else [])
+        + [(name, field.label) for name, field in by.items()],
+        "thinned": _thinned(scene),
+    }
+
+
+def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
+    """Name, text, colour and state of the switches below the view."""
+    out = []
+    if scene.mesh is not None:
+        out.append(("mesh", "Surface", "", True))
+    out.append(("points", "Points", "", scene.mesh is None))
+    if scene.normals is not None or scene.mesh is not None:
+        out.append(("peel", "Hide walls seen from behind", "", True))
+    if len(scene.after):
+        out.append(("after", "Cameras", "#5ab0f5", True))
+    if len(scene.before):
+        out.append(("before", "Cameras before optimisation", "#f0a03c", False))
+    if len(scene.reference):
+        out.append(("reference", "Reference trajectory", "#d8dade", False))
+    if len(scene.loops):
+        out.append(("loops", "Loop closures", "#5fd08a", True))
+    return out
+
+
+def _own_colors(s: Subject) -> str:
+    """What the model's own colours are: of images, or of the amplitude; empty without any."""
+    mesh = s.scene.mesh
+    color = s.result.cloud.color if mesh is None else mesh.color
+    if color is None or not len(color):
+        return ""
+    grey = bool((np.ptp(color, axis=1) == 0).all())
+    return "Amplitude" if grey else "Colour"
+
+
+def _thinned(scene: Scene) -> str:
+    if scene.mesh is not None and scene.surface is not None:
+        shown, total, what = len(scene.mesh.faces), len(scene.surface.faces), "triangles"
+    else:
+        shown, total, what = len(scene.points), scene.total, "points"
+    return "" if shown == total else f"{shown:,} of {total:,} {what} are shown."
 
 
 def views(s: Subject) -> Values:
@@ -100,7 +131,7 @@ def _sizes(points: Float64, measured: Float64, true: Float64 | None) -> list[lis
 
 def _turn_note(R: Float64) -> str:
     angle = float(np.degrees(se3.angle(R)))
-    text = "Right, down and forward are those of the first camera"
+    text = "Axes: right, down and forward of the first camera"
     if angle < 0.5:
         return text + "."
-    return f"{text}, turned by {angle:.0f}° so that the model lies straight."
+    return f"{text}, rotated by {angle:.0f}° so that the model is upright and lies straight."

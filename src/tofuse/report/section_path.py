@@ -67,7 +67,11 @@ def error(s: Subject) -> Values:
     """Return the error or displacement per axis over frames (figures 5.2, 5.6)."""
     result, reference = s.result, s.reference
     compared = reference is not None
-    title = "Cumulative error" if compared else "Displacement from the first camera"
+    title = (
+        "Trajectory error against the reference poses"
+        if compared
+        else "Displacement from the first camera"
+    )
     after, before = result.trajectory, result.diagnostics.sequential
     if before.shape != after.shape:
         before = np.full_like(after, np.nan)
@@ -228,7 +232,7 @@ def _camera_check(r: Refinement | None) -> str:
         verdict = "The camera should be checked" if s.alarm else "That is no reason for an alarm"
         out += f"The views would agree better with {' or '.join(in_words(s.errors))}. {verdict}. "
     elif not r.errors:
-        out += "The views ask for no other focal length, and no offset of the ranges. "
+        out += "No evidence of a focal-length or range-offset error. "
     if s.gap is not None:
         gap, (m, rad), (m_after, rad_after) = s.gap, s.gap.before, s.gap.after
         out += (

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 
-import numpy as np
-
 from tofuse.recordings.frames import RangeFrame
 from tofuse.report import images, words
 from tofuse.report.pictures import FATES, KINDS, depth_range
@@ -92,7 +90,7 @@ _TITLES = {
     "color": "Colour",
     "range": "Range",
     "amplitude": "Amplitude",
-    "fate": "What became of the points",
+    "fate": "Use of pixels",
 }
 
 
@@ -102,14 +100,6 @@ def player(s: Subject) -> Values:
     if not shown:
         return {"player": None, "player_kinds": [], "player_note": "", "fates": []}
     records = {r.index: r for r in s.result.diagnostics.frames}
-    T = np.eye(4)
-    T[:3, :3] = s.straight
-    poses = []
-    for picture in shown:
-        row = s.rows.get(picture.index)
-        pose = np.full((4, 4), np.nan) if row is None else T @ s.result.trajectory[row]
-        known = np.isfinite(pose).all()
-        poses.append(np.round(pose[:3], 5).ravel().tolist() if known else None)
     kinds = [kind for kind in KINDS if kind in shown[0].images]
     low, high = depth_range(s.result.diagnostics.samples)
     note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
@@ -123,7 +113,6 @@ def player(s: Subject) -> Values:
                 for p in shown
             ],
             "status": [records[p.index].status if p.index in records else "" for p in shown],
-            "poses": poses,
             "images": {
                 kind: [_uri(kind, p.images.get(kind, b"")) for p in shown] for kind in kinds
             },

@@ -21,7 +21,7 @@ from tofuse.report import (
 )
 from tofuse.report.extras import ReportExtras
 from tofuse.report.subject import Subject, Values
-from tofuse.results.card import card
+from tofuse.results.card import bound, weakest_frame
 from tofuse.results.types import Reconstruction
 
 
@@ -53,21 +53,22 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         for part in parts:
             out.update(part(subject))
         out.update(model.result())
-    if out["sizes"]:
-        size = " × ".join(row[2 if out["true_sizes"] else 1] for row in out["sizes"])
-        out["facts"].insert(5, ("width × height × depth", size))
+    true = out["true_sizes"]
+    out["dimensions"] = [
+        (row[0], row[2 if true else 1], row[1] if true else "") for row in out["sizes"]
+    ]
     names = {
-        "verdict": "Verdict",
+        "model": "Model",
+        "verdict": "Accuracy",
         "sessions": "Sessions",
         "components": "Components",
-        "model": "3D model",
-        "views": "Sizes",
-        "cameras": "Cameras",
+        "frames": "Frames",
+        "views": "Dimensions",
+        "cameras": "Trajectory",
         "error": "Error" if subject.reference is not None else "Displacement",
         "objective": "Objective",
         "filters": "Filters",
-        "frames": "Frames",
-        "loops": "Loops",
+        "loops": "Loop closures",
         "recording": "Recording",
         "timings": "Time",
         "settings": "Settings",
@@ -90,17 +91,19 @@ def _verdict(s: Subject) -> Values:
     head, _, tail = text.partition(":")
     statuses: list[str] = [f.status for f in result.diagnostics.frames]
     facts = [(f"frames {name}", f"{statuses.count(name):,}") for name in words.STATUSES]
-    facts.append(("model", words.count(s.scene.total, "point")))
+    if s.scene.surface is not None:
+        facts.append(("surface", words.count(len(s.scene.surface.faces), "triangle")))
+    facts.append(("point cloud", words.count(s.scene.total, "point")))
     path = s.scene.after[:, :3, 3]
     if len(path) > 1:
         travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-        facts.append(("camera travelled", words.length(travelled)))
+        facts.append(("trajectory length", words.length(travelled)))
     closed = sum(p.accepted for p in result.diagnostics.loops)
-    facts.append(("loops closed", f"{closed:,}"))
+    facts.append(("loop closures", f"{closed:,}"))
     return {
         "title": s.extras.title,
         "headline": s.extras.headline,
-        "card": card(result),
+        "card": _card(result),
         "subtitle": _subtitle(result),
         "verdict": result.diagnostics.verdict,
         "verdict_head": head + ":",
@@ -108,6 +111,26 @@ def _verdict(s: Subject) -> Values:
         "facts": facts,
         "findings": found,
     }
+
+
+def _card(result: Reconstruction) -> list[tuple[str, str, str]]:
+    """Name, value and ranges of frames of each line of the accuracy card."""
+    d = result.diagnostics
+    readable = sum(f.status != "skipped" for f in d.frames)
+    closed = sum(p.accepted for p in d.loops)
+    covered = f"{int(result.has_pose.sum()):,} of {words.count(readable, 'frame')}"
+    lines = [
+        ("Accuracy", bound(d.accuracy, result.cloud.diagonal_m).removeprefix("accuracy "), ""),
+        ("Coverage", f"{covered}, {words.count(closed, 'loop closure')}", ""),
+    ]
+    weakest = weakest_frame(d.accuracy)
+    if weakest:
+        a = d.accuracy
+        frames = [a.unbounded[0], a.unbounded[-1]] if a.unbounded else []
+        if a.worst is not None and not frames:
+            frames = [a.worst.frame, a.worst.frame]
+        lines.append(("Weakest", weakest, json.dumps([frames])))
+    return lines
 
 
 def _subtitle(result: Reconstruction) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 Float64 = NDArray[np.float64]
 
 _ANGLES = np.radians(np.arange(0, 90, 0.5))
+_BOXED = 0.9  # of a box is filled by the hull of points that have its shape
 _MOST = 5000  # points or faces that are tried
 
 
@@ -39,8 +40,8 @@ def upright(points: Float64, outer: float) -> Float64:
 def boxed(points: Float64) -> Float64:
     """Find the axes of the smallest box around exact points, one side of it on a hull face.
 
-    Arguments and result are as in `upright`, but any direction may be vertical. Points in one
-    plane have no such box; then only turns about y are tried.
+    Arguments and result are as in `upright`, but any direction may be vertical, if the points have
+    the shape of a box: of others, and of points in one plane, only turns about y are tried.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -58,6 +59,8 @@ def boxed(points: Float64) -> Float64:
         # A box that is hardly smaller is no reason to turn away from an earlier one.
         if volumes[k] < (1 - 1e-6) * least:
             best, least = axes[k], float(volumes[k])
+    if hull.volume < _BOXED * least:
+        return upright(points, 0.0)
     return _nearest_axes(best)
 
 

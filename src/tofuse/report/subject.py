@@ -41,7 +41,8 @@ class Subject:
     points, truth
         (N, 3) and (K, 3) finite points of the model and of the true surfaces, world frame.
     straight
-        (3, 3) axes, as rows, in which the model lies straight.
+        (3, 3) axes, as rows, in which the model is shown: x right, y down, z forward, upright as
+        `Reconstruction.T_up_world` says, and turned so that the model lies straight.
     """
 
     result: Reconstruction
@@ -71,8 +72,10 @@ class Subject:
         if truth is not None:
             truth = truth[np.isfinite(truth).all(1)]
         true = truth.astype(float) if truth is not None and len(truth) else None
-        axes = straight.upright(points, OUTER) if true is None else straight.boxed(true)
-        return cls(result, extras, index, rows, reference, scene, points, true, axes)
+        up = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
+        shown = points @ up.T if true is None else true @ up.T
+        turn = straight.upright(shown, OUTER) if true is None else straight.boxed(shown)
+        return cls(result, extras, index, rows, reference, scene, points, true, turn @ up)
 
 
 def _row_indices(result: Reconstruction) -> Float64:

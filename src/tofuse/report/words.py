@@ -84,12 +84,16 @@ class Finding:
         The frames.
     advice
         What a person can do; may be empty.
+    where
+        The frames in words; empty where they are all of them.
     """
 
     level: str
     text: str
     ranges: tuple[Range, ...]
     advice: str
+
+    where: str = ""
 
 
 def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
@@ -101,7 +105,9 @@ def findings(reasons: Sequence[Reason], total: int) -> list[Finding]:
     for reason in ranked(reasons):
         level, meaning = REASONS[reason.code]
         text = _placed(reason, total) if reason.text.strip() else meaning
-        out.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, "")))
+        some = 0 < size(reason.ranges) < total
+        where = in_words(reason.ranges).replace("-", "–") if some else ""
+        out.append(Finding(level, text, reason.ranges, ADVICE.get(reason.code, ""), where))
     return out
 
 
@@ -134,9 +140,7 @@ def verdict_sentence(result: Reconstruction, found: Sequence[Finding]) -> str:
         have = f"all {placed} frames have a pose" if placed > 1 else "the only frame has a pose"
     grave = [f for f in found if f.level == d.verdict]
     if d.verdict == "good":
-        return f"Good: {have}, and no check found fault with the result."
-    first = f" {grave[0].text}" if grave else ""
-    more = f" {count(len(grave) - 1, 'more reason')} below." if len(grave) > 1 else ""
+        return f"Good: {have}. No problems found."
     if d.verdict == "degraded":
-        return f"Degraded: use this model with care.{first}{more}"
-    return f"Failed: do not rely on this model.{first or f' {have}.'}{more}"
+        return "Degraded: use this model with care."
+    return f"Failed: do not rely on this model.{'' if grave else f' {have}.'}"

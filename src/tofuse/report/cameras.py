@@ -1,0 +1,71 @@
+"""The cameras of the 3D view: their poses, what became of their frames, and their accuracy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.fusion.pose_errors import UNKNOWN_M
+from tofuse.report.fields import OF_95_PERCENT, accuracy_shares
+from tofuse.report.packing import squeezed
+from tofuse.report.subject import Subject
+from tofuse.report.words import STATUSES
+from tofuse.results.types import FrameRecord
+
+Float64 = NDArray[np.float64]
+
+
+def packed(s: Subject) -> dict[str, Any]:
+    """Return every frame for the viewer: its index, status, error and poses.
+
+    Poses (3, 4) follow each other row by row in the axes that the model is shown in, zeros where
+    there is none; errors are bytes on the scale of the accuracy's field.
+    """
+    index = s.index.astype(int)
+    records = {r.index: r for r in s.result.diagnostics.frames}
+    known = [records.get(int(k)) for k in index]
+    errors = position_errors(s)
+    shares = np.round(255 * accuracy_shares(errors)).astype(np.uint8)
+    before = s.result.diagnostics.sequential
+    if before.shape != s.result.trajectory.shape:
+        before = np.full_like(s.result.trajectory, np.nan)
+    return {
+        "index": squeezed(index.astype("<u4")),
+        "status": "".join(str(STATUSES.index(r.status)) if r else "0" for r in known),
+        "errors": squeezed(shares) if np.isfinite(errors).any() else None,
+        "after": _poses(s.result.trajectory, s.straight),
+        "before": _poses(before, s.straight),
+    }
+
+
+def position_errors(s: Subject) -> Float64:
+    """Return (N,) 95 % bounds in m of the camera centres, in the worst direction.
+
+    `UNKNOWN_M` where a pose is not bounded, NaN where there is none or nothing was assessed.
+    """
+    records = {r.index: r for r in s.result.diagnostics.frames}
+    out = np.full(len(s.index), np.nan)
+    unbounded = set(s.result.diagnostics.accuracy.unbounded)
+    for row, index in enumerate(s.index.astype(int)):
+        record = records.get(int(index))
+        if index in unbounded:
+            out[row] = OF_95_PERCENT * UNKNOWN_M
+        elif record is not None:
+            out[row] = _bound(record)
+    out[~s.result.has_pose] = np.nan
+    return out
+
+
+def _bound(record: FrameRecord) -> float:
+    C = record.covariance
+    if C is None or not np.isfinite(C).all():
+        return float("nan")
+    worst = float(np.linalg.eigvalsh(C[:3, :3])[-1])
+    return OF_95_PERCENT * float(np.sqrt(max(worst, 0.0)))
+
+
+def _poses(poses: Float64, axes: Float64) -> str:
+    shown = np.nan_to_num(axes @ poses[:, :3, :]).reshape(len(poses), 12)
+    return squeezed(shown.astype("<f4"))
