@@ -605,8 +605,8 @@ def test_the_page_in_a_browser(room_recording, tmp_path) -> None:
         page.locator("#viewer.live").wait_for(timeout=20_000)
 
         def shown() -> np.ndarray:
-            page.wait_for_timeout(200)
-            return seen.pixels("#viewer canvas")
+            page.wait_for_timeout(900)
+            return seen.pixels("#viewer .stage canvas")
 
         after = shown()
         blue, red = after[..., 0], after[..., 2]  # the channels are BGR

@@ -1,7 +1,7 @@
 // The frames' pictures, the strip of frames, and everything on the page that points at frames.
 function startFrames(bus) {
   const strip = document.getElementById("strip"), said = document.getElementById("strip-said");
-  const player = document.getElementById("player"), data = document.getElementById("pictures");
+  const player = document.getElementById("player"), data = document.querySelector("script#pictures");
   const pictures = data ? JSON.parse(data.textContent) : null;
   const choose = (index, shown) => bus.dispatchEvent(new CustomEvent("chosen", { detail: { index, shown } }));
   const nearest = (index) => {

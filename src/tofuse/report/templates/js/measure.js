@@ -48,7 +48,7 @@ function makeMeasure(box, view, painter, sigmaOf, changed) {
     label.style.transform = `translate(${Math.round(shown[0])}px, ${Math.round(shown[1])}px) translate(-50%, -150%)`;
   }
   button.addEventListener("click", () => toggle());
-  return { toggle, add, place, line, get on() { return on; } };
+  return { toggle, add, miss: () => say("No surface there: tap the model"), place, line, get on() { return on; } };
 }
 
 function metres(value) {

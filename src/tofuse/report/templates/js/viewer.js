@@ -169,7 +169,7 @@ async function startViewer(box, scene, bus) {
     if (measure && measure.on) {
       const found = painter.read(sets(0, true), view, section, x, y, options());
       draw();
-      if (found) measure.add(view.behind(x, y, found.depth), found.value);
+      if (found) measure.add(view.behind(x, y, found.depth), found.value); else measure.miss();
       return;
     }
     const row = cameras && on("after") ? cameras.near(view, x, y) : -1;
