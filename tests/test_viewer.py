@@ -26,6 +26,7 @@ from tofuse.geometry.quaternion import to_matrix
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.run import Options, run
 from tofuse.recordings.frames import CloudFrame
+from tofuse.report.images import viridis
 from tofuse.report.pictures import draw
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
@@ -161,17 +162,22 @@ def test_colours_follow_what_they_stand_for(folder):
     bright = {by: painted(found.mesh, by, found.up)[0].astype(int).sum(1) for by in ("height",)}
     heights = found.mesh.points @ found.up
     assert np.corrcoef(bright["height"], heights)[0, 1] > 0.9
-    colors, told = painted(found.mesh, "accuracy", found.up)
+    colors, bar = painted(found.mesh, "accuracy", found.up)
     assert np.corrcoef(colors.astype(int).sum(1), found.mesh.sigma)[0, 1] > 0.9
-    assert told.endswith("± mm (95 %)")
-    np.testing.assert_array_equal(painted(found.mesh, "colour", found.up)[0], found.mesh.color)
+    assert bar.label == "Accuracy (95 %)"
+    assert bar.ticks[0].startswith("±")
+    shaded = painted(found.mesh, "colour", found.up)[0].astype(float)
+    assert np.all(shaded >= 0.6 * found.mesh.color - 1)
+    assert np.all(shaded <= found.mesh.color)
 
 
 def test_the_nearest_point_on_the_ray_is_picked():
     points = np.array([[0, 0, 4], [0.001, 0, 2], [0, 0, -1], [0.5, 0, 2]], np.float32)
-    cloud = Layer(points, None, None, None, None, None)
-    np.testing.assert_array_equal(picked([cloud], [0, 0, 0], [0, 0, 2]), points[1])
-    np.testing.assert_array_equal(picked([cloud], [0, 0, 3], [0, 0, 1]), points[0])
+    cloud = Layer(points, None, None, None, np.array([0.001, 0.002, 0.003, 0.004]), None)
+    found = picked([cloud], [0, 0, 0], [0, 0, 2])
+    np.testing.assert_array_equal(found.point, points[1])
+    assert found.sigma == 0.002
+    np.testing.assert_array_equal(picked([cloud], [0, 0, 3], [0, 0, 1]).point, points[0])
     assert picked([cloud], [0, 0, 0], [1, 1, 0]) is None
     # From behind a surface shows nothing, so it can't be picked.
     faces, away = np.array([[0, 1, 3]], np.int32), np.tile(np.float32([0, 0, 1]), (4, 1))
@@ -241,7 +247,13 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             page.get_by_role("option", name="accuracy").click()
             colored = drawn(seen)
             assert changed(first, colored) > 0.02
-            assert page.get_by_text("± mm (95 %)").is_visible()
+            assert page.get_by_text("Accuracy (95 %)").is_visible()
+            # Nothing is lit: what is drawn has a colour of the bar.
+            ramp = viridis(np.linspace(0, 1, 256)).astype(int)
+            model = colored[40:-40, 40:400, ::-1].reshape(-1, 3)
+            model = model[np.ptp(model, axis=1) > 60][::23]
+            off = np.abs(model[:, None] - ramp).max(2).min(1)
+            assert np.mean(off < 12) > 0.85
 
             shot = page.get_by_alt_text("Range")
             was = shot.get_attribute("src")
@@ -267,7 +279,9 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             page.locator("strong", has_text=" m").first.wait_for(timeout=15_000)
             np.testing.assert_allclose(view.ends, ends, atol=0.03)
             assert view.distance == pytest.approx(true, abs=0.05)
-            assert page.locator("strong", has_text=f"{view.distance:.3f} m").count() == 1
+            assert 0.001 < view.error < 0.06
+            words = f"{view.distance:.3f} m ± {1000 * view.error:.0f} mm"
+            assert page.locator("strong", has_text=words).count() == 1
             page.wait_for_timeout(500)
             page.screenshot(path=tmp_path / "measured.png")
             seen.check()

@@ -63,13 +63,32 @@ def write_glb(
     document, body = _document(
         path, points, faces, normals, color, uv, texture, T_scene_node, name, generator
     )
+    write_bytes(path, *_packed(document, body))
+
+
+def unlit_glb(points: ArrayLike, faces: ArrayLike, color: ArrayLike) -> bytes:
+    """Return a mesh as `write_glb` writes it, seen from outside only, in colours no light changes.
+
+    By the extension KHR_materials_unlit. Colours (N, 3) are uint8 sRGB, or float32 linear light.
+    """
+    document, body = _document(
+        "a mesh", points, faces, None, color, None, None, None, "model", "tofuse"
+    )
+    for material in document.get("materials", ()):
+        material |= {"doubleSided": False, "extensions": {"KHR_materials_unlit": {}}}
+        document["extensionsUsed"] = ["KHR_materials_unlit"]
+    return b"".join(_packed(document, body))
+
+
+def _packed(document: dict[str, Any], body: bytearray) -> list[bytes | bytearray]:
+    """The parts of the file of a document and its buffer."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks: list[bytes | bytearray] = [struct.pack("<I4s", len(text), b"JSON"), text]
     if body:
         chunks += [struct.pack("<I4s", len(body), b"BIN\0"), body]
     size = 12 + sum(len(chunk) for chunk in chunks)
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, size), *chunks)
+    return [struct.pack("<4sII", b"glTF", 2, size), *chunks]
 
 
 def write_gltf(
@@ -113,7 +132,8 @@ def _document(
     if normals is not None:
         columns["NORMAL"] = np.asarray(normals, np.float32)
     if color is not None:
-        columns["COLOR_0"] = linear(np.asarray(color, np.uint8))
+        light = np.asarray(color)
+        columns["COLOR_0"] = light if light.dtype == np.float32 else linear(light.astype(np.uint8))
     if uv is not None:
         columns["TEXCOORD_0"] = np.asarray(uv, np.float32)
     check_mesh(path, points, faces, columns)

@@ -199,9 +199,9 @@ def _packed_model(scene: Scene, steps: NDArray[np.uint16]) -> dict[str, Any]:
     if mesh is None:
         normals, colors, faces = scene.normals, scene.colors, None
     else:
-        normals, faces, colors = mesh.normals, squeezed(mesh.faces.astype("<u4")), mesh.color
-        if colors is None:
-            colors = height_colors(mesh.vertices.astype(float))
+        normals, faces = mesh.normals, squeezed(mesh.faces.astype("<u4"))
+        own = mesh.color
+        colors = height_colors(mesh.vertices.astype(float)) if own is None else own
     return {
         "points": squeezed(steps),
         "colors": squeezed(colors),

@@ -146,8 +146,14 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textu
         **upright,
     )
     R = result.T_up_world[:3, :3].T
-    points, normals = points @ R, normals @ R
-    write_obj(folder / "mesh.obj", points, atlas.faces, normals=normals, uv=atlas.uv, texture=image)
+    write_obj(
+        folder / "mesh.obj",
+        points @ R,
+        atlas.faces,
+        normals=normals @ R,
+        uv=atlas.uv,
+        texture=image,
+    )
 
 
 def run_json(result: Reconstruction) -> dict[str, Any]:

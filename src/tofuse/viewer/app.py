@@ -9,11 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.errors import InputError
+from tofuse.files.glb import unlit_glb
 from tofuse.geometry.quaternion import from_matrix
+from tofuse.report.fields import OF_95_PERCENT
+from tofuse.report.images import viridis
 from tofuse.report.pictures import FATES, Pictures
 from tofuse.report.scene import MAX_CAMERAS, camera_lines
+from tofuse.report.words import frame_range
+from tofuse.results.card import length
+from tofuse.results.output import component_name, is_result
 from tofuse.viewer.measure import picked
-from tofuse.viewer.result import Layer, Result, colorings, painted
+from tofuse.viewer.result import Bar, Layer, Result, colorings, painted, read_result
+from tofuse.viewer.tone import before_tone_mapping
 
 if TYPE_CHECKING:
     from viser import GuiEvent, SceneClickEvent, ViserServer
@@ -23,8 +31,9 @@ UInt8 = NDArray[np.uint8]
 
 BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (255, 225, 90)
 FOV = 2 * float(np.arctan(0.5))  # of the cameras as they are drawn
-_TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Points"}
+_TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
 _REASONS = 4
+_FAR = 1.8  # times the size of the model: then it is shown without the cameras
 
 
 class ResultView:
@@ -34,13 +43,16 @@ class ResultView:
     ----------
     ends
         The points (3,) that were picked, at most two.
-    distance
-        Between the two points that were picked last, m; None before there are two.
+    distance, error
+        Between the two points that were picked last, and its 95 % bound by their errors, m; None
+        before there are two, and NaN where nothing is known of them.
     """
 
     def __init__(self, server: ViserServer, result: Result) -> None:
         self.ends: list[Float64] = []
         self.distance: float | None = None
+        self.error: float | None = None
+        self._sigmas: list[float] = []
         self._server, self._result = server, result
         self._lock = threading.Lock()
         self._measuring = False
@@ -51,6 +63,7 @@ class ResultView:
         server.gui.main_panel.dock_right()
         with server.atomic():
             self._say_verdict()
+            self._add_models()
             self._add_lines()
             self._add_toggles(colorings(layers))
             self._add_frames()
@@ -65,6 +78,40 @@ class ResultView:
         if len(told) > _REASONS:
             lines.append(f"- {len(told) - _REASONS} more in report.html")
         self._server.gui.add_markdown("\n".join(lines))
+
+    def _add_models(self) -> None:
+        """Offer the models of components that nothing connects to the main one."""
+        folder, gui = self._result.folder, self._server.gui
+        main = folder.parent if folder.name.startswith("component-") else folder
+        if not is_result(main):
+            main = folder
+        models = {"main model": main} | {
+            component_name(k): main / component_name(k)
+            for k, c in enumerate(self._result.run["components"] if main == folder else ())
+            if is_result(main / component_name(k))
+        }
+        if main != folder:
+            models |= {p.name: p for p in sorted(main.glob("component-*")) if is_result(p)}
+        if len(models) < 2:
+            return
+        here = next(name for name, path in models.items() if path == folder)
+        choice = gui.add_dropdown("Model", tuple(models), initial_value=here)
+        frames = [f["index"] for f in self._result.frames]
+        if frames and here != "main model":
+            gui.add_markdown(f"Its frames: {frame_range(min(frames), max(frames))}.")
+
+        @choice.on_update
+        def _(event: GuiEvent[Any]) -> None:
+            path = models[str(event.target.value)]
+            try:
+                other = read_result(path)
+            except InputError as error:
+                self._legend.content = _plain(str(error))
+                return
+            with self._server.atomic():
+                self._server.scene.reset()
+                self._server.gui.reset()
+                ResultView(self._server, other)
 
     def _add_lines(self) -> None:
         result, scene = self._result, self._server.scene
@@ -100,6 +147,7 @@ class ResultView:
         gui, result = self._server.gui, self._result
         with gui.add_folder("Show"):
             self._shown = {}
+            self._drawn: dict[str, Any] = {}
             surface = result.mesh is not None and len(result.mesh.points) > 0
             if surface:
                 self._shown["surface"] = gui.add_checkbox("Surface", True)
@@ -109,17 +157,18 @@ class ResultView:
             for handle in self._shown.values():
                 handle.on_update(self._repaint)
             for name, label in (
-                ("after", "Cameras after"),
+                ("after", "Cameras"),
                 ("before", "Cameras before"),
-                ("loops", "Loops"),
+                ("loops", "Loop closures"),
             ):
                 if name in self._lines:
                     box = gui.add_checkbox(label, name == "after" or name == "loops")
                     box.on_update(self._toggle(name))
+                    self._drawn[name] = box
             if len(choices) > 1:
                 self._choice = gui.add_dropdown("Colour by", choices, initial_value=self._by)
                 self._choice.on_update(self._recolor)
-            self._legend = gui.add_markdown("")
+            self._legend = gui.add_html("")
 
     def _toggle(self, name: str) -> Any:
         def toggle(event: GuiEvent[Any]) -> None:
@@ -157,14 +206,14 @@ class ResultView:
         visible = self._visible()
         for name, handle in self._model.items():
             handle.visible = name in visible
-        scale = ""
+        scale: Bar | None = None
         for name, layer in visible.items():
             by = "colour" if name == "model before" else self._by
-            colors, told = painted(layer, by, self._result.up)
-            scale = told or scale
+            colors, bar = painted(layer, by, self._result.up)
+            scale = bar or scale
             if name not in self._model and len(layer.points):
                 self._model[name] = self._sent(name, layer, colors)
-        self._legend.content = scale
+        self._legend.content = "" if scale is None else _bar(scale)
 
     def _sent(self, name: str, layer: Layer, colors: UInt8) -> Any:
         scene = self._server.scene
@@ -178,18 +227,8 @@ class ResultView:
                 point_shape="circle",
                 point_shading="flat",
             )
-        import trimesh
-
-        surface = trimesh.Trimesh(
-            layer.points,
-            layer.faces,
-            vertex_normals=layer.normals,
-            vertex_colors=colors,
-            process=False,
-        )
-        return scene.add_mesh_trimesh(
-            f"/model/{name}", surface, cast_shadow=False, receive_shadow=False
-        )
+        surface = unlit_glb(layer.points, layer.faces, before_tone_mapping(colors))
+        return scene.add_glb(f"/model/{name}", surface, cast_shadow=False, receive_shadow=False)
 
     def _add_frames(self) -> None:
         result, gui = self._result, self._server.gui
@@ -201,7 +240,7 @@ class ResultView:
             self._slider = gui.add_slider("Frame", 0, last, 1, 0)
             self._slider.on_update(self._go)
             self._told = gui.add_markdown("")
-            look = gui.add_button("Look from this camera")
+            look = gui.add_button("Look through this camera")
             look.on_click(self._look)
             self._images = gui.add_html("")
         self._show_frame(0)
@@ -252,6 +291,11 @@ class ResultView:
         T = self._result.after.get(self._result.frames[row]["index"])
         if T is None or event.client is None:
             return
+        # Nothing stands between who looks through a camera and the model.
+        if self._camera is not None:
+            self._camera.visible = False
+        for box in self._drawn.values():
+            box.value = False
         event.client.camera.wxyz = wxyz(T)
         event.client.camera.position = T[:3, 3]
 
@@ -265,6 +309,7 @@ class ResultView:
     def _begin_measuring(self, _: GuiEvent[Any]) -> None:
         with self._lock:
             self.ends.clear()
+            self._sigmas.clear()
             for name in ("/distance/0", "/distance/1", "/distance/line", "/distance/label"):
                 self._server.scene.remove_by_name(name)
             if not self._measuring:
@@ -276,10 +321,11 @@ class ResultView:
         with self._lock:
             if not self._measuring:
                 return
-            point = picked(list(self._visible().values()), event.ray_origin, event.ray_direction)
-            if point is None:
-                self._measured.content = "There is no point of the model; click another."
+            found = picked(list(self._visible().values()), event.ray_origin, event.ray_direction)
+            if found is None:
+                self._measured.content = "No surface there: click the model."
                 return
+            point = found.point
             scene = self._server.scene
             scene.add_icosphere(
                 f"/distance/{len(self.ends)}",
@@ -290,6 +336,7 @@ class ResultView:
                 receive_shadow=False,
             )
             self.ends.append(point)
+            self._sigmas.append(found.sigma)
             if len(self.ends) == 1:
                 self._measured.content = "Click the second point."
                 return
@@ -297,7 +344,10 @@ class ResultView:
             scene.remove_click_callback(self._clicked)
             a, b = self.ends
             self.distance = float(np.linalg.norm(b - a))
+            self.error = OF_95_PERCENT * float(np.linalg.norm(self._sigmas))
             text = _length(self.distance)
+            if np.isfinite(self.error):
+                text += f" ± {length(self.error)}"
             ends = np.stack([a, b])[None].astype(np.float32)
             scene.add_line_segments(
                 "/distance/line", ends, CHOSEN, thickness=3.0, thickness_units="screen"
@@ -313,7 +363,10 @@ def _place_camera(server: ViserServer, result: Result) -> float:
     low, high = np.percentile(points[:: max(1, len(points) // 20_000)], [2, 98], axis=0)
     if result.after:
         centers = np.stack([T[:3, 3] for T in result.after.values()])
-        low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
+        wide = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
+        # Cameras that go around an object would make it small.
+        if np.linalg.norm(wide[1] - wide[0]) <= _FAR * np.linalg.norm(high - low):
+            low, high = wide
     size = max(float(np.linalg.norm(high - low)), 1e-2)
     forward = np.array([0.0, 0.0, 1.0])
     forward -= result.up * (forward @ result.up)
@@ -365,6 +418,17 @@ def wxyz(T: Float64) -> Float64:
 
 def _length(metres: float) -> str:
     return f"{1000 * metres:.1f} mm" if metres < 1 else f"{metres:.3f} m"
+
+
+def _bar(bar: Bar) -> str:
+    """A colour bar with what is written at its ends and in its middle."""
+    stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
+    ticks = "".join(f"<span>{tick}</span>" for tick in bar.ticks)
+    return (
+        f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{bar.label}'
+        f'<div style="height:12px;border-radius:3px;background:linear-gradient(90deg,{stops})">'
+        f'</div><div style="display:flex;justify-content:space-between">{ticks}</div></div>'
+    )
 
 
 def _plain(text: str) -> str:

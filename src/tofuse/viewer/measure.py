@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,8 +15,16 @@ Float64 = NDArray[np.float64]
 _NEAR, _FAR = 0.006, 0.02  # rad off the ray: as good as on it, and too far
 
 
-def picked(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> Float64 | None:
-    """Return the point (3,) of the layers that lies on a ray in front, or None.
+@dataclass(frozen=True, eq=False)
+class Picked:
+    """A point (3,) of the model, and its standard deviation in m, NaN where it is not known."""
+
+    point: Float64
+    sigma: float
+
+
+def picked(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> Picked | None:
+    """Return the point of the layers that lies on a ray in front, or None.
 
     Of the points that are as good as on the ray the nearest counts; without any, the one that is
     least off. What a surface shows from behind is not drawn, so it is not picked.
@@ -38,5 +47,7 @@ def picked(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> 
         k = on[np.argmin(along[rows[on]])] if len(on) else int(np.argmin(off))
         rank = (0.0, float(along[rows[k]])) if len(on) else (float(off[k]), 0.0)
         if off[k] < _FAR and (best is None or rank < best):
-            best, found = rank, layer.points[rows[k]].astype(float)
+            row = rows[k]
+            sigma = float("nan") if layer.sigma is None else float(layer.sigma[row])
+            best, found = rank, Picked(layer.points[row].astype(float), sigma)
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
+from tofuse.report.scene import seen_colors
+from tofuse.report.words import length
 from tofuse.results.folder import is_result, settle
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.viewer.kept import read_kept
@@ -24,6 +26,8 @@ from tofuse.viewer.kept import read_kept
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
+
+MAX_FACES = 500_000  # of a surface that a browser turns smoothly
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,27 @@ class Layer:
             ply.color,
             scalars.get("sigma"),
             scalars.get("views"),
+        )
+
+    def simplified(self, faces: int) -> Layer:
+        """Return a surface with about `faces` triangles at most; of a cloud there is no less."""
+        if self.faces is None or self.normals is None or len(self.faces) <= faces:
+            return self
+        n = len(self.points)
+        color = None if self.color is None else seen_colors(self.color)
+        sigma = np.zeros(n) if self.sigma is None else self.sigma
+        views = np.zeros(n) if self.views is None else self.views
+        small = Mesh(
+            self.points, self.faces, self.normals, color, sigma.astype(np.float32),
+            views.astype(np.int32), np.zeros(3),
+        ).decimated(faces)  # fmt: skip
+        return Layer(
+            small.vertices,
+            small.normals,
+            small.faces,
+            small.color,
+            None if self.sigma is None else small.sigma.astype(float),
+            None if self.views is None else small.views.astype(float),
         )
 
 
@@ -130,7 +155,9 @@ def read_result(folder: Path) -> Result:
     posed, poses = main_poses(folder, run)
     after = dict(zip(posed, poses, strict=True))
     cloud = Layer.of(read_ply(folder / "cloud.ply"))
-    mesh = Layer.of(read_ply(folder / "mesh.ply")) if (folder / "mesh.ply").is_file() else None
+    mesh = None
+    if (folder / "mesh.ply").is_file():
+        mesh = Layer.of(read_ply(folder / "mesh.ply")).simplified(MAX_FACES)
     kept = read_kept(folder)
     model_before = None
     if kept is not None and len(kept.points):
@@ -165,7 +192,7 @@ def _up(run: dict[str, Any], mesh: Layer | None, poses: Float64) -> Float64:
     return up / length if length > 0.1 else np.array([0.0, -1.0, 0.0])
 
 
-# What the model can be coloured by, and the unit of the scale.
+# What the model can be coloured by.
 COLORINGS = ("colour", "height", "accuracy", "view count")
 
 
@@ -180,20 +207,51 @@ def colorings(layers: Sequence[Layer]) -> list[str]:
     return [name for name in COLORINGS if any(value is not None for value in needs[name])]
 
 
-def painted(layer: Layer, by: str, up: Float64) -> tuple[UInt8, str]:
-    """Return colours (N, 3) of a layer, and the scale in words; grey if it has no such values."""
+@dataclass(frozen=True)
+class Bar:
+    """A colour bar: what it is of, and what is written at its ends and in its middle."""
+
+    label: str
+    ticks: tuple[str, str, str]
+
+
+def painted(layer: Layer, by: str, up: Float64) -> tuple[UInt8, Bar | None]:
+    """Return colours (N, 3) of a layer, and their bar; grey if it has no such values.
+
+    Colours of values are exactly those of the bar. The layer's own are shaded, from above and from
+    one side, as no light of the page changes them.
+    """
     if by == "colour" and layer.color is not None:
-        return layer.color, ""
-    values, unit = None, ""
+        return _shaded(seen_colors(layer.color), layer, up), None
     if by == "height":
-        values, unit = layer.points @ up, "m above the first camera"
-    elif by == "accuracy" and layer.sigma is not None:
-        values, unit = 1000 * OF_95_PERCENT * layer.sigma, "± mm (95 %)"
-    elif by == "view count":
-        values, unit = layer.views, "views"
-    if values is None:
-        return np.full((len(layer.points), 3), 170, np.uint8), ""
-    good = values[np.isfinite(values)]
-    low, high = np.percentile(good, [2, 98]) if len(good) else (0.0, 1.0)
-    colors = viridis((values - low) / max(high - low, 1e-9))
-    return colors, f"from dark ({low:.3g}) to bright ({high:.3g}) {unit}"
+        return _mapped(layer.points @ up, "Height", length)
+    if by == "accuracy" and layer.sigma is not None:
+        return _mapped(
+            OF_95_PERCENT * layer.sigma, "Accuracy (95 %)", lambda m: f"±{length(m)}", ratio=True
+        )
+    if by == "view count" and layer.views is not None:
+        return _mapped(layer.views, "Number of views", lambda n: f"{n:.0f}")
+    return np.full((len(layer.points), 3), 170, np.uint8), None
+
+
+def _mapped(
+    values: Float64, label: str, say: Callable[[float], str], *, ratio: bool = False
+) -> tuple[UInt8, Bar]:
+    """Colours of values, by their ratios where these tell more, and the bar."""
+    shown = np.log(np.maximum(values, 1e-6)) if ratio else values
+    good = shown[np.isfinite(shown)]
+    low, high = np.percentile(good, [2, 98]).tolist() if len(good) else (0.0, 1.0)
+    back: Callable[[float], float] = (lambda v: float(np.exp(v))) if ratio else float
+    zero = low if label == "Height" else 0.0
+    ticks = tuple(say(back(v) - zero) for v in (low, (low + high) / 2, high))
+    colors = viridis((np.nan_to_num(shown, nan=high) - low) / max(high - low, 1e-9))
+    return colors, Bar(label, (ticks[0], ticks[1], ticks[2]))
+
+
+def _shaded(color: UInt8, layer: Layer, up: Float64) -> UInt8:
+    if layer.normals is None or layer.faces is None:
+        return color
+    side = np.cross(up, [0.6, 0.0, 0.8])
+    side /= max(float(np.linalg.norm(side)), 1e-9)
+    light = 0.78 + 0.14 * (layer.normals @ up) + 0.08 * np.abs(layer.normals @ side)
+    return (color * light[:, None]).clip(0, 255).astype(np.uint8)

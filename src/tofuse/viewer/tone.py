@@ -1,0 +1,37 @@
+"""Colours that look as they are meant to behind the tone mapping of viser's page.
+
+The page shows surfaces through the filmic curve of ACES (S. Hill's fit, as three.js has it), which
+makes colours paler and darker; colours of a map would not be those of its bar. Points are shown as
+they are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+
+_IN = np.array(
+    [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]
+)
+_OUT = np.array(
+    [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]
+)
+_EXPOSURE = 0.6
+_BRIGHTEST = 0.995  # the curve never reaches much more
+
+
+def before_tone_mapping(color: UInt8) -> Float32:
+    """Return linear light (N, 3) that the page shows as sRGB colours (N, 3).
+
+    The strongest colours, which the curve can't show, come as near as it can.
+    """
+    s = np.arange(256) / 255
+    light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    y = np.clip(light[color] @ np.linalg.inv(_OUT).T, 0, _BRIGHTEST)
+    # y = (v^2 + 0.0245786 v - 0.000090537) / (0.983729 v^2 + 0.432951 v + 0.238081)
+    a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -0.000090537 - 0.238081 * y
+    v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
+    return np.maximum(_EXPOSURE * v @ np.linalg.inv(_IN).T, 0).astype(np.float32)
