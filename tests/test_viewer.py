@@ -250,7 +250,12 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
             assert page.get_by_text("Accuracy (95 %)").is_visible()
             # Nothing is lit: what is drawn has a colour of the bar.
             ramp = viridis(np.linspace(0, 1, 256)).astype(int)
-            model = colored[40:-40, 40:400, ::-1].reshape(-1, 3)
+            for name in ("Cameras", "Loop closures"):
+                page.get_by_label(name, exact=True).click()
+            page.screenshot(path=tmp_path / "accuracy.png")
+            model = drawn(seen)[200:-40, 60:460, ::-1].reshape(-1, 3)
+            for name in ("Cameras", "Loop closures"):
+                page.get_by_label(name, exact=True).click()
             model = model[np.ptp(model, axis=1) > 60][::23]
             off = np.abs(model[:, None] - ramp).max(2).min(1)
             assert np.mean(off < 12) > 0.85

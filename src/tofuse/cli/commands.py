@@ -361,12 +361,13 @@ def _check_overwrite(arguments: argparse.Namespace) -> None:
 def demo(arguments: argparse.Namespace) -> int:
     """``tofuse demo``."""
     from tofuse.kernels.threads import threads
+    from tofuse.pipeline.demo import FAILURE
     from tofuse.pipeline.demo import demo as run_demo
     from tofuse.pipeline.run import exit_status
 
     with progress_for(as_json=arguments.json) as progress, threads(arguments.threads):
         result = run_demo(
-            arguments.scene,
+            FAILURE if arguments.failure else arguments.scene,
             arguments.out,
             method=arguments.method,
             seed=arguments.seed or 0,

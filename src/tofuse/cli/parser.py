@@ -492,7 +492,16 @@ def _demo(commands: Any) -> None:
         epilog="The recording is left in DIR/recording, the result in DIR.\n\n" + _EXIT,
         reconstructs=True,
     )
-    p.add_argument("--scene", choices=DEMO_SCENES, default="room", help="what to simulate (room)")
+    what = p.add_mutually_exclusive_group()
+    what.add_argument(
+        "--scene", choices=DEMO_SCENES, default="room", help="what to simulate (room)"
+    )
+    what.add_argument(
+        "--failure",
+        action="store_true",
+        help="a recording that can't be reconstructed: 1.5 m along a bare corridor, which looks the "
+        "same everywhere. See in report.html how the failure is found and explained",
+    )
     p.add_argument(
         "--out",
         type=Path,

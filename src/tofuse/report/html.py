@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -26,7 +27,7 @@ def write_report(result: Reconstruction, path: Path, extras: ReportExtras) -> No
     OutputError
         If the file can't be written; an earlier one is left as it was.
     """
-    write_text(path, secured(render(result, extras)))
+    write_text(path, secured(readable(render(result, extras))))
 
 
 def render(result: Reconstruction, extras: ReportExtras) -> str:
@@ -46,6 +47,11 @@ def render(result: Reconstruction, extras: ReportExtras) -> str:
         player_json=None if player is None else htmlsafe_json_dumps(player),
         scene_json=None if scene is None else htmlsafe_json_dumps(scene),
     )
+
+
+def readable(text: str) -> str:
+    """Return text with a mark for each byte of a file's name that is not UTF-8."""
+    return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
 # What the pages' script is made of, each file a few functions that those behind it use.

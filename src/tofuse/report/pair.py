@@ -10,7 +10,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.files.atomic import write_text
 from tofuse.report import images, pair_words, words
-from tofuse.report.html import asset, script, template
+from tofuse.report.html import asset, readable, script, template
 from tofuse.report.pair_scene import (
     MODES,
     SOURCE,
@@ -36,7 +36,7 @@ def write_pair_report(result: PairResult, path: Path) -> None:
     OutputError
         If the file can't be written; an earlier one is left as it was.
     """
-    write_text(path, secured(render_pair(result)))
+    write_text(path, secured(readable(render_pair(result))))
 
 
 def render_pair(result: PairResult) -> str:

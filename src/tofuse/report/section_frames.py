@@ -53,6 +53,8 @@ def frames(s: Subject) -> Values:
     out["strip_hint_short"] = (
         f"{words.frame_range(first, last).capitalize()}: status above, accuracy below (dark = "
         "accurate)."
+        if any(r.covariance is not None for r in records)
+        else f"{words.frame_range(first, last).capitalize()}: status."
     )
     out["strip_hint"] = (
         f"From left to right: {words.frame_range(first, last)}. Point at a frame to see its status."

@@ -104,6 +104,7 @@ def _verdict(s: Subject) -> Values:
         "title": s.extras.title,
         "headline": s.extras.headline,
         "card": _card(result),
+        "card_tone": result.diagnostics.verdict if result.diagnostics.accuracy.assessed else "",
         "subtitle": _subtitle(result),
         "verdict": result.diagnostics.verdict,
         "verdict_head": head + ":",

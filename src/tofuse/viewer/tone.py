@@ -26,7 +26,7 @@ _BRIGHTEST = 0.995  # the curve never reaches much more
 def before_tone_mapping(color: UInt8) -> Float32:
     """Return linear light (N, 3) that the page shows as sRGB colours (N, 3).
 
-    The strongest colours, which the curve can't show, come as near as it can.
+    Of saturated colours some of it is negative, and of bright ones more than 1.
     """
     s = np.arange(256) / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
@@ -34,4 +34,5 @@ def before_tone_mapping(color: UInt8) -> Float32:
     # y = (v^2 + 0.0245786 v - 0.000090537) / (0.983729 v^2 + 0.432951 v + 0.238081)
     a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -0.000090537 - 0.238081 * y
     v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
-    return np.maximum(_EXPOSURE * v @ np.linalg.inv(_IN).T, 0).astype(np.float32)
+    light_in: Float32 = (_EXPOSURE * v @ np.linalg.inv(_IN).T).astype(np.float32)
+    return light_in
