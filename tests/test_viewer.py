@@ -30,6 +30,7 @@ from tofuse.report.images import viridis
 from tofuse.report.pictures import draw
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
+from tofuse.viewer.coverage import Coverage
 from tofuse.viewer.kept import NAME, read_kept, write_kept
 from tofuse.viewer.measure import picked
 from tofuse.viewer.result import Layer, colorings, painted, read_result
@@ -342,6 +343,11 @@ def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, 
             growing = drawn(seen)
             assert len(np.unique(growing.reshape(-1, 3), axis=0)) > 100
             seen.page.screenshot(path=tmp_path / "growing.png")
+            seen.page.get_by_label("Colour by").click()
+            seen.page.get_by_role("option", name="accuracy").click()
+            seen.page.get_by_text("Where to go next").wait_for(timeout=15_000)
+            assert changed(growing, drawn(seen)) > 0.01
+            seen.page.screenshot(path=tmp_path / "accuracy.png")
             live.finish(tmp_path / "a")
             seen.page.get_by_text("Pick two points").wait_for(timeout=30_000)
             drawn(seen)
@@ -353,6 +359,21 @@ def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, 
     for name in same:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert json.loads((tmp_path / "a/run.json").read_text())["schema"] == 1
+
+
+def test_places_are_better_known_the_nearer_and_the_more_often_they_are_seen():
+    rng = np.random.default_rng(1)
+    wall = np.float32(rng.uniform([-1, -1, 2], [1, 1, 2.001], (4000, 3)))
+    left = wall[:, 0] < 0
+    coverage = Coverage(0.05)
+    assert np.isinf(coverage.sigma(wall)).all()
+    coverage.add(wall, np.full(len(wall), 0.008))
+    for _ in range(3):
+        coverage.add(wall[left], np.full(left.sum(), 0.008))
+    inside = np.abs(wall[:, 0]) > 0.1
+    np.testing.assert_allclose(coverage.sigma(wall)[left & inside], 0.004, rtol=1e-6)
+    np.testing.assert_allclose(coverage.sigma(wall)[~left & inside], 0.008, rtol=1e-6)
+    assert np.isinf(coverage.sigma(wall + np.float32([0, 0, 1]))).all()
 
 
 @needs_viser

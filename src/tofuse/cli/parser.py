@@ -499,8 +499,8 @@ def _demo(commands: Any) -> None:
     what.add_argument(
         "--failure",
         action="store_true",
-        help="a recording that can't be reconstructed: 1.5 m along a bare corridor, which looks the "
-        "same everywhere. See in report.html how the failure is found and explained",
+        help="a recording that can't be reconstructed, 1.5 m along a bare corridor: see in "
+        "report.html how the failure is detected and explained",
     )
     p.add_argument(
         "--out",

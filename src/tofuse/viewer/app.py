@@ -213,7 +213,7 @@ class ResultView:
             scale = bar or scale
             if name not in self._model and len(layer.points):
                 self._model[name] = self._sent(name, layer, colors)
-        self._legend.content = "" if scale is None else _bar(scale)
+        self._legend.content = "" if scale is None else color_bar(scale)
 
     def _sent(self, name: str, layer: Layer, colors: UInt8) -> Any:
         scene = self._server.scene
@@ -420,8 +420,8 @@ def _length(metres: float) -> str:
     return f"{1000 * metres:.1f} mm" if metres < 1 else f"{metres:.3f} m"
 
 
-def _bar(bar: Bar) -> str:
-    """A colour bar with what is written at its ends and in its middle."""
+def color_bar(bar: Bar) -> str:
+    """Return a colour bar as HTML, with what is written at its ends and in its middle."""
     stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
     ticks = "".join(f"<span>{tick}</span>" for tick in bar.ticks)
     return (

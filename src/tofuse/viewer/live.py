@@ -11,23 +11,31 @@ from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import data_uri, depth_image, depth_limits, shrink, viridis
+from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
-from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, wxyz
-from tofuse.viewer.result import read_result
+from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, color_bar, wxyz
+from tofuse.viewer.coverage import Coverage
+from tofuse.viewer.result import Bar, read_result
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from viser import ViserServer
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
 
 _POINTS = 4000  # of each view shown
 _CLOUDS = 120  # views shown; then every second one goes
 _MOVED, _TURNED = 0.15, np.radians(8.0)  # m and rad between views that are shown
 _PERIOD = 0.3  # s between updates of what is seen now
 _WIDTH = 240  # px
+_RECOLORED = 2.0  # s between new colours of all that is shown
+_CELL = 0.015  # edge of the cubes of the coverage, of the depth of the first view
+_SPREAD = 10.0  # the colour bar's end is so many times what is usual
 
 
 class LiveView:
@@ -40,6 +48,9 @@ class LiveView:
     def __init__(self, server: ViserServer) -> None:
         self._server = server
         self._shown: list[tuple[Float64, Any]] = []
+        self._seen: dict[str, tuple[Float32, UInt8]] = {}  # points and colours of what is shown
+        self._coverage: Coverage | None = None
+        self._recolored = 0.0
         self._path: list[Float64] = []
         self._lock = threading.Lock()
         self._stage, self._done, self._total = "opening", 0, 0
@@ -52,6 +63,9 @@ class LiveView:
         server.initial_camera.position = (0.6, -1.2, -2.2)
         server.initial_camera.look_at = (0.0, 0.0, 1.5)
         self._words = server.gui.add_markdown("Opening the recording.")
+        self._by = server.gui.add_dropdown("Colour by", ("colour", "accuracy"))
+        self._by.on_update(lambda _: self._recolor_now())
+        self._legend = server.gui.add_html("")
         self._image = server.gui.add_html("")
 
     def stage(self, name: str, total: int | None = None) -> None:
@@ -79,6 +93,8 @@ class LiveView:
             if f"/live/{frame.index}" in seen or self._is_new(T):
                 self._add(frame, T)
             now = perf_counter()
+            if self._by.value == "accuracy" and now - self._recolored > _RECOLORED:
+                self._recolor()
             if now - self._last > _PERIOD:
                 self._last = now
                 self._show_now(frame, T)
@@ -91,6 +107,7 @@ class LiveView:
             self._server.scene.reset()
             self._server.gui.reset()
             self._shown.clear()
+            self._seen.clear()
             return ResultView(self._server, result)
 
     def _say(self, more: str = "") -> None:
@@ -123,6 +140,7 @@ class LiveView:
         else:
             low, high = np.percentile(world[:, 1], [2, 98])
             tint = viridis((high - world[:, 1].astype(float)) / max(float(high - low), 1e-6))
+        self._cover(frame, world, chosen)
         handle = self._server.scene.add_point_cloud(
             f"/live/{frame.index}",
             world,
@@ -133,13 +151,50 @@ class LiveView:
         )
         if self.first_seconds is None:
             self.first_seconds = perf_counter() - self._began
+        self._seen[handle.name] = (world, tint)
         self._shown = [item for item in self._shown if item[1].name != handle.name]
         self._shown.append((T, handle))
         if len(self._shown) > _CLOUDS:
             for _, old in self._shown[1::2]:
+                del self._seen[old.name]
                 old.remove()
             del self._shown[1::2]
             self._apart = (1.5 * self._apart[0], 1.5 * self._apart[1])
+
+    def _cover(self, frame: Frame, world: Float32, chosen: slice) -> None:
+        """Count a view for the accuracy of what it sees."""
+        far = np.linalg.norm(frame.points[chosen], axis=1)
+        if self._coverage is None:
+            self._coverage = Coverage(max(_CELL * float(np.median(far)), 1e-4))
+        known = frame.sigma
+        # Without a noise model only the distances tell: noise grows with their square.
+        sigma = 0.001 * far**2 if known is None else known[chosen].astype(float)
+        self._coverage.add(world, sigma)
+
+    def _recolor_now(self) -> None:
+        with self._lock:
+            self._recolor()
+
+    def _recolor(self) -> None:
+        """Give all that is shown the colours of what is known by now."""
+        self._recolored = perf_counter()
+        coverage = self._coverage
+        if self._by.value == "colour" or coverage is None:
+            self._legend.content = ""
+            for _, handle in self._shown:
+                handle.colors = self._seen[handle.name][1]
+            return
+        usual = OF_95_PERCENT * float(np.median(coverage.sigmas))
+        for _, handle in self._shown:
+            ratio = OF_95_PERCENT * coverage.sigma(self._seen[handle.name][0]) / usual
+            share = 0.5 + 0.5 * np.log(np.minimum(ratio, _SPREAD)) / np.log(_SPREAD)
+            handle.colors = viridis(share)
+        ticks = tuple(f"±{length(usual * times)}" for times in (1 / _SPREAD, 1.0, _SPREAD))
+        bar = Bar("Accuracy so far (95 %), noise only", (ticks[0], ticks[1], ticks[2]))
+        self._legend.content = color_bar(bar) + (
+            '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Where to go next: what is bright '
+            "was seen from too far or too seldom.</div>"
+        )
 
     def _show_now(self, frame: Frame, T: Float64) -> None:
         scene = self._server.scene

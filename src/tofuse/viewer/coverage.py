@@ -1,0 +1,55 @@
+"""How well each place has been seen so far, while a recording goes on: where to go next."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_REACH = 1 << 20  # cells to each side of the origin
+
+
+class Coverage:
+    """Cubes of space, and what the views' noise leaves uncertain about the surface in each.
+
+    Every view that sees a cube adds the information of one measurement, as errors of its pixels
+    there are alike. Errors of the poses are known only in the end, and are not in it.
+    """
+
+    def __init__(self, cell_m: float) -> None:
+        self._cell = cell_m
+        self._keys: Int64 = np.zeros(0, np.int64)
+        self._information: Float64 = np.zeros(0)
+
+    def add(self, points: Float32, sigma: Float64) -> None:
+        """Take a view: points (N, 3) in the world and their standard deviations (N,), m."""
+        keys, cell = np.unique(self._key(points), return_inverse=True)
+        count = np.bincount(cell, minlength=len(keys))
+        mean = np.bincount(cell, sigma, len(keys)) / np.maximum(count, 1)
+        both = np.concatenate([self._keys, keys])
+        more = np.concatenate([self._information, 1 / np.maximum(mean, 1e-5) ** 2])
+        merged, place = np.unique(both, return_inverse=True)
+        self._keys = merged.astype(np.int64)
+        self._information = np.bincount(place, more, len(self._keys))
+
+    def sigma(self, points: Float32) -> Float64:
+        """Return the standard deviation (N,) of the surface at points, m; inf where never seen."""
+        if not len(self._keys):
+            return np.full(len(points), np.inf)
+        keys = self._key(points)
+        row = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        known = self._keys[row] == keys
+        return np.where(known, 1 / np.sqrt(self._information[row]), np.inf)
+
+    @property
+    def sigmas(self) -> Float64:
+        """(C,) of all cubes."""
+        return 1 / np.sqrt(self._information)
+
+    def _key(self, points: Float32) -> Int64:
+        step = np.floor(points / self._cell).astype(np.int64).clip(-_REACH, _REACH - 1) + _REACH
+        keys: Int64 = (step[:, 0] << 42) | (step[:, 1] << 21) | step[:, 2]
+        return keys
