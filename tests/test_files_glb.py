@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError
-from tofuse.files.glb import write_glb
+from tofuse.files.glb import unlit_glb, write_glb
 
 SIZES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -91,3 +91,27 @@ def test_what_does_not_fit_is_refused(tmp_path) -> None:
         with pytest.raises(InputError, match=r"m\.glb"):
             write_glb(tmp_path / "m.glb", **problem)
     assert not (tmp_path / "m.glb").exists()
+
+
+def test_a_node_places_the_mesh_in_the_scene(tmp_path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    rng = np.random.default_rng(4)
+    points, faces = rng.normal(0, 1, (9, 3)).astype(np.float32), np.arange(9).reshape(3, 3)
+    T = np.eye(4)
+    T[:3] = [[0, 1, 0, 0.5], [-1, 0, 0, 0], [0, 0, 1, -2]]
+    write_glb(tmp_path / "m.glb", points, faces, T_scene_node=T)
+    scene = trimesh.load_scene(tmp_path / "m.glb", process=False, maintain_order=True)
+    (mesh,) = scene.geometry.values()
+    np.testing.assert_array_equal(mesh.vertices, points)  # in their own frame
+    found, _ = scene.graph[scene.graph.nodes_geometry[0]]
+    np.testing.assert_allclose(found, T, atol=1e-12)
+
+
+def test_an_unlit_mesh_says_so() -> None:
+    points, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]])
+    data = unlit_glb(points, faces, np.float32([[1.5, -0.1, 0], [0, 1, 0], [0, 0, 1]]))
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert document["materials"][0]["doubleSided"] is False
+    assert len(data) == int.from_bytes(data[8:12], "little")

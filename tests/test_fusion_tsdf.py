@@ -518,6 +518,10 @@ def test_up_is_the_floor_s_normal_or_the_cameras(tilt) -> None:
         np.testing.assert_allclose(R @ down, [0, -1, 0], atol=0.03)
     wall_only = fuse_surface([RangeView.of(frame_of(wall))], EYE[None], Fusion(voxel_m=0.03))
     np.testing.assert_allclose(upright(wall_only, EYE[None]), np.diag([1, -1, -1]), atol=1e-12)
+    # Without a floor, what an accelerometer measured counts before the cameras' own up.
+    against_gravity = np.array([0.6, -0.8, 0.0])
+    R = upright(wall_only, EYE[None], against_gravity)
+    np.testing.assert_allclose(R @ against_gravity, [0, 1, 0], atol=1e-12)
 
 
 def test_depths_drawn_to_planes_and_jumps_against_slow_twins() -> None:

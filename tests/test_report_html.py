@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import replace
 from functools import cache
@@ -200,7 +201,7 @@ class Page(HTMLParser):
         super().__init__(convert_charrefs=True)
         self.open, self.sections, self.links, self.ids, self.scripts = [], {}, [], [], []
         self.rows, self.images, self.titles = [], [], []
-        self.section = None
+        self.section, self.text = None, text
         self.feed(text)
         self.close()
         assert self.open == []
@@ -751,6 +752,28 @@ def test_poor_results_say_what_is_missing(tmp_path):
     assert "Failed: do not rely on this model." in said
     assert "No frame has a pose." in said
     assert "There is nothing to show" in got.sections["model"]
+
+
+@pytest.mark.parametrize("title", [os.fsdecode(b"caf\xe9 'q' \""), '\u202e\u062e\u0631<b>"x"', ""])
+def test_any_name_of_a_file_is_shown(title, tmp_path):
+    result, extras = room()
+    record = replace(result.diagnostics.frames[9], reason=title)
+    frames = (*result.diagnostics.frames[:9], record, *result.diagnostics.frames[10:])
+    result = replace(
+        result,
+        recording={**result.recording, "path": title},
+        diagnostics=replace(result.diagnostics, frames=frames),
+    )
+    got = page(tmp_path, result, replace(extras, title=title))
+    shown = re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", title)
+    assert any(f"Frame 9: lost – {shown}" in t or not title for t in got.titles)
+
+
+def test_reasons_point_at_their_frames(shown):
+    text = re.findall(r'class="where" href="#frames" data-ranges="(.*?)">(.*?)<', shown.text)
+    assert ("[[9, 10]]", "Show frames 9–10") in text
+    assert ("[[9, 10]]", "frames 9–10") in text  # the table of problems
+    assert ("[[0, 0], [23, 23]]", "0 and 23") in text  # a loop closure
 
 
 def test_an_unwritable_place_leaves_nothing(tmp_path):

@@ -18,7 +18,7 @@ from tofuse.report.pictures import FATES, Pictures
 from tofuse.report.scene import MAX_CAMERAS, camera_lines
 from tofuse.report.words import frame_range
 from tofuse.results.card import length
-from tofuse.results.output import component_name, is_result
+from tofuse.results.folder import component_name, is_result
 from tofuse.viewer.measure import picked
 from tofuse.viewer.result import Bar, Layer, Result, colorings, painted, read_result
 from tofuse.viewer.tone import before_tone_mapping

@@ -50,6 +50,8 @@ class Coverage:
         return 1 / np.sqrt(self._information)
 
     def _key(self, points: Float32) -> Int64:
-        step = np.floor(points / self._cell).astype(np.int64).clip(-_REACH, _REACH - 1) + _REACH
-        keys: Int64 = (step[:, 0] << 42) | (step[:, 1] << 21) | step[:, 2]
+        x, y, z = (
+            np.floor(points / self._cell).astype(np.int64).clip(-_REACH, _REACH - 1).T + _REACH
+        )
+        keys: Int64 = (x << 42) | (y << 21) | z
         return keys
