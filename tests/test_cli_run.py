@@ -697,6 +697,20 @@ def test_an_interrupted_simulation_leaves_nothing(tmp_path, monkeypatch) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_demo_that_fails_says_where(tmp_path, capsys) -> None:
+    out = tmp_path / "demo"
+    assert main(["demo", "--failure", "--out", str(out)]) == 0
+    assert "degraded" in capsys.readouterr().out
+    run = json.loads((out / "run.json").read_text())
+    reasons = {reason["code"]: reason for reason in run["reasons"]}
+    assert "unobserved_motion" in reasons
+    assert run["accuracy"]["position_m"] is None
+    assert reasons["unobserved_motion"]["ranges"] == [[2, 19]]
+    with pytest.raises(SystemExit) as stopped:
+        main(["demo", "--failure", "--scene", "torso", "--out", str(out)])
+    assert stopped.value.code == 2
+
+
 def test_demo_of_peaks(tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "demo"
     assert main(["demo", "--scene", "peaks", "--out", str(out)]) in (0, 3)

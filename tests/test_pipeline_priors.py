@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from test_report_html import lonely
 from tofuse.cli import main
 from tofuse.errors import InputError
+from tofuse.geometry import se3
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.priors import with_prior
-from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.pipeline.reconstruct import device_up, reconstruct
 from tofuse.posegraph.outside import GravityEdges, OdometryEdges
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import read_run_json
+from tofuse.results.types import FrameRecord
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,22 @@ def test_reference_poses_of_other_recordings_are_only_compared_with(recording) -
     assert kinds(config) == [GravityEdges]
     with pytest.raises(InputError, match="no poses of its device"):
         with_prior(recording, from_method("default"), "device")
+
+
+def test_a_phone_knows_which_way_up_it_was(recording) -> None:
+    # Its world has y up, and is turned about that and moved against the result's.
+    T_device_world = np.eye(4)
+    T_device_world[:3, :3] = [[0.0, 0.0, 1.0], [-0.6, -0.8, 0.0], [0.8, -0.6, 0.0]]
+    T_device_world[:3, 3] = [3.0, 1.0, -2.0]
+    phone = by_phone(recording, T_device_world @ recording.reference)
+    n = len(recording)
+    poses = recording.reference @ se3.exp(np.tile([0.1, 0, 0, 0, 0, 0], (n, 1)))
+    frames = tuple(FrameRecord(int(k), 0.0, "tracked") for k in recording.indices)
+    result = lonely(trajectory=poses, timestamps=np.arange(n), sequential=poses, frames=frames)
+    np.testing.assert_allclose(device_up(phone, result), [-0.6, -0.8, 0.0], atol=1e-9)
+    assert device_up(recording, result) is None
+    lost = replace(result, trajectory=np.full_like(poses, np.nan))
+    assert device_up(phone, lost) is None
 
 
 def test_nothing_but_the_images(recording) -> None:

@@ -33,7 +33,7 @@ class Coverage:
         more = np.concatenate([self._information, 1 / np.maximum(mean, 1e-5) ** 2])
         merged, place = np.unique(both, return_inverse=True)
         self._keys = merged.astype(np.int64)
-        self._information = np.bincount(place, more, len(self._keys))
+        self._information = np.bincount(place, more, len(self._keys)).astype(float)
 
     def sigma(self, points: Float32) -> Float64:
         """Return the standard deviation (N,) of the surface at points, m; inf where never seen."""
