@@ -13,21 +13,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tofuse.errors import OutputError
 from tofuse.fusion.cloud import Cloud, CloudBuilder, empty_cloud
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import UNSEEN, Mesh, seen_colors
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.posegraph.graph import LoopRecord, PoseGraph
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-from tofuse.report import plots
+from tofuse.report import images, plots
 from tofuse.report.extras import ReportExtras
 from tofuse.report.fields import fields
 from tofuse.report.html import write_report
 from tofuse.report.packing import squeezed, unsqueezed
 from tofuse.report.pictures import draw
-from tofuse.report.scene import MAX_FACES, UNSEEN, make_scene, packed, seen_colors
+from tofuse.report.scene import (
+    MAX_FACES,
+    PITCH,
+    YAW,
+    make_scene,
+    opening_yaw,
+    packed,
+)
 from tofuse.report.subject import Subject
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
@@ -514,6 +522,20 @@ def test_viewer_holds_a_surface_with_not_too_many_faces():
     assert packed(make_scene(result, rows))["model"]["faces"] is None
 
 
+def test_view_opens_on_the_side_that_shows_most():
+    scene = make_scene(room()[0], {})
+    for k in (0, 2, 5):
+        yaw = YAW + k * np.pi / 4
+        facing = -images.turned(yaw, PITCH)[2]
+        normals = np.tile(facing, (len(scene.points), 1))
+        found = opening_yaw(replace(scene, normals=normals))
+        assert np.cos(found - yaw) == pytest.approx(1)
+    # What looks alike from all sides is shown as ever.
+    normals = np.random.default_rng(0).normal(0, 1, (len(scene.points), 3))
+    assert opening_yaw(replace(scene, normals=normals)) == YAW
+    assert opening_yaw(replace(scene, normals=None)) == YAW
+
+
 def test_nothing_is_black_where_no_image_showed_a_colour():
     colors = np.array([[0, 0, 0], [0, 0, 1], [200, 10, 5]], np.uint8)
     shown = seen_colors(colors)
@@ -778,6 +800,6 @@ def test_reasons_point_at_their_frames(shown):
 
 def test_an_unwritable_place_leaves_nothing(tmp_path):
     (tmp_path / "report.html").mkdir()
-    with pytest.raises(OSError, match="report"):
+    with pytest.raises(OutputError, match="report"):
         write_report(lonely(), tmp_path / "report.html", ReportExtras("x"))
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

@@ -24,6 +24,8 @@ _HELD = 0.02
 _MEASURED = 100_000
 # Two vertices of which one faces away from the other are on different sides of something.
 _BEHIND = -0.3
+# Where no image showed a colour, for who looks at it.
+UNSEEN = (142, 142, 142)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,3 +271,11 @@ def _loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
                 place[following] = len(path)
                 path.append(following)
     return [loop for loop in found if len(loop) > 2]
+
+
+def seen_colors(colors: UInt8) -> UInt8:
+    """Return colours (N, 3) with a neutral grey where no image showed one, which are black."""
+    unseen = ~colors.any(1)
+    out = colors.copy()
+    out[unseen] = UNSEEN
+    return out

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import Mesh, seen_colors
 from tofuse.geometry import se3
 from tofuse.report import images
 from tofuse.report.packing import normal_bytes, squeezed, steps_of
@@ -25,9 +25,9 @@ MAX_POINTS = 150_000
 MAX_FACES = 300_000
 MAX_CAMERAS = 72
 _FAR = 1.8  # times the size of the model: then it is framed without the cameras
+_SAMPLED, _CLEARLY = 5000, 1.05  # normals that tell what is seen, and how much more is clear
 _DIRECTIONS = 100  # in which the outermost points are framed
 YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
-UNSEEN = (142, 142, 142)  # where no image showed a colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ def packed(scene: Scene) -> dict[str, Any]:
         "size": scene.size,
         "framed": np.round(scene.framed, 4).tolist(),
         "spacing": scene.spacing if mesh is None else spacing_of(points),
-        "yaw": YAW,
+        "yaw": opening_yaw(scene),
         "pitch": PITCH,
         "model": _packed_model(scene, steps_of(points, low, extent)) if len(points) else None,
         "lines": {
@@ -216,12 +216,20 @@ def _seen(mesh: Mesh | None) -> Mesh | None:
     return replace(mesh, color=seen_colors(mesh.color))
 
 
-def seen_colors(colors: UInt8) -> UInt8:
-    """Return colours (N, 3) with a neutral grey where no image showed one, which are black."""
-    unseen = ~colors.any(1)
-    out = colors.copy()
-    out[unseen] = UNSEEN
-    return out
+def opening_yaw(scene: Scene) -> float:
+    """Return the yaw in rad from which most of the model is seen from its front.
+
+    Of eight around it, and `YAW` unless another one shows clearly more.
+    """
+    normals = scene.normals if scene.mesh is None else scene.mesh.normals
+    if normals is None or not len(normals):
+        return YAW
+    sample = np.nan_to_num(normals[:: -(-len(normals) // _SAMPLED)].astype(float))
+    yaws = YAW + np.arange(8) * np.pi / 4
+    towards = np.array([-images.turned(yaw, PITCH)[2] for yaw in yaws])
+    seen = np.maximum(sample @ towards.T, 0).sum(0)
+    best = int(seen.argmax())
+    return float(yaws[best]) if seen[best] > _CLEARLY * seen[0] else YAW
 
 
 def camera_lines(poses: Float64, edge: float, step: int = 1) -> Float64:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tofuse.geometry import se3
 from tofuse.report import cameras, images, plots, words
 from tofuse.report.fields import fields
-from tofuse.report.scene import Scene, packed, still
+from tofuse.report.scene import Scene, opening_yaw, packed, still
 from tofuse.report.subject import OUTER, Figure, Subject, Values
 
 Float64 = NDArray[np.float64]
@@ -32,7 +32,7 @@ def model(s: Subject) -> Values:
     }
     return {
         "scene": data,
-        "still": images.data_uri(still(laid)),
+        "still": images.data_uri(still(laid, yaw=opening_yaw(laid))),
         "toggles": _toggles(scene),
         "colorings": ([("", own)] if own else [])
         + [(name, field.label) for name, field in by.items()],

@@ -54,9 +54,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
             out.update(part(subject))
         out.update(model.result())
     true = out["true_sizes"]
-    out["dimensions"] = [
-        (row[0], row[2 if true else 1], row[1] if true else "") for row in out["sizes"]
-    ]
+    out["dimensions"] = [(row[0], row[2 if true else 1]) for row in out["sizes"]]
     names = {
         "model": "Model",
         "verdict": "Accuracy",

@@ -19,7 +19,7 @@ from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
 from tofuse.files.reading import parsed, read_text
 from tofuse.files.trajectory import read_tum, write_tum
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import Mesh, seen_colors
 from tofuse.fusion.texture import Textured
 from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.accuracy import Accuracy
@@ -126,7 +126,7 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textu
             mesh.vertices,
             mesh.faces,
             normals=mesh.normals,
-            color=mesh.color,
+            color=None if mesh.color is None else seen_colors(mesh.color),
             generator=generator,
             **upright,
         )

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.ply import Ply, read_ply
-from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.mesh import Mesh, seen_colors
 from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
-from tofuse.report.scene import seen_colors
 from tofuse.report.words import length
 from tofuse.results.folder import is_result, settle
 from tofuse.results.output import main_poses, read_run_json

@@ -19,7 +19,10 @@ function makeCameras(painter, size, frames) {
 
   function drawn(of, inkOf, isMarked) {
     const places = [], colors = [], step = Math.ceil(n / MOST);
-    let last = null, first = true, markedDrawn = 0;
+    let last = null, first = true, markedDrawn = 0, shown = null;
+    // A camera that hardly moved since the last pyramid would only make a blot.
+    const moved = (T) => !shown || Math.hypot(...minus(at(T, 0, 0, 0), at(shown, 0, 0, 0))) > 0.007 * size
+      || T[2] * shown[2] + T[6] * shown[6] + T[10] * shown[10] < 0.93;
     const put = (lines, color) => {
       for (const value of lines) places.push(value);
       for (let k = 0; k < lines.length / 3; k++) colors.push(...color);
@@ -30,8 +33,9 @@ function makeCameras(painter, size, frames) {
       const color = bytesOf(inkOf(row)), here = at(T, 0, 0, 0);
       if (last) put([...last, ...here], color);
       last = here;
-      if (row % step === 0 || (marked && markedDrawn++ < MOST) || status[row] !== "0") {
+      if ((row % step === 0 && moved(T)) || (marked && markedDrawn++ < MOST) || status[row] !== "0") {
         put(pyramid(T, (marked ? 0.026 : 0.018) * size), color);
+        shown = T;
       }
       // The first camera is larger, as in the thesis.
       if (first) put(pyramid(T, 0.032 * size), color);
