@@ -95,6 +95,9 @@ def test_gravity_takes_out_the_drift_of_roll_and_pitch():
     assert tilt(held, right) < 0.4 * tilt(graph.poses, right)
     np.testing.assert_array_equal(held[0], graph.poses[0])
     assert told.records[0].used == N
+    up = told.up(graph.with_poses(held))
+    assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
+    assert Told().up(graph) is None
     # It says nothing of the heading, nor of where the cameras are.
     C, free = pose_covariances(with_outside(graph, told)), pose_covariances(graph)
     assert C[-1, 3, 3] + C[-1, 5, 5] < 0.6 * (free[-1, 3, 3] + free[-1, 5, 5])

@@ -104,7 +104,7 @@ def views(s: Subject) -> Values:
         figures.insert(0, Figure(drawn, name))
     legend = [("after", "", "measured extents")]
     if len(path):
-        legend.append(("ink", "", "path of the camera, a dot where it begins"))
+        legend.append(("ink", "", "camera trajectory (dot: start)"))
     if true is not None:
         legend.insert(0, ("bad", "6 3", "true outline"))
     return {

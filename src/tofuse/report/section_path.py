@@ -37,11 +37,11 @@ def cameras(s: Subject) -> Values:
                     reference=s.scene.reference if s.reference is not None else None,
                 )
                 figures.append(Figure(drawing, title[0].upper() + title[1:]))
-    legend = [("before", "", "cameras before"), ("after", "", "cameras after")]
+    legend = [("before", "", "before optimisation"), ("after", "", "after optimisation")]
     if len(s.scene.loops):
-        legend.append(("loop", "", "loops closed"))
+        legend.append(("loop", "", "loop closures"))
     if s.reference is not None:
-        legend.append(("reference", "2 3", "reference path"))
+        legend.append(("reference", "2 3", "reference trajectory"))
     return {"cameras": figures, "cameras_legend": legend, "moved": _moved(s)}
 
 
@@ -56,9 +56,9 @@ def _moved(s: Subject) -> str:
     shift[~both] = 0
     k = int(shift.argmax())
     if shift[k] < 1e-6:
-        return "Optimisation moved no camera: the path is that of frame-by-frame registration."
+        return "Optimisation changed no pose: the trajectory is that of odometry."
     return (
-        f"Optimisation moved the cameras by up to {words.length(float(shift[k]))}, "
+        f"Optimisation moved poses by up to {words.length(float(shift[k]))}, "
         f"most at frame {int(s.index[k])}."
     )
 
@@ -190,24 +190,24 @@ def optimised(s: Subject) -> Values:
     if len(d.parts) > 1:
         out.append(f"The pose graph has {len(d.parts)} disconnected parts.")
     if any(p.before > 0 and not p.improved for p in d.parts):
-        out.append("The optimiser found nothing better than what it was given.")
+        out.append("The optimiser did not improve on the initial poses.")
     r = d.refinement
     refined = ""
     if r is not None and r.views:
         refined = (
-            f"{words.count(r.views, 'view')} in {words.count(r.pairs, 'overlapping pair')} were "
-            "refined together. "
+            f"Global refinement over {words.count(r.views, 'view')} in "
+            f"{words.count(r.pairs, 'overlapping pair')}. "
         )
         support = f"{words.share(r.support[0])} to {words.share(r.support[1])}"
         if r.kept:
             refined += (
-                f"They moved by up to {words.length(r.moved_m)} and "
-                f"{np.degrees(r.moved_rad):.2f}°, and their support rose from {support}."
+                f"Poses moved by up to {words.length(r.moved_m)} and "
+                f"{np.degrees(r.moved_rad):.2f}°, and consistency rose from {support}."
             )
         elif r.pairs:
-            refined += f"Their support fell from {support}, so nothing of it was kept."
+            refined += f"Consistency fell from {support}: it was discarded."
         else:
-            refined = "No two views overlap enough to refine them together."
+            refined = "No two views overlap enough for a global refinement."
     out += [f"{sensor.text[0].upper()}{sensor.text[1:]}." for sensor in d.outside]
     return {"optimised": " ".join(out), "refined": refined, "camera_check": _camera_check(r)}
 
@@ -229,15 +229,16 @@ def _camera_check(r: Refinement | None) -> str:
     if s is None:
         return out.strip()
     if s.errors:
-        verdict = "The camera should be checked" if s.alarm else "That is no reason for an alarm"
-        out += f"The views would agree better with {' or '.join(in_words(s.errors))}. {verdict}. "
+        verdict = "Check the calibration" if s.alarm else "This is not significant"
+        errors = " or ".join(in_words(s.errors))
+        out += f"Overlapping views would be more consistent with {errors}. {verdict}. "
     elif not r.errors:
         out += "No evidence of a focal-length or range-offset error. "
     if s.gap is not None:
         gap, (m, rad), (m_after, rad_after) = s.gap, s.gap.before, s.gap.after
         out += (
-            f"From view {gap.i} to {gap.j} neighbours alone miss by {words.length(m)} and "
-            f"{np.degrees(rad):.1f}°; with a camera corrected so, by {words.length(m_after)} and "
+            f"Odometry drift over loop {gap.i}–{gap.j} is {words.length(m)}, "
+            f"{np.degrees(rad):.1f}°; with the camera corrected so, {words.length(m_after)}, "
             f"{np.degrees(rad_after):.1f}°."
         )
     return out.strip()
