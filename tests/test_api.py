@@ -267,7 +267,7 @@ def test_a_cloud_is_saved_by_its_suffix(result, tmp_path, suffix):
 
 
 def test_an_unknown_suffix_names_the_known_ones(result, tmp_path):
-    with pytest.raises(tofuse.InputError, match=r"\.glb, \.gltf, \.ply, \.obj, \.stl"):
+    with pytest.raises(tofuse.InputError, match=r"\.glb, \.gltf, \.ply, \.obj, \.usdz, \.stl"):
         result.mesh.save(tmp_path / "model.docx")
     with pytest.raises(tofuse.InputError, match=r"\.ply, \.pcd"):
         result.cloud.save(tmp_path / "model.glb")
