@@ -39,7 +39,11 @@ def write_npz(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def read_npz(
-    path: str | Path, *, limit: int = _MAX_BYTES, only: frozenset[str] | None = None
+    path: str | Path,
+    *,
+    limit: int = _MAX_BYTES,
+    only: frozenset[str] | None = None,
+    without: str | None = None,
 ) -> Arrays:
     """Return the arrays of a file, by name.
 
@@ -49,6 +53,8 @@ def read_npz(
         Bytes that all of them may have together.
     only
         Names of those that are wanted; all unless given.
+    without
+        What names of those begin with that are not wanted.
 
     Raises
     ------
@@ -60,7 +66,7 @@ def read_npz(
             path.stat() if isinstance(path, Path) else Path(path).stat()
             raise InputError("is no ordinary file", where=path, remedy="give a file")
         with zipfile.ZipFile(path) as archive:
-            return _read(archive, limit, only)
+            return _read(archive, limit, only, without)
     except OSError as error:
         raise input_error(error, path) from error
     except (
@@ -85,11 +91,18 @@ def read_npz(
         ) from error
 
 
-def _read(archive: zipfile.ZipFile, limit: int, only: frozenset[str] | None) -> Arrays:
+def _read(
+    archive: zipfile.ZipFile, limit: int, only: frozenset[str] | None, without: str | None
+) -> Arrays:
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
         raise ValueError(f"it holds {len(members)} arrays")
-    wanted = [m for m in members if only is None or m.filename.removesuffix(".npy") in only]
+    wanted = [
+        m
+        for m in members
+        if (only is None or m.filename.removesuffix(".npy") in only)
+        and (without is None or not m.filename.startswith(without))
+    ]
     if sum(m.file_size for m in wanted) > limit:
         raise ValueError(f"its arrays have more than {limit >> 20} MiB")
     found: Arrays = {}

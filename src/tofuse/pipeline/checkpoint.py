@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tofuse.errors import Ended, InputError, OutputError
 from tofuse.files.arrays import Arrays, read_npz, write_npz
 from tofuse.files.stamps import Stamp, stamp, stamps_in
-from tofuse.pipeline.states import StateError, decode, encode
+from tofuse.pipeline.states import PIECE, StateError, decode, encode
 from tofuse.results.folder import CHECKPOINT
 
 # While frames are tracked a state is kept this often, and so seldom that it costs little.
@@ -301,10 +301,14 @@ def _write(path: Path, header: dict[str, Any], state: Any) -> None:
 
 
 def _read(path: Path, key: str) -> Any:
-    arrays = read_npz(path, limit=_MAX_BYTES)
+    arrays = read_npz(path, limit=_MAX_BYTES, without=PIECE)
     if _header_in(arrays).get("key") != key:
         raise StateError("it is of another run")
     nodes = arrays.pop(_NODES, None)
     if nodes is not None and nodes.nbytes > _MAX_NODES_BYTES:
         raise StateError("it is too large")
-    return decode(_json(nodes), arrays)
+
+    def piece(name: str) -> NDArray[Any]:
+        return read_npz(path, only=frozenset({name}))[name]
+
+    return decode(_json(nodes), arrays, piece)

@@ -13,7 +13,7 @@ import importlib
 import math
 import pkgutil
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache, cached_property
 from types import ModuleType
@@ -22,11 +22,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.files.spill import SpillFile
+
 Arrays = dict[str, NDArray[Any]]
 
 # Whose classes may take part.
 _ROOMS = (
     "evaluation",
+    "files.spill",
     "filters",
     "fusion",
     "geometry",
@@ -52,6 +55,8 @@ _ROOMS = (
     "sensor",
 )
 _KINDS = "biufcSU"  # of arrays
+# How names of arrays begin that are pieces of a temporary file: there may be more of it than memory.
+PIECE = "piece-"
 _SMALL = 1 << 14  # bytes; smaller arrays of a type lie in one
 
 
@@ -70,15 +75,25 @@ def encode(state: Any) -> tuple[list[Any], Arrays]:
     return _Encoder().run(state)
 
 
-def decode(nodes: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+def decode(
+    nodes: Any,
+    arrays: Mapping[str, NDArray[Any]],
+    piece: Callable[[str], NDArray[Any]] | None = None,
+) -> Any:
     """Return the state of some nodes and arrays.
+
+    Parameters
+    ----------
+    piece
+        Gives arrays whose names begin with `PIECE`, which are needed one at a time; where they are
+        not given, they are among the others.
 
     Raises
     ------
     StateError
         If they are no state.
     """
-    return _Decoder(nodes, arrays).run()
+    return _Decoder(nodes, arrays, piece or arrays.__getitem__).run()
 
 
 @cache
@@ -161,10 +176,21 @@ class _Encoder:
             return ["array", *self._placed(flat), turned, *whole.shape]
         if isinstance(item, np.generic):
             return ["number", *self._placed(np.asarray(item).reshape(-1))]
+        if kind is SpillFile:
+            return ["file", item.folder, *self._pieces(item)]
         if known_types().get(_name(kind)) is kind:
             state = item.__getstate__() or {}
             return ["object", _name(kind), *(v for k in state for v in (k, value(state[k])))]
         raise StateError(f"{_name(kind)} is no part of a state")
+
+    def _pieces(self, file: SpillFile) -> list[str]:
+        """Names of the pieces of a temporary file: arrays that are read when they are written."""
+        names = []
+        for piece in file.pieces():
+            names.append(f"{PIECE}{len(self._arrays)}")
+            made: Any = piece
+            self._arrays[names[-1]] = made
+        return names
 
     def _placed(self, flat: NDArray[Any]) -> list[Any]:
         """Where the values of an array are: in which of those that are written, and from where."""
@@ -186,7 +212,13 @@ _TABLES: dict[type, str] = {dict: "dict", OrderedDict: "ordered"}
 
 
 class _Decoder:
-    def __init__(self, nodes: Any, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def __init__(
+        self,
+        nodes: Any,
+        arrays: Mapping[str, NDArray[Any]],
+        piece: Callable[[str], NDArray[Any]],
+    ) -> None:
+        self._piece = piece
         if not isinstance(nodes, list) or not nodes:
             raise StateError("it is no list of nodes")
         self._nodes = nodes
@@ -265,9 +297,22 @@ class _Decoder:
         else:
             made.__dict__.update(state)
 
+    def _file(self, folder: str | None, *names: str) -> SpillFile:
+        if folder is not None and not isinstance(folder, str):
+            raise StateError("a temporary file is nowhere")
+        made = SpillFile(folder)
+        for name in names:
+            data = self._piece(name) if name.startswith(PIECE) else None
+            if data is None or data.dtype != np.uint8:
+                raise StateError("a temporary file is not whole")
+            made.append(data)
+        return made
+
     def _plain(self, kind: str, rest: list[Any]) -> Any:
         if kind == "float":
             return float(rest[0])
+        if kind == "file":
+            return self._file(*rest)
         if kind in ("bytes", "number", "array"):
             name, start, count, *shape = rest
             whole = self._arrays[name]
