@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from tofuse.fusion import tsdf as fusing
+from tofuse.files.spill import Spill
+from tofuse.fusion import layout
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
@@ -240,16 +242,6 @@ def test_blocks_lie_near_surfaces_only_and_don_t_grow_with_views(ball) -> None:
     assert off.max() < once.reach_m + 0.02 + np.sqrt(3) * 4 * 0.012
 
 
-def test_too_many_voxels_are_made_larger() -> None:
-    frames, poses = around_a_ball(4)
-    views = [RangeView.of(f) for f in frames]
-    fine = Volume.around(views, poses, 0.003, Fusion())
-    small = Volume.around(views, poses, 0.003, Fusion(memory_mb=3))
-    assert fine.voxel_m == 0.003
-    assert small.voxel_m > 0.004
-    assert small.distance.nbytes * 14 / 4 <= 3e6
-
-
 def test_free_space_carves_away_what_one_view_made_up() -> None:
     wall = [plane_range(look([x, 0, 0], [x, 0, 2]), np.array([0, 0, 1.0]), 2.0) for x in (0, 0.1)]
     poses = np.array([look([x, 0, 0], [x, 0, 2]) for x in (0, 0.1)] * 4)
@@ -434,20 +426,36 @@ def test_views_that_show_nothing_make_an_empty_mesh() -> None:
     assert mesh.cloud().points.shape == (0, 3)
 
 
-def test_a_builder_keeps_so_much_memory_evenly() -> None:
-    frame = frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0))
-    size = RangeView.of(frame).nbytes
-    builder = ModelBuilder(Fusion(memory_mb=1))
-    for k in range(200):
-        builder.add(replace(frame, index=k), None, 1000)
-    most = 500_000 // size
-    assert most / 2 <= builder.views <= most
-    advanced = []
-    model = builder.fuse(dict.fromkeys(range(200), EYE), lambda: advanced.append(1))
-    assert len(advanced) == builder.views
-    steps = np.diff([view.index for view in builder._ranges])
-    assert (steps == steps[0]).all()
-    assert model.mesh.views.max() == builder.views
+def test_a_builder_keeps_all_views_in_so_much_memory() -> None:
+    frames, poses = around_a_ball(60, noise=np.random.default_rng(1))
+    posed = dict(enumerate(poses))
+    models = []
+    for options in (Fusion(voxel_m=0.02), Fusion(voxel_m=0.02, memory_mb=1)):
+        spill = Spill(options.memory_mb * 500_000)
+        builder = ModelBuilder(options, spill)
+        for frame in frames:
+            builder.add(frame, None, 1000)
+        assert builder.views == 60
+        assert builder.nbytes == 60 * RangeView.of(frames[0]).nbytes
+        advanced: list[None] = []
+        errors = {"scale": 0.01}
+        models.append(
+            [
+                builder.fuse(posed, partial(advanced.append, None)),
+                builder.fuse(posed, errors=errors),
+                builder.fuse(posed),
+            ]
+        )
+        assert len(advanced) == 60
+        assert (spill.spilled_bytes > 0) == (options.memory_mb == 1)
+        assert spill.held_bytes <= options.memory_mb * 500_000
+        assert len(spill) == 60  # what was corrected is forgotten
+        assert len(builder.sketch(posed)) > 500
+    for large, small in zip(*models, strict=True):
+        for name in ("vertices", "faces", "normals", "color", "sigma", "views"):
+            a, b = getattr(large.mesh, name), getattr(small.mesh, name)
+            np.testing.assert_array_equal(a, b)
+    assert models[0][0].mesh.views.max() > 20
 
 
 def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
@@ -455,7 +463,7 @@ def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
     frame = frame_of(rng.uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
     view = RangeView.of(frame)
-    found = without_camera_errors([view, view], errors)
+    found = list(without_camera_errors([view, view], errors))
     expected = without_errors(view.as_cloud().points, errors)
     np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
     assert found[0].projection is found[1].projection
@@ -637,7 +645,7 @@ def test_views_in_turns_make_nearly_the_same_surface(monkeypatch) -> None:
     turned = Volume.around(views, poses, 0.012, options)
     assert turned.turns == 2
     found = fuse_surface(views, poses, options)
-    monkeypatch.setattr(fusing, "_TURNS", 1)
+    monkeypatch.setattr(layout, "_TURNS", 1)
     full = Volume.around(views, poses, 0.012, options)
     assert full.turns == 1
     assert len(turned.keys) > 0.97 * len(full.keys)  # lone pixels may be passed over

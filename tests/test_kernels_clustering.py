@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
-from tofuse.kernels.clustering import number_keys, plane_sums
+from tofuse.kernels.clustering import connect, number_keys, plane_sums
 
 
 def test_equal_keys_have_one_number_in_the_order_in_which_they_come() -> None:
@@ -41,3 +43,16 @@ def test_sums_are_those_of_each_corner_s_plane() -> None:
     np.testing.assert_allclose(A, wanted_A, atol=1e-12)
     np.testing.assert_allclose(b, wanted_b, atol=1e-12)
     assert not A[6].any(), "no vertex is in the last group"
+
+
+def test_pieces_are_those_of_a_graph_library() -> None:
+    rng = np.random.default_rng(3)
+    for count, faces in ((40, 9), (500, 150), (500, 400), (5, 0)):
+        rows = rng.integers(0, count, (faces, 3)).astype(np.int32)
+        piece = np.empty(count, np.int32)
+        connect(rows, piece)
+        ends = np.concatenate([rows[:, :2], rows[:, 1:]])
+        links = coo_matrix((np.ones(len(ends)), ends.T), shape=(count, count))
+        _, wanted = connected_components(links, directed=False)
+        _, first = np.unique(wanted, return_index=True)
+        np.testing.assert_array_equal(piece, first[wanted])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.exchange import Shape
-from tofuse.kernels.clustering import number_keys, plane_sums
+from tofuse.kernels.clustering import connect, number_keys, plane_sums
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -107,13 +107,8 @@ class Mesh:
         """Return the mesh without its connected pieces of fewer than `least` vertices."""
         if len(self.faces) == 0:
             return self.rows(np.zeros(0, bool))
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
-
-        a, b = self.faces[:, [0, 1]].T, self.faces[:, [1, 2]].T
-        i, j = np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
-        links = coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(len(self),) * 2)
-        _, piece = connected_components(links, directed=False)
+        piece = np.empty(len(self), np.int32)
+        connect(self.faces, piece)
         return self.rows((np.bincount(piece)[piece] >= least)[self.faces[:, 0]])
 
     def without_holes(self, longest_m: float) -> Mesh:

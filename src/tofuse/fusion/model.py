@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
+from tofuse.fusion.kept import KeptViews
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.tsdf import fitting_voxel, fuse_surface
-from tofuse.fusion.views import RangeView, without_camera_errors
+from tofuse.fusion.views import RangeView
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.refinement import without_errors
-from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
+from tofuse.recordings.frames import CloudFrame, Frame
 
 Float64 = NDArray[np.float64]
 
@@ -41,14 +43,23 @@ class Model:
 
 
 class ModelBuilder:
-    """Keeps views, small and of bounded size, and fuses them at the poses they get in the end."""
+    """Keeps views, small, and fuses them at the poses they get in the end.
 
-    def __init__(self, options: Fusion) -> None:
+    Parameters
+    ----------
+    options
+        How.
+    spill
+        Where range images are kept; unless given, half as many bytes of them as there may be of
+        voxels stay in memory.
+    """
+
+    def __init__(self, options: Fusion, spill: Spill[RangeView] | None = None) -> None:
         self._options = options
-        self._ranges: list[RangeView] = []
+        if spill is None:
+            spill = Spill(options.memory_mb * 500_000)
+        self._ranges = KeptViews(spill)
         self._clouds: list[CloudFrame] = []
-        self._step = 1  # every so-many-th range image is kept
-        self._count = 0
         self._bytes = 0
         self._voxel_m = 0.01  # of clouds
 
@@ -67,18 +78,9 @@ class ModelBuilder:
                 self._voxel_m = self._options.voxel_m or choose_voxel(frame)
             self._clouds.append(as_cloud(frame, most_points))
             return
-        if self._count % self._step == 0:
-            self._keep(frame, surface)
-        self._count += 1
-
-    def _keep(self, frame: RangeFrame, surface: SurfaceMap | None) -> None:
         view = RangeView.of(frame, surface)
-        self._ranges.append(view)
+        self._ranges.add(view)
         self._bytes += view.nbytes
-        while self._bytes > self._options.memory_mb * 500_000 and len(self._ranges) > 1:
-            self._ranges = self._ranges[::2]
-            self._step *= 2
-            self._bytes = sum(kept.nbytes for kept in self._ranges)
 
     @property
     def views(self) -> int:
@@ -87,7 +89,7 @@ class ModelBuilder:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the images of these views take."""
+        """Bytes that the images of these views take, in memory or on disk."""
         return self._bytes
 
     def fuse(
@@ -107,21 +109,27 @@ class ModelBuilder:
         errors
             Of the camera, which are taken out; see `Refinement.errors`.
         """
-        if self._clouds or not self._ranges:
-            clouds = [
+        if self._clouds or not len(self._ranges):
+            clouds = (
                 replace(c, points=without_errors(c.points, errors)) if errors else c
                 for c in self._clouds
                 if c.index in poses
-            ]
+            )
             return Model(self._average(clouds, poses, self._voxel_m, advance), None)
-        ranges = [view for view in self._ranges if view.index in poses]
-        views = without_camera_errors(ranges, errors)
-        at = np.array([poses[view.index] for view in views], float)
+        views = self._ranges.of(poses)
+        wrong = any(errors.values())
+        if wrong:
+            views = views.corrected(errors)
+        at = np.array([poses[each.index] for each in views.about], float)
         mesh = fuse_surface(views, at, self._options, advance)
         if len(mesh):
-            return Model(mesh.cloud(), self._finished(mesh))
-        clouds = [view.as_cloud() for view in views]
-        return Model(self._average(clouds, poses, self._range_voxel), mesh)
+            model = Model(mesh.cloud(), self._finished(mesh))
+        else:
+            clouds = (view.as_cloud() for view in views)
+            model = Model(self._average(clouds, poses, self._range_voxel), mesh)
+        if wrong:
+            views.forget()
+        return model
 
     def _finished(self, mesh: Mesh) -> Mesh:
         """The surface without its small holes, and with as many triangles as asked for."""
@@ -137,7 +145,7 @@ class ModelBuilder:
         if self._clouds:
             clouds = [c for c in self._clouds if c.index in poses]
             return self._average(clouds, poses, self._voxel_m)
-        ranges = [view for view in self._ranges if view.index in poses]
+        ranges = self._ranges.of(poses)
         some = ranges[:: max(1, -(-len(ranges) // _SKETCHED))]
         voxel = self._range_voxel
         sketched = [view.as_cloud(_SKETCHED_PIXELS) for view in some]
@@ -149,7 +157,7 @@ class ModelBuilder:
 
     def _average(
         self,
-        views: list[CloudFrame],
+        views: Iterable[CloudFrame],
         poses: Mapping[int, Float64],
         voxel_m: float,
         advance: Callable[[], None] | None = None,

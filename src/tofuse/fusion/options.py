@@ -24,9 +24,9 @@ class Fusion:
     island
         Pieces of surface with fewer vertices are left out.
     memory_mb
-        Most memory for the voxels: where it does not do, they are made larger. Half as much may go
-        to the views that are kept for fusion: where it does not do, every second view is dropped,
-        again and again.
+        Most memory for the voxels: where it does not do, the model is made region by region, with
+        the same result. Half as much may go to the views that are kept for it; what does not fit
+        is on disk until it is fused.
     holes_m
         Holes in the surface with a border no longer than this are closed; 0 closes none.
     faces

@@ -9,23 +9,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.fusion.cloud import grey_of
+from tofuse.fusion.frusta import Frusta
+from tofuse.fusion.kept import about
+from tofuse.fusion.layout import OF_CUBES, REACH_SIGMAS, Layout, Region, near
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
+from tofuse.fusion.stitching import Piece, colored, stitched
 from tofuse.fusion.views import DECODED, RangeView
 from tofuse.geometry import se3
-from tofuse.kernels.blocks import (
-    EDGE,
-    EMPTY,
-    VOXELS,
-    enter,
-    index_of,
-    mark_eighths,
-    neighbours_of,
-)
+from tofuse.kernels.blocks import EDGE, VOXELS, index_of, mark_eighths, neighbours_of
 from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.tsdf import integrate, near_cubes, open_view, settle_free
+from tofuse.kernels.tsdf import integrate, open_view, settle_free
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -33,33 +28,21 @@ Int64 = NDArray[np.int64]
 
 _CHUNKS = 16
 _AT_ONCE = 16  # views
-# Where a view shows no surface near by, at most every 4th one counts, and four times: of hundreds
-# that see through a place all say the same. One of every so many more views is left out.
-_TURNS, _PER_TURN = 4, 32
-# How far apart points along a normal may be that stand for all of it: as a share of a block's edge,
-# and of an eighth's.
-_OF_BLOCKS, _OF_CUBES = 0.34, 0.6
-_MOST_SEEN = 65535  # views that a voxel can count
 # Pixels by which a camera that keeps lines straight may bend them, from one node to the next.
 _STRAIGHT = 1e-3
 # And within how many nodes any other one bends them little.
 _LINEAR_NODES = 2.0
-# Nearer cuts would take off more of the noise on one side of a surface than on the other.
-_REACH_SIGMAS = 3.0
-_LARGEST_REACH = 8.0  # voxels: the noise of a bad sensor is no reason to fill space
 _KNOWN = 2.0  # voxels: the largest standard deviation of a surface
-# How much larger voxels get when there are too many.
-_COARSER = 1.25
 
 
 def fitting_voxel(views: Sequence[RangeView]) -> float:
     """Return a voxel edge in m that fits the sensor and the scene: 2 mm to 10 cm."""
-    seen = [view for view in views if view.depth > 0]
+    seen = [each for each in about(views) if each.depth > 0]
     if not seen:
         return 0.01
-    depth = float(np.median([view.depth for view in seen]))
+    depth = float(np.median([each.depth for each in seen]))
     # Depth noise grows with depth: finer voxels than this would hold little but noise.
-    size = max(float(np.median([view.pitch for view in seen])), 0.004) * depth
+    size = max(float(np.median([each.pitch for each in seen])), 0.004) * depth
     return float(f"{np.clip(size, 0.002, 0.1):.2g}")
 
 
@@ -67,16 +50,17 @@ def fitting_voxel(views: Sequence[RangeView]) -> float:
 class Volume:
     """Signed distances to the surfaces that views saw, in blocks near these surfaces.
 
-    All blocks are laid out first, so their order and memory depend on the surfaces alone; then each
-    view is added to the blocks it sees. Blocks are shared out among threads, and each is changed by
-    one of them.
+    Each view is added to the blocks it sees. Blocks are shared out among threads, and each is
+    changed by one of them. What a block gets does not depend on which others are held beside it.
 
     Attributes
     ----------
     voxel_m, reach_m
         Edge of a voxel, and the largest distance that is told.
     keys
-        (B,) the blocks, ascending.
+        (B,) the blocks: those of a region, ascending, then the layer around it.
+    numbers, own
+        (B,) their numbers among all blocks, and how many are the region's.
     distance, weight, seen, color, free
         See `tofuse.kernels.tsdf.integrate`.
     turns, added
@@ -86,6 +70,8 @@ class Volume:
     voxel_m: float
     reach_m: float
     keys: Int64
+    numbers: Int64
+    own: int
     distance: Float32
     weight: Float32
     seen: NDArray[np.uint16]
@@ -103,39 +89,26 @@ class Volume:
     def around(
         cls, views: Sequence[RangeView], poses: Float64, voxel_m: float, options: Fusion
     ) -> Volume:
-        """Lay out the blocks near the surfaces of views at their poses (N, 4, 4), all empty.
+        """Lay out all blocks near the surfaces of views at their poses (N, 4, 4), all empty."""
+        layout = Layout.of(views, poses, voxel_m, options)
+        return cls.of(layout, layout.whole())
 
-        Where that would take more memory than allowed, voxels are made larger.
-        """
-        channels = max((view.channels for view in views), default=0)
-        block_bytes = VOXELS * (4 + 4 + 2 + 4 * channels)
-        most = max(1, options.memory_mb * 1_000_000 // block_bytes)
-        noise = [view.sigma_m for view in views if view.sigma_m > 0]
-        sigma = float(np.median(noise)) if noise else 0.0
-        turns = int(np.clip(len(views) // _PER_TURN, 1, _TURNS))
-        while True:
-            reach = voxel_m * float(
-                np.clip(
-                    _REACH_SIGMAS * sigma / voxel_m,
-                    options.reach,
-                    max(_LARGEST_REACH, options.reach),
-                )
-            )
-            keys = _touched(views, poses, EDGE * voxel_m, reach, most, turns)
-            if keys is not None:
-                break
-            voxel_m = float(f"{_COARSER * voxel_m:.3g}")
-        blocks = len(keys)
+    @classmethod
+    def of(cls, layout: Layout, region: Region) -> Volume:
+        """Hold a region of a layout, empty."""
+        blocks = len(region.rows)
         return cls(
-            voxel_m,
-            reach,
-            keys,
+            layout.voxel_m,
+            layout.reach_m,
+            layout.keys[region.rows],
+            region.rows,
+            region.own,
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.uint16),
-            np.zeros((blocks, VOXELS, channels), np.float32),
+            np.zeros((blocks, VOXELS, layout.channels), np.float32),
             np.zeros((blocks, 8), np.float32),
-            turns,
+            layout.turns,
         )
 
     def add(
@@ -143,24 +116,39 @@ class Volume:
         views: Sequence[RangeView],
         poses: Float64,
         advance: Callable[[], None] | None = None,
+        touching: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Add views at their poses (N, 4, 4), in order; `advance` is called after each."""
-        start = 0
-        while start < len(views):
-            stop = start + 1
-            while (
-                stop < min(len(views), start + _AT_ONCE)
-                and views[stop].projection is views[start].projection
-            ):
-                stop += 1
-            self._add(views[start:stop], poses[start:stop])
-            for _ in range(start, stop):
-                if advance is not None:
-                    advance()
-            start = stop
+        """Add views at their poses (N, 4, 4), in order; `advance` is called for each.
 
-    def _add(self, views: Sequence[RangeView], poses: Float64) -> None:
-        """Add a few views of one camera at once: a block is then fetched once for all of them."""
+        Those that are not `touching` (N,) any block are passed over.
+        """
+        batch: list[RangeView] = []
+        numbers: list[int] = []
+
+        def flush() -> None:
+            if batch:
+                at = np.array(numbers, np.int64)
+                self._add(batch, poses[at - self.added], at)
+            batch.clear()
+            numbers.clear()
+
+        for k in range(len(views)):
+            if touching is None or touching[k]:
+                view = views[k]
+                if batch and (len(batch) == _AT_ONCE or view.projection is not batch[0].projection):
+                    flush()
+                batch.append(view)
+                numbers.append(self.added + k)
+            if advance is not None:
+                advance()
+        flush()
+        self.added += len(views)
+
+    def _add(self, views: Sequence[RangeView], poses: Float64, numbers: Int64) -> None:
+        """Add a few views of one camera at once: a block is then fetched once for all of them.
+
+        `numbers` (N,) are theirs among all views.
+        """
         if len(self.keys) == 0:
             return
         count, (rows, columns) = len(views), views[0].z.shape
@@ -193,30 +181,30 @@ class Volume:
                     coarse[s],
                 )
                 if self.turns > 1:
-                    cubes = _near(view, poses[s], edge, self.reach_m, _OF_CUBES, self.added + s, 2)
-                    mark_eighths(cubes, *self.index, near[s])
+                    number = int(numbers[s])
+                    cubes = near(view, poses[s], edge, self.reach_m, OF_CUBES, number, 2)
+                    mark_eighths(cubes, *self.index, close[s])
                 # Albedo says nothing where the others have colour.
                 if view.light is not None and channels == view.channels:
                     light[s] = view.light.reshape(-1, channels)
 
-        near = np.zeros((count, len(self.keys)), np.uint8)
+        close = np.zeros((count, len(self.keys)), np.uint8)
         edge = 0.5 * EDGE * self.voxel_m
         run_chunks(open_views, count, count)
-        if self.added + count > _MOST_SEEN:
-            np.minimum(self.seen, _MOST_SEEN - count, out=self.seen)
         T = np.array([se3.inverse(T_world_camera) for T_world_camera in poses])
         nodes = _straight_nodes(projection.lookup)
         run_chunks(
             lambda a, b: integrate(
                 self.keys,
+                self.numbers,
                 self.voxel_m,
                 T,
+                numbers,
                 heights,
                 codes,
                 DECODED,
                 backs,
-                near,
-                self.added,
+                close,
                 self.turns,
                 light,
                 (rows, columns),
@@ -237,13 +225,48 @@ class Volume:
             len(self.keys),
             _CHUNKS,
         )
-        self.added += count
 
     def surface(self, min_views: int = 1) -> Mesh:
         """Return where the distances change sign, between voxels that views saw.
 
-        What is not known to within a few voxels is left out: there noise makes the surface.
+        What is not known to within a few voxels is left out: there noise makes the surface. Of a
+        region's surface what is made of its own blocks is a `piece`.
         """
+        net = self._net(min_views)
+        return Mesh(
+            net.points.astype(np.float32),
+            net.faces,
+            net.normals,
+            colored(net.tints),
+            net.sigma,
+            net.views,
+            np.zeros(3),
+        )
+
+    def piece(self, min_views: int = 1) -> Piece:
+        """Return the surface of the region's own blocks, to be stitched to those of others."""
+        net = self._net(min_views)
+        block, voxel = np.nonzero(net.cells >= 0)
+        names = self.numbers[block] * VOXELS + voxel
+        mine = int(np.searchsorted(block, self.own))
+        used = np.zeros(len(names), bool)
+        used[:mine] = True
+        used[net.faces] = True
+        place = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return Piece(
+            names[used],
+            net.points[:mine].astype(np.float32),
+            net.normals[:mine].copy(),
+            net.tints[:mine].copy(),
+            net.sigma[:mine].copy(),
+            net.views[:mine].copy(),
+            place[net.faces].reshape(-1, 3),
+            self.numbers[: self.own],
+            net.per_block,
+        )
+
+    def _net(self, min_views: int) -> _Net:
+        """Vertices of all cells, and the triangles of the region's own blocks."""
         blocks = len(self.keys)
         run_chunks(
             lambda a, b: settle_free(self.distance, self.weight, self.free, self.reach_m, a, b),
@@ -300,13 +323,8 @@ class Volume:
             blocks,
             _CHUNKS,
         )
-        faces = self._faces(neighbours, cells, starts, points)
-        color = None
-        if channels == 3:
-            color = np.round(tints).clip(0, 255).astype(np.uint8)
-        elif channels:
-            color = grey_of(tints[:, 0].astype(float) ** 2)
-        return Mesh(points.astype(np.float32), faces, normals, color, sigma, views, np.zeros(3))
+        faces, per_block = self._faces(neighbours, cells, starts, points)
+        return _Net(points, normals, tints, sigma, views, faces, per_block, cells)
 
     def _faces(
         self,
@@ -314,9 +332,9 @@ class Volume:
         cells: NDArray[np.int32],
         starts: Int64,
         points: Float64,
-    ) -> NDArray[np.int32]:
-        blocks = len(self.keys)
-        counts = np.zeros(blocks, np.int64)
+    ) -> tuple[NDArray[np.int32], Int64]:
+        """Triangles of the own blocks, and how many each block has."""
+        counts = np.zeros(self.own, np.int64)
 
         def run(firsts: Int64, faces: NDArray[np.int32], fill: bool) -> NDArray[np.int32]:
             run_chunks(
@@ -333,14 +351,28 @@ class Volume:
                     a,
                     b,
                 ),
-                blocks,
+                self.own,
                 _CHUNKS,
             )
             return faces
 
         run(counts, np.empty((0, 3), np.int32), fill=False)
         found = np.empty((int(counts.sum()), 3), np.int32)
-        return run(np.cumsum(counts) - counts, found, fill=True)
+        return run(np.cumsum(counts) - counts, found, fill=True), counts
+
+
+@dataclass(frozen=True, eq=False)
+class _Net:
+    """What surface nets make of a volume: columns of vertices (V,), and faces (M, 3)."""
+
+    points: Float64
+    normals: Float32
+    tints: Float32
+    sigma: Float32
+    views: NDArray[np.int32]
+    faces: NDArray[np.int32]
+    per_block: Int64  # (own,) faces of each block
+    cells: NDArray[np.int32]  # (B, VOXELS) number of the vertex within its block, or -1
 
 
 def _backs(reach: float) -> Float32:
@@ -350,7 +382,7 @@ def _backs(reach: float) -> Float32:
     the back would make a surface of its own.
     """
     sigma = 1 / np.sqrt(np.maximum(DECODED, np.float32(1e-12)))
-    return np.where(DECODED > 0, np.maximum(_REACH_SIGMAS * sigma, reach), reach).astype(np.float32)
+    return np.where(DECODED > 0, np.maximum(REACH_SIGMAS * sigma, reach), reach).astype(np.float32)
 
 
 def _straight_nodes(lookup: Float32) -> float:
@@ -359,59 +391,6 @@ def _straight_nodes(lookup: Float32) -> float:
     if max(bend.max() for bend in bends) < _STRAIGHT:
         return float(np.inf)
     return _LINEAR_NODES
-
-
-def _touched(
-    views: Sequence[RangeView],
-    poses: Float64,
-    block_m: float,
-    reach: float,
-    most: int,
-    turns: int,
-) -> Int64 | None:
-    """Keys of the blocks near surfaces, ascending; None if there are more than `most`."""
-
-    def touched(start: int, stop: int) -> Int64:
-        table, count = np.full(1 << 12, EMPTY, np.int64), 0
-        for k in range(start, stop):
-            keys = _near(views[k], poses[k], block_m, reach, _OF_BLOCKS, k, min(turns, 2))
-            table, count = enter(table, count, keys)
-            if count > most:
-                break
-        return table[table != EMPTY]
-
-    if not views:
-        return np.zeros(0, np.int64)
-    keys = np.unique(np.concatenate(run_chunks(touched, len(views), _CHUNKS)))
-    return keys if len(keys) <= most else None
-
-
-def _near(
-    view: RangeView,
-    T_world_camera: Float64,
-    cube_m: float,
-    reach: float,
-    spacing: float,
-    number: int,
-    stride: int,
-) -> Int64:
-    """Keys of the cubes near to what a view shows, by every `stride`-th pixel.
-
-    Views with other numbers begin with another one.
-    """
-    return near_cubes(
-        view.z,
-        view.unit,
-        view.normals,
-        view.strength,
-        view.projection.rays,
-        T_world_camera,
-        cube_m,
-        reach,
-        spacing,
-        (number % stride, number // stride % stride),
-        stride,
-    )
 
 
 def fuse_surface(
@@ -433,9 +412,48 @@ def fuse_surface(
 
     Returns
     -------
-    The surface without its islands; no faces where the views show none.
+    The surface without its islands; no faces where the views show none. Where its voxels take more
+    memory than `options` allow, it is made region by region, with the same result.
     """
     options = options or Fusion()
-    volume = Volume.around(views, poses, options.voxel_m or fitting_voxel(views), options)
-    volume.add(views, poses, advance)
-    return volume.surface(options.min_views).without_islands(options.island)
+    layout = Layout.of(views, poses, options.voxel_m or fitting_voxel(views), options)
+    regions = layout.regions(options.memory_mb * 1_000_000 // layout.block_bytes)
+    if len(regions) == 1:
+        volume = Volume.of(layout, regions[0])
+        volume.add(views, poses, advance)
+        mesh = volume.surface(options.min_views)
+        del volume
+    else:
+        mesh = _by_regions(layout, regions, views, poses, options.min_views, advance)
+    return mesh.without_islands(options.island)
+
+
+def _by_regions(
+    layout: Layout,
+    regions: Sequence[Region],
+    views: Sequence[RangeView],
+    poses: Float64,
+    min_views: int,
+    advance: Callable[[], None] | None,
+) -> Mesh:
+    """The surface, one region after the other: the same to the byte as of all of it at once."""
+    frusta = Frusta.of(views, poses, _backs(layout.reach_m))
+    block_m = EDGE * layout.voxel_m
+    pieces = []
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if advance is not None and done % len(regions) == 0:
+            advance()
+
+    for region in regions:
+        # One more block, as blocks are looked at as balls around them.
+        low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
+        touching = frusta.touching(block_m * low, block_m * high)
+        volume = Volume.of(layout, region)
+        volume.add(views, poses, step, touching)
+        pieces.append(volume.piece(min_views))
+        del volume
+    return stitched(pieces, len(layout.keys))

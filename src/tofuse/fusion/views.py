@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -199,14 +199,11 @@ def _widened(mask: NDArray[np.uint8], margin: int) -> NDArray[np.bool_]:
 
 
 def without_camera_errors(
-    views: Sequence[RangeView], errors: Mapping[str, float]
-) -> list[RangeView]:
+    views: Iterable[RangeView], errors: Mapping[str, float]
+) -> Iterator[RangeView]:
     """Views as they would be, did the camera not err like this; see `Refinement.errors`."""
-    if not any(errors.values()):
-        return list(views)
     stretch = 1 + errors.get("focal", 0.0)
     straight: dict[int, Projection] = {}  # shared, as it was before
-    out = []
     for view in views:
         old = view.projection
         if id(old) not in straight:
@@ -221,8 +218,7 @@ def without_camera_errors(
         z = np.maximum(np.nan_to_num(z), 0)
         unit = max(float(z.max(initial=0.0)), 1e-3) / 65535
         counts = np.round(z / unit).astype(np.uint16)
-        out.append(replace(view, z=counts, unit=unit, projection=straight[id(old)]))
-    return out
+        yield replace(view, z=counts, unit=unit, projection=straight[id(old)])
 
 
 def _encoded(weight: Float32) -> NDArray[np.uint8]:

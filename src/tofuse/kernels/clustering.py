@@ -1,4 +1,4 @@
-"""Groups of vertices that are put together, and sums over the triangles around them."""
+"""Groups of vertices: connected or put together, and sums over the triangles around them."""
 
 from __future__ import annotations
 
@@ -44,6 +44,34 @@ def number_keys(keys: Int64, number: Int64) -> Int64:
             count += 1
         number[k] = numbers[slot]
     return first[:count]
+
+
+@kernel
+def connect(faces: NDArray[np.int32], piece: NDArray[np.int32]) -> None:
+    """Fill `piece` (N,) with the first vertex of the connected piece that each vertex is in.
+
+    `faces` (M, 3) are rows of the vertices. Sets are joined by their first members, and paths
+    halved (Tarjan and van Leeuwen 1984).
+    """
+    for n in range(len(piece)):
+        piece[n] = n
+    for m in range(len(faces)):
+        for k in range(1, 3):
+            a = faces[m, 0]
+            b = faces[m, k]
+            while piece[a] != a:
+                piece[a] = piece[piece[a]]
+                a = piece[a]
+            while piece[b] != b:
+                piece[b] = piece[piece[b]]
+                b = piece[b]
+            if a < b:
+                piece[b] = a
+            elif b < a:
+                piece[a] = b
+    for n in range(len(piece)):
+        # The first member comes before all others: it is settled already.
+        piece[n] = piece[piece[n]]
 
 
 @kernel

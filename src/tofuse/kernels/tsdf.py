@@ -19,6 +19,7 @@ Int64 = NDArray[np.int64]
 Int32 = NDArray[np.int32]
 UInt16 = NDArray[np.uint16]
 
+MOST_SEEN = 65535  # views that a voxel can count
 # How many cells of the grid of rays are looked through before a block is taken voxel by voxel.
 _MOST_CELLS = 600
 _PER_UNIT = np.float32(1 / 127)  # of normals in bytes
@@ -294,6 +295,56 @@ def open_view(
 
 
 @kernel
+def farthest_told(
+    z: UInt16,
+    unit: float,
+    normals: NDArray[np.int8],
+    strength: NDArray[np.uint8],
+    rays: Float32,
+    backs: Float32,
+) -> float:
+    """How far from its camera, along z, a view may still tell something, m; 0 if it tells nothing.
+
+    The images are those of `open_view`. Voxels that land on a pixel are up to half of its width
+    from its ray, and the plane of the pixel is the nearer to that ray's direction the farther it
+    reaches: a whole width is allowed for.
+    """
+    rows, columns = z.shape
+    far = 0.0
+    for r in range(rows):
+        for c in range(columns):
+            code = strength[r, c]
+            if z[r, c] == 0 or code == 0:
+                continue
+            x = np.float64(rays[r, c, 0])
+            y = np.float64(rays[r, c, 1])
+            n0 = normals[r, c, 0] / 127.0
+            n1 = normals[r, c, 1] / 127.0
+            n2 = normals[r, c, 2] / 127.0
+            along = n0 * x + n1 * y + n2
+            if not along > 0:
+                continue
+            turned = 0.0
+            for axis in range(2):
+                wide = -1.0
+                for step in range(-1, 2, 2):
+                    i = r + step * axis
+                    j = c + step * (1 - axis)
+                    if i < 0 or j < 0 or i >= rows or j >= columns:
+                        continue
+                    across = abs(n0 * (rays[i, j, 0] - x)) + abs(n1 * (rays[i, j, 1] - y))
+                    if across > wide:
+                        wide = across
+                if wide < 0:
+                    return np.inf
+                turned += wide
+            if along <= turned:
+                return np.inf
+            far = max(far, (z[r, c] * unit * along + backs[code]) / (along - turned))
+    return far
+
+
+@kernel
 def _told(
     x: float,
     y: float,
@@ -395,14 +446,15 @@ def _linear(
 @kernel
 def integrate(
     keys: Int64,
+    blocks: Int64,
     voxel_m: float,
     T_camera_world: Float64,
+    views: Int64,
     heights: Float32,
     codes: Int32,
     weights: Float32,
     backs: Float32,
     near: NDArray[np.uint8],
-    first: int,
     turns: int,
     light: Float32,
     shape: tuple[int, int],
@@ -432,14 +484,17 @@ def integrate(
 
     Parameters
     ----------
+    blocks, views
+        (B,) and (V,) the numbers of the blocks and of the views among all that there are, by which
+        views have turns: so a block gets the same, whichever others are held beside it.
     T_camera_world
         (V, 4, 4) of the views.
     heights, codes, weights, backs, cells, coarse
         Of `open_view`, one row for each view.
     near
         (V, B) bits of the eighths of a block that are near to what a view saw.
-    first, turns
-        Number of the first view, and every how-many-th view counts where it is not near.
+    turns
+        Every how-many-th view counts where it is not near.
     light
         (V, H W, C) float32; C may be 0.
     shape
@@ -502,7 +557,7 @@ def integrate(
         mz = oz + middle
         for s in range(len(T_camera_world)):
             # Neighbours have their turns one after the other.
-            turn = (first + s + b) % turns == 0
+            turn = (views[s] + blocks[b]) % turns == 0
             if near[s, b] == 0 and not turn:
                 continue
             T = T_camera_world[s]
@@ -623,10 +678,11 @@ def _average(
 
 @kernel
 def _count(distance: Float32, limit: float, seen: UInt16) -> None:
-    """Count the voxels with a surface within the `limit`."""
+    """Count the voxels with a surface within the `limit`, up to what a count holds."""
     cut = np.float32(limit)
+    most = np.uint16(MOST_SEEN)
     for q in range(64):
-        seen[q] += np.uint16(distance[q] < cut)
+        seen[q] += np.uint16((distance[q] < cut) & (seen[q] < most))
 
 
 @kernel
