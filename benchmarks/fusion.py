@@ -12,27 +12,38 @@ is fused again and again, to see whether a frame costs the same in a volume that
 Times are of one thread, process time.
 
 With `--frames` it is shown instead what a frame costs, and how much is kept of all, while more and
-more are taken in the same room.
+more are taken in the same room. With `--memory` so many frames of the flat, walked through once,
+are fused within several bounds of memory, each in a process of its own: how many regions that
+makes, the most memory that the process held before and in all, and a digest of the surface.
 
     python benchmarks/fusion.py [--every 1] [--all] [--estimated] [--repeat 4] [--frames 5000]
+    python benchmarks/fusion.py --memory 600 200 50 10 --frames 400
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.util
+import multiprocessing
+import pickle
 import resource
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.evaluation.surface import Shape, compare_surfaces, distances
+from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
 from tofuse.filters.multipath import Multipath
+from tofuse.fusion.kept import KeptViews
+from tofuse.fusion.layout import Layout
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
@@ -126,20 +137,22 @@ def row(label: str, shape: Shape, truth: Shape, seen: Float64, kept: Float64) ->
     )
 
 
-def around_the_room(count: int, seed: int = 0) -> Iterator[tuple[RangeFrame, Float64]]:
-    """Frames with their poses: laps of the simulated room, each from slightly other places.
+def around_the_room(
+    count: int, seed: int = 0, *, scene: str = "room", step: int = 1
+) -> Iterator[tuple[RangeFrame, Float64]]:
+    """Frames with their poses: laps of a simulated scene, each from slightly other places.
 
     Ranges are exact but for noise of 1 % that pixels do not share: rendering every frame with all
     that the camera does would take hours.
     """
-    made = plan("room")
+    made = plan(scene)
     camera = made.model.camera
     shape = camera.rays().shape[:2]
     rays = np.insert(camera.rays().reshape(-1, 2).astype(float), 2, 1, -1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     for k in range(count):
         rng = np.random.default_rng([seed, k])
-        time_s = made.raw[k % len(made.raw)] / made.sequence.frame_rate_hz
+        time_s = made.raw[step * k % len(made.raw)] / made.sequence.frame_rate_hz
         T = made.sequence.T_room_camera(time_s) @ se3.exp(rng.normal(0, _ELSEWHERE))
         ranges = made.scene.cast(T[:3, 3], rays @ T[:3, :3].T).distance.reshape(shape)
         noisy = ranges * (1 + _NOISE_SHARE * rng.standard_normal(shape))
@@ -160,10 +173,9 @@ def long_run(count: int) -> None:
     for frame, T in around_the_room(count):
         poses[frame.index] = T
         surface = surface_map(frame, SurfaceOptions())
-        before, started = builder.views, time.process_time()
+        started = time.process_time()
         builder.add(frame, surface, 0)
-        if builder.views != before:  # of many frames every second is passed over
-            kept_s.append(time.process_time() - started)
+        kept_s.append(time.process_time() - started)
         if len(poses) not in marks:
             continue
         started = time.process_time()
@@ -180,6 +192,56 @@ def long_run(count: int) -> None:
         kept_s = []
 
 
+def memories(count: int, bounds: list[int]) -> None:
+    """Print what fusing one walk through the flat takes within several bounds of memory."""
+    step = max(1, len(plan("flat").raw) // count)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frames"
+        with path.open("wb") as file:
+            for pair in around_the_room(count, scene="flat", step=step):
+                pickle.dump(pair, file)
+        print(
+            f"{'memory_mb':>9} {'blocks':>8} {'regions':>8} {'views MB':>9} {'on disk':>8} "
+            f"{'CPU s':>7} {'vertices':>9} {'before MB':>10} {'peak MB':>8}  surface"
+        )
+        for bound in bounds:
+            # A process of its own: what the largest one held says nothing of the others.
+            spawned = multiprocessing.get_context("spawn").Process(
+                target=within, args=(path, count, bound)
+            )
+            spawned.start()
+            spawned.join()
+
+
+def within(path: Path, count: int, memory_mb: int) -> None:
+    """Fuse the frames of a file within so much memory, and print what that took."""
+    options = Fusion(memory_mb=memory_mb)
+    store: Spill[RangeView] = Spill(memory_mb * 500_000)
+    views = KeptViews(store)
+    poses = []
+    with threads(1), path.open("rb") as file:
+        for _ in range(count):
+            frame, T = pickle.load(file)
+            views.add(RangeView.of(frame, surface_map(frame, SurfaceOptions())))
+            poses.append(T)
+        T_world = np.array(poses)
+        layout = Layout.of(views, T_world, fitting_voxel(views), options)
+        regions = len(layout.regions(memory_mb * 1_000_000 // layout.block_bytes))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        started = time.process_time()
+        mesh = fuse_surface(views, T_world, options)
+        spent = time.process_time() - started
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    columns = (mesh.vertices, mesh.faces, mesh.normals, mesh.sigma, mesh.views)
+    digest = hashlib.sha256(b"".join(each.tobytes() for each in columns)).hexdigest()[:8]
+    print(
+        f"{memory_mb:>9} {len(layout.keys):>8,} {regions:>8} {store.nbytes / 1e6:>9.0f} "
+        f"{store.spilled_bytes / 1e6:>8.0f} {spent:>7.1f} {len(mesh):>9,} {before:>10.0f} "
+        f"{peak:>8.0f}  {digest}",
+        flush=True,
+    )
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--every", type=int, default=1)
@@ -187,7 +249,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--estimated", action="store_true", help="also at estimated poses")
     parser.add_argument("--repeat", type=int, default=4)
     parser.add_argument("--frames", type=int, help="only the cost of so many frames of one room")
+    parser.add_argument("--memory", type=int, nargs="+", help="bounds, MB, for frames of the flat")
     options = parser.parse_args(arguments)
+    if options.memory:
+        memories(options.frames or 400, options.memory)
+        return 0
     if options.frames:
         with threads(1):
             long_run(options.frames)

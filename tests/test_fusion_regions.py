@@ -9,10 +9,11 @@ import pytest
 
 from made_rooms import at, seen
 from test_fusion_tsdf import CAMERA, EYE, around_a_ball, frame_of, look, plane_range
+from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
 from tofuse.fusion.layout import Layout
 from tofuse.fusion.options import Fusion
-from tofuse.fusion.stitching import stitched
+from tofuse.fusion.stitching import Piece, stitched
 from tofuse.fusion.tsdf import Volume, _backs, fuse_surface
 from tofuse.fusion.views import RangeView
 from tofuse.kernels import tsdf
@@ -169,16 +170,18 @@ def test_an_island_is_told_by_all_its_parts() -> None:
     ranges[40:] = np.inf
     view = RangeView.of(frame_of(ranges))
     layout = Layout.of([view], EYE[None], 0.01, Fusion())
-    pieces = []
+    pieces: Spill[Piece] = Spill(0)
+    largest = 0
     for region in layout.regions(30):
         volume = Volume.of(layout, region)
         volume.add([view], EYE[None])
-        pieces.append(volume.piece())
-    largest = max(len(piece.points) for piece in pieces)
+        piece = volume.piece()
+        largest = max(largest, len(piece))
+        pieces.put(piece)
     assert len(pieces) > 5
-    mesh = stitched(pieces, len(layout.keys))
-    assert pieces == []
-    assert len(mesh.without_islands(2 * largest)) > 0.9 * len(mesh) > 3 * largest
+    mesh = stitched(pieces, len(layout.keys), 2 * largest)
+    assert len(mesh) > 3 * largest
+    assert len(stitched(pieces, len(layout.keys), 2 * len(mesh))) == 0
 
 
 def test_progress_is_told_for_each_view_once(room) -> None:

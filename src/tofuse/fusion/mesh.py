@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.exchange import Shape
-from tofuse.kernels.clustering import connect, number_keys, plane_sums
+from tofuse.kernels.clustering import connect, number_keys, plane_sums, settle
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -107,8 +107,9 @@ class Mesh:
         """Return the mesh without its connected pieces of fewer than `least` vertices."""
         if len(self.faces) == 0:
             return self.rows(np.zeros(0, bool))
-        piece = np.empty(len(self), np.int32)
+        piece = np.arange(len(self), dtype=np.int32)
         connect(self.faces, piece)
+        settle(piece)
         return self.rows((np.bincount(piece)[piece] >= least)[self.faces[:, 0]])
 
     def without_holes(self, longest_m: float) -> Mesh:

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import grey_of
 from tofuse.fusion.mesh import Mesh
+from tofuse.kernels.clustering import connect, settle
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
@@ -46,33 +48,80 @@ class Piece:
     blocks: Int64
     counts: Int64
 
+    def __len__(self) -> int:
+        return len(self.points)
 
-def stitched(pieces: list[Piece], blocks: int) -> Mesh:
-    """Put together the pieces of all of so many blocks, and empty the list.
+    @property
+    def own_names(self) -> Int64:
+        """Of its own vertices."""
+        return self.names[: len(self)]
+
+
+def stitched(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
+    """Put together the pieces of all of so many blocks, without islands.
 
     Vertices come in the order of their names, faces in that of their blocks: as if all blocks had
-    been one region.
+    been one region. Pieces are read one at a time, so that little is there beside the result.
+
+    Parameters
+    ----------
+    island
+        Connected surfaces of fewer vertices are left out.
     """
-    names = np.sort(np.concatenate([piece.names[: len(piece.points)] for piece in pieces]))
+    each = range(len(pieces))
+    names = np.sort(np.concatenate([pieces.get(k).own_names for k in each]))
+    tints = np.empty((len(names), pieces.get(0).tints.shape[1]), np.float32)
+    group = np.arange(len(names), dtype=np.int32)
+    used = np.zeros(len(names), bool)
+    for k in each:
+        piece = pieces.get(k)
+        place = _places(piece, names)
+        tints[place[: len(piece)]] = piece.tints
+        faces = place[piece.faces]
+        used[faces] = True
+        connect(faces, group)
+    settle(group)
+    color = colored(tints)  # by those of islands as well: they tell how light the scene is
+    del tints
+    used &= np.bincount(group, minlength=len(names))[group] >= island
+    del group
     counts = np.zeros(blocks, np.int64)
-    for piece in pieces:
-        counts[piece.blocks] = piece.counts
+    for k in each:
+        piece = pieces.get(k)
+        block = np.repeat(piece.blocks, piece.counts)
+        kept = used[_places(piece, names)[piece.faces[:, 0]]]
+        counts += np.bincount(block[kept], minlength=blocks)
+    place_of = np.cumsum(used, dtype=np.int32) - np.int32(1)
     firsts = np.cumsum(counts) - counts
-    total = len(names)
-    points, normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
-    tints = np.empty((total, pieces[0].tints.shape[1]), np.float32)
-    sigma, views = np.empty(total, np.float32), np.empty(total, np.int32)
-    faces = np.empty((int(counts.sum()), 3), np.int32)
-    while pieces:
-        piece = pieces.pop()
-        place = np.searchsorted(names, piece.names).astype(np.int32)
-        own = place[: len(piece.points)]
-        points[own], normals[own], tints[own] = piece.points, piece.normals, piece.tints
-        sigma[own], views[own] = piece.sigma, piece.views
-        before = np.cumsum(piece.counts) - piece.counts
-        rows = np.repeat(firsts[piece.blocks] - before, piece.counts) + np.arange(len(piece.faces))
-        faces[rows] = place[piece.faces]
-    return Mesh(points, faces, normals, colored(tints), sigma, views, np.zeros(3))
+    total = int(used.sum())
+    mesh = Mesh(
+        np.empty((total, 3), np.float32),
+        np.empty((int(counts.sum()), 3), np.int32),
+        np.empty((total, 3), np.float32),
+        None if color is None else color[used],
+        np.empty(total, np.float32),
+        np.empty(total, np.int32),
+        np.zeros(3),
+    )
+    for k in each:
+        piece = pieces.get(k)
+        place = _places(piece, names)
+        own = used[place[: len(piece)]]
+        to = place_of[place[: len(piece)][own]]
+        mesh.vertices[to], mesh.normals[to] = piece.points[own], piece.normals[own]
+        mesh.sigma[to], mesh.views[to] = piece.sigma[own], piece.views[own]
+        kept = used[place[piece.faces[:, 0]]]
+        block = np.repeat(piece.blocks, piece.counts)[kept]
+        before = np.searchsorted(block, block)  # faces of earlier blocks of this piece
+        mesh.faces[firsts[block] + np.arange(len(block)) - before] = place_of[
+            place[piece.faces[kept]]
+        ]
+    return mesh
+
+
+def _places(piece: Piece, names: Int64) -> Int32:
+    """Where the vertices of a piece are among all, by their names."""
+    return np.searchsorted(names, piece.names).astype(np.int32)
 
 
 def colored(tints: Float32) -> NDArray[np.uint8] | None:

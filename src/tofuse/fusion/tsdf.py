@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
 from tofuse.fusion.kept import about
 from tofuse.fusion.layout import OF_CUBES, REACH_SIGMAS, Layout, Region, near
@@ -423,9 +424,8 @@ def fuse_surface(
         volume.add(views, poses, advance)
         mesh = volume.surface(options.min_views)
         del volume
-    else:
-        mesh = _by_regions(layout, regions, views, poses, options.min_views, advance)
-    return mesh.without_islands(options.island)
+        return mesh.without_islands(options.island)
+    return _by_regions(layout, regions, views, poses, options, advance)
 
 
 def _by_regions(
@@ -433,13 +433,13 @@ def _by_regions(
     regions: Sequence[Region],
     views: Sequence[RangeView],
     poses: Float64,
-    min_views: int,
+    options: Fusion,
     advance: Callable[[], None] | None,
 ) -> Mesh:
     """The surface, one region after the other: the same to the byte as of all of it at once."""
     frusta = Frusta.of(views, poses, _backs(layout.reach_m))
     block_m = EDGE * layout.voxel_m
-    pieces = []
+    pieces: Spill[Piece] = Spill(0)
     done = 0
 
     def step() -> None:
@@ -454,6 +454,9 @@ def _by_regions(
         touching = frusta.touching(block_m * low, block_m * high)
         volume = Volume.of(layout, region)
         volume.add(views, poses, step, touching)
-        pieces.append(volume.piece(min_views))
+        pieces.put(volume.piece(options.min_views))
         del volume
-    return stitched(pieces, len(layout.keys))
+    try:
+        return stitched(pieces, len(layout.keys), options.island)
+    finally:
+        pieces.close()

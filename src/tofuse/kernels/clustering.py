@@ -47,31 +47,34 @@ def number_keys(keys: Int64, number: Int64) -> Int64:
 
 
 @kernel
-def connect(faces: NDArray[np.int32], piece: NDArray[np.int32]) -> None:
-    """Fill `piece` (N,) with the first vertex of the connected piece that each vertex is in.
+def connect(faces: NDArray[np.int32], group: NDArray[np.int32]) -> None:
+    """Join the vertices of each triangle in `group` (N,), which is 0 to N - 1 before the first.
 
-    `faces` (M, 3) are rows of the vertices. Sets are joined by their first members, and paths
-    halved (Tarjan and van Leeuwen 1984).
+    `faces` (M, 3) are rows of the vertices. Of each vertex `group` has one that comes before it in
+    its connected piece, or itself: the first one when all are joined and `settle` is called.
+    Paths are halved on the way (Tarjan and van Leeuwen 1984).
     """
-    for n in range(len(piece)):
-        piece[n] = n
     for m in range(len(faces)):
         for k in range(1, 3):
             a = faces[m, 0]
             b = faces[m, k]
-            while piece[a] != a:
-                piece[a] = piece[piece[a]]
-                a = piece[a]
-            while piece[b] != b:
-                piece[b] = piece[piece[b]]
-                b = piece[b]
+            while group[a] != a:
+                group[a] = group[group[a]]
+                a = group[a]
+            while group[b] != b:
+                group[b] = group[group[b]]
+                b = group[b]
             if a < b:
-                piece[b] = a
+                group[b] = a
             elif b < a:
-                piece[a] = b
-    for n in range(len(piece)):
-        # The first member comes before all others: it is settled already.
-        piece[n] = piece[piece[n]]
+                group[a] = b
+
+
+@kernel
+def settle(group: NDArray[np.int32]) -> None:
+    """Let each vertex know the first one of its piece; see `connect`."""
+    for n in range(len(group)):
+        group[n] = group[group[n]]  # what comes before is settled already
 
 
 @kernel
