@@ -16,8 +16,11 @@ import pytest
 from test_files_glb import parse
 from tofuse.cli import main
 from tofuse.cli.parser import EXPORTS
-from tofuse.errors import InputError
+from tofuse.errors import InputError, OutputError
+from tofuse.files import las
+from tofuse.files.glb import read_glb
 from tofuse.files.ply import read_ply, write_ply
+from tofuse.files.tileset import read_tileset
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.results.export import FORMATS, export
@@ -95,21 +98,25 @@ def test_pcd(result: Path, expected) -> None:
     np.testing.assert_array_equal(rgb, expected.color)
 
 
-def test_las(result: Path, expected) -> None:
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_las(result: Path, expected, suffix: str) -> None:
     laspy = pytest.importorskip("laspy")
-    (path,) = export(result, ["las"])
-    las = laspy.read(path)
-    assert str(las.header.version) == "1.4"
-    assert las.header.point_format.id == 7
-    assert las.header.generating_software.startswith("tofuse")
-    np.testing.assert_allclose(las.xyz, expected.points, atol=0.51e-4)
-    np.testing.assert_allclose(las.header.mins, expected.points.min(0), atol=1e-6)
-    np.testing.assert_allclose(las.header.maxs, expected.points.max(0), atol=1e-6)
-    rgb = np.stack([las.red, las.green, las.blue], -1)
+    if suffix == "laz":
+        pytest.importorskip("lazrs")
+    (path,) = export(result, [suffix])
+    found = laspy.read(path)
+    assert found.header.are_points_compressed == (suffix == "laz")
+    assert str(found.header.version) == "1.4"
+    assert found.header.point_format.id == 7
+    assert found.header.generating_software.startswith("tofuse")
+    np.testing.assert_allclose(found.xyz, expected.points, atol=0.51e-4)
+    np.testing.assert_allclose(found.header.mins, expected.points.min(0), atol=1e-6)
+    np.testing.assert_allclose(found.header.maxs, expected.points.max(0), atol=1e-6)
+    rgb = np.stack([found.red, found.green, found.blue], -1)
     np.testing.assert_array_equal(rgb // 256, expected.color)
-    np.testing.assert_array_equal(las["views"], expected.views)
-    np.testing.assert_array_equal(las["sigma"], expected.sigma)
-    normals = np.stack([las[f"normal {a}"] for a in "xyz"], -1)
+    np.testing.assert_array_equal(found["views"], expected.views)
+    np.testing.assert_array_equal(found["sigma"], expected.sigma)
+    normals = np.stack([found[f"normal {a}"] for a in "xyz"], -1)
     np.testing.assert_array_equal(normals, expected.normals)
 
 
@@ -310,6 +317,45 @@ def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
     np.testing.assert_allclose(p[:, 2], -2, atol=1e-5)
     assert np.abs(found[:, 0] - (127 + 120 * np.sin(6 * p[:, 0]))).max() < 20
     assert np.abs(found[:, 1] - (127 + 120 * np.cos(-6 * p[:, 1]))).max() < 20
+
+
+def test_laz_has_the_same_bytes_again_in_parts(result: Path, monkeypatch) -> None:
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    (path,) = export(result, ["laz"])
+    first = path.read_bytes()
+    export(result, ["laz"], overwrite=True)
+    assert path.read_bytes() == first
+    monkeypatch.setattr(las, "_AT_ONCE", 7)
+    export(result, ["laz", "las"], overwrite=True)
+    np.testing.assert_array_equal(
+        laspy.read(path).points.array, laspy.read(result / "cloud.las").points.array
+    )
+    monkeypatch.setitem(__import__("sys").modules, "lazrs", None)
+    with pytest.raises(InputError, match=r"needs laspy and lazrs.*tofuse\[scan\]"):
+        export(result, ["laz"], overwrite=True)
+
+
+def test_tiles(result: Path, expected) -> None:
+    (path,) = export(result, ["3dtiles"])
+    root, extras = read_tileset(path)
+    assert (root.faces, root.error_m, root.children) == (len(expected.faces), 0, [])
+    mesh = read_glb(path.parent / root.content)
+    R = np.array(extras["T_up_world"])[:3, :3]
+    np.testing.assert_allclose(mesh.points @ R, expected.points, atol=1e-6)
+    np.testing.assert_array_equal(mesh.scalars["sigma"], expected.sigma)
+    np.testing.assert_array_equal(mesh.scalars["views"], expected.views)
+    with pytest.raises(OutputError, match="--overwrite"):
+        export(result, ["3dtiles"])
+    export(result, ["3dtiles"], overwrite=True)
+    (path.parent / "mine.txt").write_text("kept")
+    with pytest.raises(OutputError, match="other than tiles"):
+        export(result, ["3dtiles"], overwrite=True)
+    assert (path.parent / "mine.txt").read_text() == "kept"
+    write_ply(result / "mesh.ply", np.zeros((3, 3)))
+    with pytest.raises(InputError, match="no triangles"):
+        export(result, ["3dtiles"], tmp_out := result / "new")
+    assert not (tmp_out / "tiles").exists()
 
 
 def test_kitti(result: Path) -> None:

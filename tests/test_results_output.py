@@ -174,6 +174,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "reasons",
         "frames",
         "T_up_world",
+        "tiles",
         "components",
         "sessions",
         "session_pairs",

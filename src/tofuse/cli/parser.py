@@ -15,7 +15,7 @@ from tofuse._version import __version__
 
 DEMO_SCENES = ("room", "empty-room", "rail", "torso", "box", "peaks")
 EXPORTS = (
-    *("pcd", "las", "e57", "glb", "gltf", "obj", "usdz", "stl"),
+    *("pcd", "las", "laz", "e57", "glb", "gltf", "obj", "usdz", "stl", "3dtiles"),
     *("kitti", "log", "nerfstudio", "colmap"),
 )
 

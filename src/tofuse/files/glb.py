@@ -6,6 +6,7 @@ import base64
 import json
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes, write_text
+from tofuse.files.reading import read_bytes
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -30,6 +32,7 @@ def write_glb(
     uv: ArrayLike | None = None,
     texture: bytes | None = None,
     T_scene_node: ArrayLike | None = None,
+    scalars: Mapping[str, ArrayLike] | None = None,
     name: str = "model",
     generator: str = "tofuse",
 ) -> None:
@@ -54,6 +57,8 @@ def write_glb(
     T_scene_node
         (4, 4) from the frame of the points into the scene; the points are in the scene's axes
         without one.
+    scalars
+        More (N,) columns by name, kept as float32 in attributes of the application: `_NAME`.
 
     Raises
     ------
@@ -61,7 +66,7 @@ def write_glb(
         If the shapes disagree.
     """
     document, body = _document(
-        path, points, faces, normals, color, uv, texture, T_scene_node, name, generator
+        path, points, faces, normals, color, uv, texture, T_scene_node, scalars or {}, name, generator
     )
     write_bytes(path, *_packed(document, body))
 
@@ -72,7 +77,7 @@ def unlit_glb(points: ArrayLike, faces: ArrayLike, color: ArrayLike) -> bytes:
     By the extension KHR_materials_unlit. Colours (N, 3) are uint8 sRGB, or float32 linear light.
     """
     document, body = _document(
-        "a mesh", points, faces, None, color, None, None, None, "model", "tofuse"
+        "a mesh", points, faces, None, color, None, None, None, {}, "model", "tofuse"
     )
     for material in document.get("materials", ()):
         material |= {"doubleSided": False, "extensions": {"KHR_materials_unlit": {}}}
@@ -106,7 +111,7 @@ def write_gltf(
 ) -> None:
     """Write a mesh as `write_glb` does, as one file of JSON with all data inside as base64."""
     document, body = _document(
-        path, points, faces, normals, color, uv, texture, T_scene_node, name, generator
+        path, points, faces, normals, color, uv, texture, T_scene_node, {}, name, generator
     )
     for buffer in document.get("buffers", ()):
         text = base64.b64encode(body).decode()
@@ -123,6 +128,7 @@ def _document(
     uv: ArrayLike | None,
     texture: bytes | None,
     T_scene_node: ArrayLike | None,
+    scalars: Mapping[str, ArrayLike],
     name: str,
     generator: str,
 ) -> tuple[dict[str, Any], bytearray]:
@@ -136,6 +142,8 @@ def _document(
         columns["COLOR_0"] = light if light.dtype == np.float32 else linear(light.astype(np.uint8))
     if uv is not None:
         columns["TEXCOORD_0"] = np.asarray(uv, np.float32)
+    for scalar, column in scalars.items():
+        columns[f"_{scalar.upper()}"] = np.asarray(column, np.float32).reshape(-1, 1)
     check_mesh(path, points, faces, columns)
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": generator},
@@ -221,11 +229,94 @@ def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
     return accessor
 
 
-def linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Linear light and opacity (N, 4) of sRGB colours (IEC 61966-2-1)."""
+def _light_of_screen() -> NDArray[np.uint16]:
+    """(256,) linear light of sRGB values (IEC 61966-2-1), ascending."""
     s = np.arange(256) / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    table = np.round(65535 * light).astype("<u2")
+    return np.round(65535 * light).astype("<u2")
+
+
+def linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Linear light and opacity (N, 4) of sRGB colours."""
     out = np.full((*color.shape[:-1], 4), 65535, "<u2")
-    out[..., :3] = table[color]
+    out[..., :3] = _light_of_screen()[color]
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Glb:
+    """A mesh as `write_glb` takes it; see there."""
+
+    points: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    normals: NDArray[np.float32] | None
+    color: NDArray[np.uint8] | None
+    scalars: Mapping[str, NDArray[np.float32]]
+
+
+def read_glb(path: str | Path) -> Glb:
+    """Read a file of one mesh that `write_glb` wrote; without a texture, if it has one.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, is damaged, or is no such file.
+    """
+    data = read_bytes(path)
+    try:
+        document, body = _chunks(data)
+        if "meshes" not in document:
+            nothing = np.zeros((0, 3))
+            return Glb(nothing.astype(np.float32), nothing.astype(np.int32), None, None, {})
+        primitive = document["meshes"][0]["primitives"][0]
+        columns = {
+            name: _column(document, body, int(k)) for name, k in primitive["attributes"].items()
+        }
+        points = columns["POSITION"].astype(np.float32)
+        faces = _column(document, body, int(primitive["indices"])).reshape(-1, 3)
+        if points.shape[1:] != (3,) or any(len(c) != len(points) for c in columns.values()):
+            raise ValueError("its columns disagree")
+        if faces.size and (faces.min() < 0 or faces.max() >= len(points)):
+            raise ValueError("a face names no vertex")
+        normals, light = columns.get("NORMAL"), columns.get("COLOR_0")
+        color = None
+        if light is not None:
+            color = np.searchsorted(_light_of_screen(), light[:, :3]).clip(0, 255).astype(np.uint8)
+        return Glb(
+            points,
+            faces.astype(np.int32),
+            None if normals is None else normals.astype(np.float32),
+            color,
+            {
+                name[1:].lower(): values[:, 0].astype(np.float32)
+                for name, values in columns.items()
+                if name.startswith("_")
+            },
+        )
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+        raise InputError(
+            f"is no mesh of ours, or damaged ({error})", where=path, remedy="copy or make it again"
+        ) from error
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document and the buffer of a file."""
+    magic, version, length = struct.unpack_from("<4sII", data)
+    if (magic, version, length) != (b"glTF", 2, len(data)):
+        raise ValueError("its header is wrong")
+    at, found = 12, {b"BIN\0": b""}
+    while at < length:
+        size, kind = struct.unpack_from("<I4s", data, at)
+        found[kind] = data[at + 8 : at + 8 + size]
+        at += 8 + size
+    return json.loads(found[b"JSON"]), found[b"BIN\0"]
+
+
+def _column(document: Mapping[str, Any], body: bytes, number: int) -> NDArray[Any]:
+    """The values of an accessor, one row for each."""
+    accessor = document["accessors"][number]
+    view = document["bufferViews"][accessor["bufferView"]]
+    dtype = np.dtype({_FLOAT: "<f4", _USHORT: "<u2", _UINT: "<u4"}[accessor["componentType"]])
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    count = int(accessor["count"]) * width
+    return np.frombuffer(body, dtype, count, int(view["byteOffset"])).reshape(-1, width)

@@ -36,25 +36,38 @@ Mark = tuple[str, int, float] | dict[str, Any]
 
 @dataclass(frozen=True)
 class Names:
-    """What a result is made of: files, and folders that hold such files and nothing else."""
+    """What a result is made of: files, and folders that hold certain ones and nothing else.
+
+    Attributes
+    ----------
+    files, more
+        Names of files, and what further ones are like.
+    folders
+        What names of folders are like, and what is in them.
+    """
 
     files: frozenset[str]
-    folders: re.Pattern[str] | None = None
+    folders: tuple[tuple[re.Pattern[str], Names], ...] = ()
+    more: re.Pattern[str] | None = None
 
     def file(self, name: str) -> bool:
         """Whether it is the name of a file."""
-        return name in self.files
+        return name in self.files or bool(self.more and self.more.fullmatch(name))
 
-    def folder(self, name: str) -> bool:
-        """Whether it is the name of a folder."""
-        return self.folders is not None and self.folders.fullmatch(name) is not None
+    def folder(self, name: str) -> Names | None:
+        """Return what a folder of this name holds; None if it is no name of a folder."""
+        return next((inner for like, inner in self.folders if like.fullmatch(name)), None)
 
     def is_whole(self, folder: Path) -> bool:
-        """Whether something is a folder of such files: no links, and nothing else inside."""
+        """Whether something is such a folder: no links, and nothing else inside."""
+        inner = self.folder(folder.name)
         return (
-            self.folder(folder.name)
+            inner is not None
             and _is(folder, stat.S_ISDIR)
-            and all(self.file(p.name) and _is(p, stat.S_ISREG) for p in folder.iterdir())
+            and all(
+                inner.is_whole(p) or (inner.file(p.name) and _is(p, stat.S_ISREG))
+                for p in folder.iterdir()
+            )
         )
 
 
@@ -232,13 +245,11 @@ def _marks(data: object, names: Names, key: str) -> dict[str, Mark]:
         raise _UntrueError("it is no plan")
     found: dict[str, Mark] = {}
     for name, mark in data.items():
+        inner = names.folder(name)
         if names.file(name) and _is_mark(mark, ("file", "link") if key == "old" else ("file",)):
             found[name] = tuple(mark)
-        elif names.folder(name) and isinstance(mark, dict):
-            inner = {n: tuple(m) for n, m in mark.items() if names.file(n) and _is_mark(m)}
-            if len(inner) != len(mark):
-                raise _UntrueError(f"{name} holds what is no file of a result")
-            found[name] = inner
+        elif inner is not None and isinstance(mark, dict):
+            found[name] = _marks(mark, inner, "within")
         else:
             raise _UntrueError(f"it names {name!r:.80}")
     return found
@@ -257,8 +268,9 @@ def _is_mark(mark: object, kinds: tuple[str, ...] = ("file",)) -> bool:
 def _mark(path: Path, names: Names) -> Mark:
     """What something of a result is."""
     status = path.lstat()
-    if stat.S_ISDIR(status.st_mode) and names.is_whole(path):
-        return {p.name: _mark(p, names) for p in sorted(path.iterdir())}
+    inner = names.folder(path.name)
+    if inner is not None and stat.S_ISDIR(status.st_mode) and names.is_whole(path):
+        return {p.name: _mark(p, inner) for p in sorted(path.iterdir())}
     for kind, test in (("file", stat.S_ISREG), ("link", stat.S_ISLNK)):
         if test(status.st_mode) and names.file(path.name):
             return (kind, status.st_size, status.st_mtime)
@@ -271,15 +283,14 @@ def _check(path: Path, mark: Mark, names: Names) -> None:
         now = _mark(path, names)
     except (OSError, OutputError):
         raise _UntrueError(f"{path.name} is not what it was") from None
-    pairs = [(now, mark)]
-    if isinstance(now, dict) and isinstance(mark, dict) and set(now) == set(mark):
-        pairs = [(now[name], mark[name]) for name in now]
-    for a, b in pairs:
-        if isinstance(a, dict) or isinstance(b, dict) or not _same(a, b):
-            raise _UntrueError(f"{path.name} is not what it was")
+    if not _same(now, mark):
+        raise _UntrueError(f"{path.name} is not what it was")
 
 
-def _same(a: tuple[str, int, float], b: tuple[str, int, float]) -> bool:
+def _same(a: Mark, b: Mark) -> bool:
+    if isinstance(a, dict) or isinstance(b, dict):
+        both = isinstance(a, dict) and isinstance(b, dict) and set(a) == set(b)
+        return both and all(_same(a[name], b[name]) for name in a)
     return a[:2] == b[:2] and abs(a[2] - b[2]) <= _SAME_TIME_S
 
 
@@ -326,8 +337,9 @@ def _clear_folder(folder: Path, names: Names) -> None:
     if not _is(folder, stat.S_ISDIR):
         return
     for path in list(folder.iterdir()):
-        if names.folder(path.name):
-            _clear_folder(path, names)
+        inner = names.folder(path.name)
+        if inner is not None:
+            _clear_folder(path, inner)
         elif names.file(path.name) or _PART.fullmatch(path.name):
             with suppress(OSError):
                 path.unlink()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.atomic import write_bytes
+from tofuse.files.atomic import replacing
 from tofuse.files.reading import read_bytes
 
 Float32 = NDArray[np.float32]
@@ -27,6 +27,7 @@ _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int
           "f4": "float", "f8": "double"}  # fmt: skip
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 16
+_AT_ONCE = 1 << 18  # rows of a file that are packed at a time
 _COPY_AGAIN = "copy or export the file again"
 
 
@@ -418,25 +419,36 @@ def write_ply(
         array = np.asarray(values)
         _check_shape(path, name, array, (len(points),))
         columns[name] = array, _stored(array.dtype)
-    rows = np.empty(len(points), [(name, dtype) for name, (_, dtype) in columns.items()])
-    for name, (column, _) in columns.items():
-        rows[name] = column
+    row = np.dtype([(name, dtype) for name, (_, dtype) in columns.items()])
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {' '.join(c.split())}" for c in comments]
     header += [f"element vertex {len(points)}"]
     header += [
         f"property {_NAMES[np.dtype(dtype).str[1:]]} {name}" for name, (_, dtype) in columns.items()
     ]
-    body = [rows.view(np.uint8).data]
+    triangles = None
     if faces is not None:
         triangles = np.asarray(faces)
         _check_shape(path, "faces", triangles, (len(triangles), 3))
-        polygon = np.empty(len(triangles), [("n", "u1"), ("items", "<i4", (3,))])
-        polygon["n"], polygon["items"] = 3, triangles
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
-        body.append(polygon.view(np.uint8).data)
     header.append("end_header\n")
-    write_bytes(path, "\n".join(header).encode(), *body)
+    with replacing(path) as beside, beside.open("wb") as file:
+        file.write("\n".join(header).encode())
+        for part in _parts(len(points)):
+            rows = np.empty(part.stop - part.start, row)
+            for name, (column, _) in columns.items():
+                rows[name] = column[part]
+            file.write(rows.view(np.uint8).data)
+        for part in _parts(0 if triangles is None else len(triangles)):
+            assert triangles is not None
+            polygon = np.empty(part.stop - part.start, [("n", "u1"), ("items", "<i4", (3,))])
+            polygon["n"], polygon["items"] = 3, triangles[part]
+            file.write(polygon.view(np.uint8).data)
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Cut so many rows into parts that are packed and written one after the other."""
+    return (slice(a, min(a + _AT_ONCE, count)) for a in range(0, count, _AT_ONCE))
 
 
 def _stored(dtype: np.dtype) -> str:

@@ -62,7 +62,7 @@ class Cloud:
         return Shape(points, self.normals, self.color, scalars)
 
     def save(self, path: str | Path) -> None:
-        """Write it as .ply, .pcd, .las or .e57, see `Shape.save`."""
+        """Write it as .ply, .pcd, .las, .laz or .e57, see `Shape.save`."""
         self.shape().save(path)
 
     def to_trimesh(self) -> Any:

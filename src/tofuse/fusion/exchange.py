@@ -15,7 +15,7 @@ from tofuse._version import __version__
 from tofuse.errors import InputError
 from tofuse.files.e57 import write_e57
 from tofuse.files.glb import write_glb, write_gltf
-from tofuse.files.las import write_las
+from tofuse.files.las import write_las, write_laz
 from tofuse.files.obj import write_obj
 from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
@@ -144,7 +144,8 @@ def _las(shape: Shape, path: str | Path, _: Float64) -> None:
             f"normal {a}": (shape.normals[:, k], "away from the surface")
             for k, a in enumerate("xyz")
         }
-    write_las(path, shape.points, color=shape.color, scalars=scalars, software=_GENERATOR)
+    write = write_laz if Path(path).suffix.lower() == ".laz" else write_las
+    write(path, shape.points, color=shape.color, scalars=scalars, software=_GENERATOR)
 
 
 def _pcd(shape: Shape, path: str | Path, _: Float64) -> None:
@@ -166,4 +167,4 @@ _MESHES: dict[str, _Write] = {
     ".usdz": lambda shape, path, R: write_usdz(path, **shape.turned(R), generator=_GENERATOR),
     ".stl": _stl,
 }
-_CLOUDS: dict[str, _Write] = {".ply": _ply, ".pcd": _pcd, ".las": _las, ".e57": _e57}
+_CLOUDS: dict[str, _Write] = {".ply": _ply, ".pcd": _pcd, ".las": _las, ".laz": _las, ".e57": _e57}

@@ -103,6 +103,14 @@ class Mesh:
             views=self.views[used],
         )
 
+    @property
+    def spacing(self) -> float:
+        """Edge of the squares that two triangles of the mean area make, m."""
+        some = self.faces[:: max(1, -(-len(self.faces) // _MEASURED))]
+        a, b, c = (self.vertices[some[:, k]] for k in range(3))
+        across = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return float(np.sqrt(across.mean(dtype=float))) if len(some) else 0.0
+
     def without_islands(self, least: int) -> Mesh:
         """Return the mesh without its connected pieces of fewer than `least` vertices."""
         if len(self.faces) == 0:

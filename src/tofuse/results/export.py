@@ -23,9 +23,10 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import baked
 from tofuse.fusion.upright import upright
 from tofuse.results.colmap import write_colmap
-from tofuse.results.folder import is_result, settle
+from tofuse.results.folder import TILES, TILESET, is_result, settle
 from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.output import read_run_json
+from tofuse.results.tiles import is_tiles, write_tiles
 
 Float64 = NDArray[np.float64]
 
@@ -71,9 +72,15 @@ class _Result:
         ply = read_ply(path)
         faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
         normals = np.zeros((len(ply), 3), np.float32) if ply.normals is None else ply.normals
-        nothing = np.zeros(len(ply), np.int32)
+        unknown = np.zeros(len(ply))
         return Mesh(
-            ply.points, faces, normals, ply.color, nothing.astype(np.float32), nothing, np.zeros(3)
+            ply.points,
+            faces,
+            normals,
+            ply.color,
+            ply.vertex.get("sigma", unknown).astype(np.float32),
+            ply.vertex.get("views", unknown).astype(np.int32),
+            np.zeros(3),
         )
 
     @cached_property
@@ -185,6 +192,22 @@ def _folder(path: Path) -> Iterator[Path]:
         raise output_error(error, path) from error
 
 
+def _tiles(result: _Result, path: Path) -> None:
+    if len(result.mesh.faces) == 0:
+        raise InputError("holds no triangles to be tiled", where=result.folder / "mesh.ply")
+    folder = path.parent
+    if os.path.lexists(folder):
+        if not is_tiles(folder):
+            raise OutputError(
+                "holds something other than tiles",
+                where=folder,
+                remedy="move it away, or give another --out",
+            )
+        shutil.rmtree(folder, ignore_errors=True)
+    with new_folder(folder) as beside:
+        write_tiles(result.mesh, result.R_up_world, beside)
+
+
 def _kitti(result: _Result, path: Path) -> None:
     write_kitti(path, result.trajectory[1])
 
@@ -197,12 +220,14 @@ def _log(result: _Result, path: Path) -> None:
 FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "pcd": ("cloud.pcd", _cloud),
     "las": ("cloud.las", _cloud),
+    "laz": ("cloud.laz", _cloud),
     "e57": ("cloud.e57", _cloud),
     "glb": ("mesh.glb", _mesh),
     "gltf": ("mesh.gltf", _mesh),
     "obj": ("mesh.obj", _mesh),
     "usdz": ("mesh.usdz", _mesh),
     "stl": ("mesh.stl", _stl),
+    "3dtiles": (f"{TILES}/{TILESET}", _tiles),
     "kitti": ("trajectory.kitti.txt", _kitti),
     "log": ("trajectory.log", _log),
     "nerfstudio": ("nerfstudio", _nerfstudio),

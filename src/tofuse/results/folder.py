@@ -59,11 +59,16 @@ FILES = (
     "rig_trajectory.txt",
     "cloud.pcd",
     "cloud.las",
+    "cloud.laz",
     "cloud.e57",
     "mesh.gltf",
     "trajectory.kitti.txt",
     "trajectory.log",
 )
+# Large surfaces are in tiles, in a folder of their own (`results.tiles`).
+TILES, TILESET = "tiles", "tileset.json"
+_TILES = Names(frozenset({TILESET}), more=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII))
+_WITH_TILES = (re.compile(re.escape(TILES)), _TILES)
 # Components that have a model of their own have it in a folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
 
@@ -91,8 +96,8 @@ class OutputFolder:
     Making one checks everything that can be checked before hours of work: that the folder is
     ours or empty, that nobody else writes into it, and that it can be written.
 
-    What a run puts into place are files, and folders `component-1` and so on, which are moved as a
-    whole. Links are moved as what they are, and never followed.
+    What a run puts into place are files, and folders (`tiles`, `component-1` and so on), which are
+    moved as a whole. Links are moved as what they are, and never followed.
 
     The folder is given back when the result is written; used in a `with`, at the end of its block.
     """
@@ -310,4 +315,7 @@ def component_number(folder: Path) -> int | None:
     return int(folder.name.split("-")[1]) if _COMPONENT.fullmatch(folder.name) else None
 
 
-RESULT = Contract(Names(frozenset(FILES), _COMPONENT), "run.json", is_result)
+_MODEL = Names(frozenset(FILES), (_WITH_TILES,))
+RESULT = Contract(
+    Names(frozenset(FILES), (_WITH_TILES, (_COMPONENT, _MODEL))), "run.json", is_result
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -26,7 +27,8 @@ from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import Suspicion
-from tofuse.results.folder import OutputFolder, component_name, is_result
+from tofuse.results import tiles
+from tofuse.results.folder import TILES, TILESET, OutputFolder, component_name, is_result
 from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
 
 Float64 = NDArray[np.float64]
@@ -75,12 +77,14 @@ def _write_files(
         write_g2o(folder / "pose_graph.g2o", result.graph)
         if report is not None:
             report(result, folder)
-        model.result()
-        text = json.dumps(run_json(result), indent=1, allow_nan=False)
+        text = json.dumps(run_json(result, model.result()), indent=1, allow_nan=False)
         (folder / "run.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _write_model(result: Reconstruction, folder: Path, texture: Textured | None) -> None:
+def _write_model(
+    result: Reconstruction, folder: Path, texture: Textured | None
+) -> tiles.Tiled | None:
+    """Write clouds and surfaces; what there is in tiles, or None if all is in single files."""
     cloud = result.cloud
     write_ply(
         folder / "cloud.ply",
@@ -89,10 +93,14 @@ def _write_model(result: Reconstruction, folder: Path, texture: Textured | None)
         color=cloud.color,
         scalars={"views": cloud.views} | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
     )
+    tiled = None
     if result.mesh is not None:
-        _write_mesh(result.mesh, result, folder, texture)
+        tiled = _write_mesh(result.mesh, result, folder, texture)
+    if tiled is not None and importlib.util.find_spec("lazrs") is not None:
+        cloud.save(folder / "cloud.laz")
     if result.changes:
         _write_changes(result, folder / "changes.ply")
+    return tiled
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:
@@ -108,8 +116,13 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
     )
 
 
-def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None) -> None:
-    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node turns it upright."""
+def _write_mesh(
+    mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None
+) -> tiles.Tiled | None:
+    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node turns it upright.
+
+    Large surfaces are written as tiles as well, and `mesh.glb` is an overview of them.
+    """
     write_ply(
         folder / "mesh.ply",
         mesh.vertices,
@@ -120,17 +133,21 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textu
     )
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
+    tiled = None
+    if len(mesh.faces) > tiles.MOST_FACES:
+        tiled = tiles.write_tiles(mesh, result.T_up_world[:3, :3], folder / TILES)
     if texture is None:
+        shown = mesh if tiled is None else tiled.overview
         write_glb(
             folder / "mesh.glb",
-            mesh.vertices,
-            mesh.faces,
-            normals=mesh.normals,
-            color=None if mesh.color is None else seen_colors(mesh.color),
+            shown.vertices,
+            shown.faces,
+            normals=shown.normals,
+            color=None if shown.color is None else seen_colors(shown.color),
             generator=generator,
             **upright,
         )
-        return
+        return tiled
     atlas, image = texture.atlas, png_bytes(texture.image)
     points, normals = (
         values[atlas.vertices] for values in (texture.mesh.vertices, texture.mesh.normals)
@@ -154,9 +171,10 @@ def _write_mesh(mesh: Mesh, result: Reconstruction, folder: Path, texture: Textu
         uv=atlas.uv,
         texture=image,
     )
+    return tiled
 
 
-def run_json(result: Reconstruction) -> dict[str, Any]:
+def run_json(result: Reconstruction, tiled: tiles.Tiled | None = None) -> dict[str, Any]:
     """Return the content of `run.json`, schema 1: SI units and radians, no NaN (null instead)."""
     d = result.diagnostics
     return plain(
@@ -194,6 +212,7 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
                 for f in d.frames
             ],
             "T_up_world": result.T_up_world,
+            "tiles": _tiles(tiled),
             "components": [_component(c) for c in result.components],
             "sessions": [
                 {
@@ -258,6 +277,19 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
             "filters": {name: {"removed": share} for name, share in d.removed.items()},
         }
     )
+
+
+def _tiles(tiled: tiles.Tiled | None) -> dict[str, Any] | None:
+    """What there is in tiles; `mesh.glb` is an overview then."""
+    if tiled is None:
+        return None
+    return {
+        "tileset": f"{TILES}/{TILESET}",
+        "levels": tiled.levels,
+        "tiles": tiled.tiles,
+        "faces": tiled.faces,
+        "overview_faces": len(tiled.overview.faces),
+    }
 
 
 def _session_of(index: int, result: Reconstruction) -> int | None:

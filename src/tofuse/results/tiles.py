@@ -1,0 +1,135 @@
+"""Surfaces that are too large for one file of a browser: 3D Tiles, and an overview."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse._version import __version__
+from tofuse.files.atomic import make_folder
+from tofuse.files.glb import write_glb
+from tofuse.files.tileset import Tile, write_tileset
+from tofuse.fusion.levels import Level, Place, levels
+from tofuse.fusion.mesh import Mesh
+from tofuse.results.folder import RESULT, TILESET
+
+Float64 = NDArray[np.float64]
+
+# A surface of more triangles is tiled. So many are 110 MB of glTF, all of which has to be there
+# before anything is shown, and about what a laptop's own graphics draw 30 times a second.
+MOST_FACES = 4_000_000
+OVERVIEW_BYTES = 8_000_000
+# Of a vertex: place, normal, colour; and of a triangle: its corners.
+_VERTEX_BYTES, _FACE_BYTES, _HEAD_BYTES = 12 + 12 + 8, 12, 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Tiled:
+    """What has been written.
+
+    Attributes
+    ----------
+    levels, tiles
+        How many there are.
+    faces
+        Triangles of the whole surface.
+    overview
+        The finest level that takes no more than `OVERVIEW_BYTES` as one glTF file.
+    """
+
+    levels: int
+    tiles: int
+    faces: int
+    overview: Mesh
+
+
+def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
+    """Write a surface with faces as tiles with y up, a `tileset.json` and the files beside it.
+
+    Parameters
+    ----------
+    R_up_world
+        (3, 3) from the world into axes with y up; see `upright`.
+    folder
+        Made if it is not there.
+
+    Raises
+    ------
+    OutputError
+        If something can't be written.
+    """
+    make_folder(folder)
+    below: dict[Place, Tile] = {}
+    overview = None
+    number = tiles = 0
+    for level in levels(mesh):
+        number = level.number
+        tiles += len(level.places)
+        below = _tree(_written(level, R_up_world, folder), below, level.error_m)
+        if overview is None and _fits(level.mesh):
+            overview = level.mesh
+        last = level
+    error = last.error_m
+    while len(below) > 1:  # what was put together to nothing has tiles below it all the same
+        number, error = number + 1, 2 * error
+        below = _tree({}, below, error)
+    (root,) = below.values()
+    T = np.eye(4)
+    T[:3, :3] = R_up_world
+    write_tileset(
+        folder / TILESET,
+        root,
+        generator=f"tofuse {__version__}",
+        extras={"T_up_world": T.tolist()},
+    )
+    return Tiled(number + 1, tiles, len(mesh.faces), last.mesh if overview is None else overview)
+
+
+def is_tiles(folder: Path) -> bool:
+    """Say whether it is a folder `tiles` that holds nothing but what `write_tiles` writes."""
+    return RESULT.names.is_whole(folder)
+
+
+def _fits(mesh: Mesh) -> bool:
+    size = _HEAD_BYTES + _VERTEX_BYTES * len(mesh) + _FACE_BYTES * len(mesh.faces)
+    return size <= OVERVIEW_BYTES
+
+
+def _written(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Tile]:
+    """Write the tiles of a level."""
+    out = {}
+    for place, mesh in level.tiles():
+        name = f"{level.number}-{place[0]}-{place[1]}-{place[2]}.glb"
+        points = (mesh.vertices @ R_up_world.T).astype(np.float32)
+        write_glb(
+            folder / name,
+            points,
+            mesh.faces,
+            normals=mesh.normals @ R_up_world.T,
+            color=mesh.color,
+            scalars={"sigma": mesh.sigma, "views": mesh.views},
+            generator=f"tofuse {__version__}",
+        )
+        low, high = points.min(0).astype(float), points.max(0).astype(float)
+        out[place] = Tile(low, high, level.error_m, name, len(mesh.faces))
+    return out
+
+
+def _tree(tiles: dict[Place, Tile], below: dict[Place, Tile], error_m: float) -> dict[Place, Tile]:
+    """Put the tiles of the next finer level below those of a level, each within its box."""
+    for (i, j, k), child in below.items():
+        place = (i // 2, j // 2, k // 2)
+        if place not in tiles:
+            tiles[place] = Tile(child.low, child.high, error_m, None, 0)
+        parent = tiles[place]
+        parent.children.append(child)
+        parent.low = np.minimum(parent.low, child.low)
+        parent.high = np.maximum(parent.high, child.high)
+    for tile in tiles.values():
+        if below and not tile.children:
+            # What moved over a border is in a finer tile beside it: here it only has to go.
+            tile.children.append(Tile(tile.low, tile.high, 0.0, None, 0))
+    return tiles
