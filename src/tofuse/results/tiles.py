@@ -37,7 +37,7 @@ class Tiled:
     faces
         Triangles of the whole surface.
     overview
-        The finest level that takes no more than `OVERVIEW_BYTES` as one glTF file.
+        The surface with fewer triangles, no more than `OVERVIEW_BYTES` as one glTF file.
     """
 
     levels: int
@@ -63,16 +63,15 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
     """
     make_folder(folder)
     below: dict[Place, Tile] = {}
-    overview = None
+    overview = mesh
     number = tiles = 0
     for level in levels(mesh):
         number = level.number
         tiles += len(level.places)
         below = _tree(_written(level, R_up_world, folder), below, level.error_m)
-        if overview is None and _fits(level.mesh):
+        if not _fits(level.mesh):
             overview = level.mesh
-        last = level
-    error = last.error_m
+        error = level.error_m
     while len(below) > 1:  # what was put together to nothing has tiles below it all the same
         number, error = number + 1, 2 * error
         below = _tree({}, below, error)
@@ -85,12 +84,22 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
         generator=f"tofuse {__version__}",
         extras={"T_up_world": T.tolist()},
     )
-    return Tiled(number + 1, tiles, len(mesh.faces), last.mesh if overview is None else overview)
+    return Tiled(number + 1, tiles, len(mesh.faces), _fitting(overview))
 
 
 def is_tiles(folder: Path) -> bool:
     """Say whether it is a folder `tiles` that holds nothing but what `write_tiles` writes."""
     return RESULT.names.is_whole(folder)
+
+
+def _fitting(mesh: Mesh) -> Mesh:
+    """As many triangles as fit into the overview."""
+    faces = float(OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2))
+    fitting = mesh
+    while not _fits(fitting):
+        fitting = mesh.decimated(int(faces))
+        faces *= 0.9
+    return fitting
 
 
 def _fits(mesh: Mesh) -> bool:

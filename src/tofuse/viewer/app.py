@@ -21,6 +21,7 @@ from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result
 from tofuse.viewer.measure import picked
 from tofuse.viewer.result import Bar, Layer, Result, colorings, painted, read_result
+from tofuse.viewer.tiled import TiledSurface
 from tofuse.viewer.tone import before_tone_mapping
 
 if TYPE_CHECKING:
@@ -217,6 +218,11 @@ class ResultView:
 
     def _sent(self, name: str, layer: Layer, colors: UInt8) -> Any:
         scene = self._server.scene
+        if name == "surface" and self._result.tiles is not None:
+            by, up = self._by, self._result.up
+            return TiledSurface(
+                self._server, self._result.tiles, lambda part: painted(part, by, up, layer)[0]
+            )
         if layer.faces is None:
             return scene.add_point_cloud(
                 f"/model/{name}",
@@ -321,7 +327,11 @@ class ResultView:
         with self._lock:
             if not self._measuring:
                 return
-            found = picked(list(self._visible().values()), event.ray_origin, event.ray_direction)
+            layers = self._visible()
+            tiled = self._model.get("surface")
+            if "surface" in layers and isinstance(tiled, TiledSurface):
+                layers["surface"] = tiled.seen_along(event.ray_origin, event.ray_direction)
+            found = picked(list(layers.values()), event.ray_origin, event.ray_direction)
             if found is None:
                 self._measured.content = "No surface there: click the model."
                 return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
+from tofuse.files.glb import read_glb
 from tofuse.files.ply import Ply, read_ply
+from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.mesh import Mesh, seen_colors
 from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
 from tofuse.report.words import length
-from tofuse.results.folder import is_result, settle
+from tofuse.results.folder import TILES, TILESET, is_result, settle
 from tofuse.results.output import main_poses, read_run_json
+from tofuse.viewer.detail import OVERVIEW_FACES, chosen
 from tofuse.viewer.kept import read_kept
 
 Float32 = NDArray[np.float32]
@@ -92,6 +95,75 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
+class TiledLayer:
+    """A surface in tiles, which are read when they are asked for.
+
+    Attributes
+    ----------
+    folder, root
+        Where they are, and their tree.
+    R_up_world
+        (3, 3) from the world into the axes of the tiles.
+    """
+
+    folder: Path
+    root: Tile
+    R_up_world: Float64
+
+    @classmethod
+    def read(cls, folder: Path) -> TiledLayer:
+        """Read the tree of a folder; InputError if it is damaged."""
+        path = folder / TILESET
+        root, extras = read_tileset(path)
+        T = np.array(extras.get("T_up_world", np.eye(4)), float)
+        if T.shape != (4, 4) or not np.isfinite(T).all():
+            raise InputError("has no T_up_world", where=path, remedy="copy the whole folder")
+        return cls(folder, root, T[:3, :3])
+
+    def layer(self, tile: Tile) -> Layer:
+        """Read a tile that has a file, into the world frame."""
+        assert tile.content is not None
+        glb = read_glb(self.folder / tile.content)
+        R = self.R_up_world.astype(np.float32)
+        known = {name: glb.scalars[name].astype(float) for name in glb.scalars}
+        return Layer(
+            glb.points @ R,
+            None if glb.normals is None else glb.normals @ R,
+            glb.faces,
+            glb.color,
+            known.get("sigma"),
+            known.get("views"),
+        )
+
+    def overview(self) -> Layer:
+        """All of it, with few triangles."""
+        return joined([self.layer(tile) for tile in chosen(self.root, None, OVERVIEW_FACES)])
+
+
+def joined(layers: Sequence[Layer]) -> Layer:
+    """Put layers with faces into one; it has what all of them have."""
+
+    def column(values: list[NDArray[Any] | None]) -> Any:
+        known = [each for each in values if each is not None]
+        return np.concatenate(known) if len(known) == len(layers) else None
+
+    firsts = np.cumsum([0] + [len(layer.points) for layer in layers])
+    faces = [
+        layer.faces + np.int32(first)
+        for layer, first in zip(layers, firsts, strict=False)
+        if layer.faces is not None
+    ]
+    return Layer(
+        np.concatenate([layer.points for layer in layers]),
+        column([layer.normals for layer in layers]),
+        np.concatenate(faces),
+        column([layer.color for layer in layers]),
+        column([layer.sigma for layer in layers]),
+        column([layer.views for layer in layers]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
 class Result:
     """A result, as the viewer shows it.
 
@@ -105,6 +177,8 @@ class Result:
         Points as they lay before, or None.
     up
         (3,) unit vector in the world.
+    tiles
+        Of a surface that is too large to be shown at once; `mesh` and `cloud` are an overview then.
     """
 
     folder: Path
@@ -116,6 +190,7 @@ class Result:
     model_before: Layer | None
     pictures: tuple[Pictures, ...]
     up: Float64
+    tiles: TiledLayer | None = None
 
     @property
     def frames(self) -> list[dict[str, Any]]:
@@ -153,10 +228,16 @@ def read_result(folder: Path) -> Result:
     run = read_run_json(folder / "run.json")
     posed, poses = main_poses(folder, run)
     after = dict(zip(posed, poses, strict=True))
-    cloud = Layer.of(read_ply(folder / "cloud.ply"))
-    mesh = None
-    if (folder / "mesh.ply").is_file():
-        mesh = Layer.of(read_ply(folder / "mesh.ply")).simplified(MAX_FACES)
+    tiled = None
+    if run.get("tiles"):
+        tiled = TiledLayer.read(folder / TILES)
+        mesh: Layer | None = tiled.overview()
+        cloud = replace(tiled.overview(), faces=None)
+    else:
+        cloud = Layer.of(read_ply(folder / "cloud.ply"))
+        mesh = None
+        if (folder / "mesh.ply").is_file():
+            mesh = Layer.of(read_ply(folder / "mesh.ply")).simplified(MAX_FACES)
     kept = read_kept(folder)
     model_before = None
     if kept is not None and len(kept.points):
@@ -171,6 +252,7 @@ def read_result(folder: Path) -> Result:
         model_before,
         () if kept is None else kept.pictures,
         _up(run, mesh, poses),
+        tiled,
     )
 
 
@@ -214,34 +296,50 @@ class Bar:
     ticks: tuple[str, str, str]
 
 
-def painted(layer: Layer, by: str, up: Float64) -> tuple[UInt8, Bar | None]:
+def painted(
+    layer: Layer, by: str, up: Float64, scale_of: Layer | None = None
+) -> tuple[UInt8, Bar | None]:
     """Return colours (N, 3) of a layer, and their bar; grey if it has no such values.
+
+    The scale is that of another layer where one is given, of which this one is a part.
 
     Colours of values are exactly those of the bar. The layer's own are shaded, from above and from
     one side, as no light of the page changes them.
     """
     if by == "colour" and layer.color is not None:
         return _shaded(seen_colors(layer.color), layer, up), None
-    if by == "height":
-        return _mapped(layer.points @ up, "Height", length)
-    if by == "accuracy" and layer.sigma is not None:
-        return _mapped(
-            OF_95_PERCENT * layer.sigma, "Accuracy (95 %)", lambda m: f"±{length(m)}", ratio=True
-        )
-    if by == "view count" and layer.views is not None:
-        return _mapped(layer.views, "Number of views", lambda n: f"{n:.0f}")
+    values = _values(layer, by, up)
+    if values is not None:
+        known = None if scale_of is None else _values(scale_of, by, up)
+        return _mapped(values, values if known is None else known, by)
     return np.full((len(layer.points), 3), 170, np.uint8), None
 
 
-def _mapped(
-    values: Float64, label: str, say: Callable[[float], str], *, ratio: bool = False
-) -> tuple[UInt8, Bar]:
-    """Colours of values, by their ratios where these tell more, and the bar."""
-    shown = np.log(np.maximum(values, 1e-6)) if ratio else values
-    good = shown[np.isfinite(shown)]
+def _values(layer: Layer, by: str, up: Float64) -> Float64 | None:
+    """What a layer is coloured by; None if it does not have it."""
+    if by == "height":
+        return np.asarray(layer.points @ up, np.float64)
+    if by == "accuracy" and layer.sigma is not None:
+        return np.asarray(OF_95_PERCENT * layer.sigma, np.float64)
+    return layer.views if by == "view count" else None
+
+
+_LABELS: dict[str, tuple[str, Callable[[float], str]]] = {
+    "height": ("Height", length),
+    "accuracy": ("Accuracy (95 %)", lambda m: f"±{length(m)}"),
+    "view count": ("Number of views", lambda n: f"{n:.0f}"),
+}
+
+
+def _mapped(values: Float64, scale: Float64, by: str) -> tuple[UInt8, Bar]:
+    """Colours of values on the scale of others, and the bar; accuracies by their ratios."""
+    label, say = _LABELS[by]
+    ratio = by == "accuracy"
+    shown, known = (np.log(np.maximum(v, 1e-6)) if ratio else v for v in (values, scale))
+    good = known[np.isfinite(known)]
     low, high = np.percentile(good, [2, 98]).tolist() if len(good) else (0.0, 1.0)
     back: Callable[[float], float] = (lambda v: float(np.exp(v))) if ratio else float
-    zero = low if label == "Height" else 0.0
+    zero = low if by == "height" else 0.0
     ticks = tuple(say(back(v) - zero) for v in (low, (low + high) / 2, high))
     colors = viridis((np.nan_to_num(shown, nan=high) - low) / max(high - low, 1e-9))
     return colors, Bar(label, (ticks[0], ticks[1], ticks[2]))

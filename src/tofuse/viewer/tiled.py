@@ -1,0 +1,204 @@
+"""A surface in tiles on the page: who looks at it gets those that are to be seen from there."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofuse.files.glb import unlit_glb
+from tofuse.geometry.quaternion import to_matrix
+from tofuse.viewer.detail import MOST_FACES, Eye, chosen
+from tofuse.viewer.result import Layer, TiledLayer, joined
+from tofuse.viewer.tone import before_tone_mapping
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, ViserServer
+
+    from tofuse.files.tileset import Tile
+
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+# Something is seen at once, and gets finer.
+_SHARES = (0.1, 0.3, 1.0)
+_SLACK = 0.01  # of a tile's size: a ray that passes by so near still hits it
+
+
+class TiledSurface:
+    """Shows a surface to everybody who opens the page; it can be hidden and removed as a handle."""
+
+    def __init__(
+        self,
+        server: ViserServer,
+        layer: TiledLayer,
+        paint: Callable[[Layer], UInt8],
+        most_faces: int = MOST_FACES,
+    ) -> None:
+        self._server, self._layer, self._paint = server, layer, paint
+        self._most = most_faces
+        self._visible = True
+        self._removed = False
+        self._clients: dict[int, _Client] = {}
+        self._lock = threading.Lock()
+        for client in server.get_clients().values():
+            self._join(client)
+        server.on_client_connect(self._join)
+        server.on_client_disconnect(self._leave)
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self._visible
+
+    @visible.setter
+    def visible(self, value: bool) -> None:
+        self._visible = value
+        for client in self._now():
+            client.show(value)
+
+    def remove(self) -> None:
+        """Take it off all pages."""
+        self._removed = True
+        with self._lock:
+            clients, self._clients = list(self._clients.values()), {}
+        for client in clients:
+            client.stop(remove=True)
+
+    def shown(self) -> list[list[Tile]]:
+        """The tiles on each page."""
+        return [client.tiles() for client in self._now()]
+
+    def seen_along(self, origin: ArrayLike, direction: ArrayLike) -> Layer:
+        """What of the shown tiles a ray passes, in the world frame."""
+        R = self._layer.R_up_world
+        o, d = R @ np.asarray(origin, float), R @ np.asarray(direction, float)
+        hit = {t.content: t for tiles in self.shown() for t in tiles if _passes(t, o, d)}
+        if not hit:
+            nothing = np.zeros((0, 3), np.float32)
+            return Layer(nothing, None, np.zeros((0, 3), np.int32), None, None, None)
+        return joined([self._layer.layer(hit[name]) for name in sorted(hit, key=str)])
+
+    def _now(self) -> list[_Client]:
+        with self._lock:
+            return list(self._clients.values())
+
+    def _join(self, client: ClientHandle) -> None:
+        with self._lock:
+            if self._removed or client.client_id in self._clients:
+                return
+            self._clients[client.client_id] = _Client(
+                client, self._layer, self._paint, self._most, self._visible
+            )
+
+    def _leave(self, client: ClientHandle) -> None:
+        with self._lock:
+            gone = self._clients.pop(client.client_id, None)
+        if gone is not None:
+            gone.stop(remove=False)
+
+
+class _Client:
+    """One page: a thread that follows its camera."""
+
+    def __init__(
+        self,
+        client: ClientHandle,
+        layer: TiledLayer,
+        paint: Callable[[Layer], UInt8],
+        most_faces: int,
+        visible: bool,
+    ) -> None:
+        self._client, self._layer, self._paint, self._most = client, layer, paint, most_faces
+        self._visible = visible
+        self._nodes: dict[str, tuple[Tile, Any]] = {}
+        self._lock = threading.Lock()
+        self._moved = threading.Event()
+        self._stopped = False
+        self._moved.set()
+        client.camera.on_update(lambda _: self._moved.set())
+        threading.Thread(target=self._follow, name="tofuse-tiles", daemon=True).start()
+
+    def tiles(self) -> list[Tile]:
+        """Those that are on the page."""
+        with self._lock:
+            return [tile for tile, _ in self._nodes.values()]
+
+    def show(self, visible: bool) -> None:
+        """Show or hide them."""
+        with self._lock:
+            self._visible = visible
+            for _, node in self._nodes.values():
+                node.visible = visible
+
+    def stop(self, *, remove: bool) -> None:
+        """End the thread."""
+        with self._lock:
+            self._stopped = True
+            if remove:
+                for _, node in self._nodes.values():
+                    node.remove()
+            self._nodes = {}
+        self._moved.set()
+
+    def _follow(self) -> None:
+        while True:
+            self._moved.wait()
+            self._moved.clear()
+            for share in _SHARES:
+                if self._stopped:
+                    return
+                wanted = chosen(self._layer.root, self._eye(), int(share * self._most))
+                self._exchange(wanted)
+                if self._moved.is_set():  # what is missing now is of other places
+                    break
+
+    def _eye(self) -> Eye:
+        camera = self._client.camera
+        R = self._layer.R_up_world
+        turned = R @ to_matrix(np.roll(camera.wxyz, -1))
+        return Eye(
+            R @ camera.position,
+            turned[:, 2],
+            float(camera.fov),
+            float(camera.aspect),
+            int(camera.image_height),
+        )
+
+    def _exchange(self, wanted: list[Tile]) -> None:
+        """Show these tiles and no others; new ones are there before old ones go."""
+        names = {str(tile.content) for tile in wanted}
+        new = [tile for tile in wanted if tile.content not in self._nodes]
+        ready = [(tile, self._packed(tile)) for tile in new]
+        with self._lock, self._client.atomic():
+            if self._stopped:
+                return
+            for tile, data in ready:
+                node = self._client.scene.add_glb(
+                    f"/model/tiles/{tile.content}",
+                    data,
+                    visible=self._visible,
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+                self._nodes[str(tile.content)] = tile, node
+            for name in [name for name in self._nodes if name not in names]:
+                _, node = self._nodes.pop(name)
+                node.remove()
+
+    def _packed(self, tile: Tile) -> bytes:
+        part = self._layer.layer(tile)
+        assert part.faces is not None
+        return unlit_glb(part.points, part.faces, before_tone_mapping(self._paint(part)))
+
+
+def _passes(tile: Tile, origin: Float64, direction: Float64) -> bool:
+    """Whether a ray passes a tile."""
+    slack = _SLACK * float(np.linalg.norm(tile.high - tile.low))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (np.stack([tile.low - slack, tile.high + slack]) - origin) / direction
+    near, far = np.nanmin(ends, 0).max(), np.nanmax(ends, 0).min()
+    return bool(far >= max(near, 0))
