@@ -482,6 +482,25 @@ def test_what_the_camera_errs_is_taken_out_of_images_as_of_points() -> None:
     np.testing.assert_allclose(z, 2.1, atol=0.003)
 
 
+def test_a_builder_keeps_all_clouds_in_so_much_memory() -> None:
+    rng = np.random.default_rng(4)
+    clouds = [replace(CloudFrame.of(rng.normal(size=(4000, 3))), index=k) for k in range(30)]
+    poses = {k: se3.exp(0.1 * rng.normal(size=6)) for k in range(0, 30, 2)}
+    made = []
+    for memory_mb in (600, 1):
+        spill = Spill(memory_mb * 500_000)
+        builder = ModelBuilder(Fusion(voxel_m=0.1, memory_mb=memory_mb), spill)
+        for cloud in clouds:
+            builder.add(cloud, None, 3000)
+        assert builder.views == 30
+        assert (spill.spilled_bytes > 0) == (memory_mb == 1)
+        made += [builder.fuse(poses).cloud, builder.sketch(poses)]
+    for large, small in zip(made[:2], made[2:], strict=True):
+        assert large.points.tobytes() == small.points.tobytes()
+        np.testing.assert_array_equal(large.views, small.views)
+    assert made[0].views.max() > 1
+
+
 def test_clouds_have_no_surface_and_hopeless_images_still_a_cloud() -> None:
     rng = np.random.default_rng(4)
     builder = ModelBuilder(Fusion())

@@ -8,6 +8,7 @@ from typing import overload
 
 from tofuse.files.spill import Spill
 from tofuse.fusion.views import RangeView, without_camera_errors
+from tofuse.recordings.frames import CloudFrame
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,25 @@ class KeptViews(Sequence[RangeView]):
 
     def __iter__(self) -> Iterator[RangeView]:
         return (self._spill.get(number) for number in self._numbers)
+
+
+class KeptClouds:
+    """Clouds in a store, read when they are asked for."""
+
+    def __init__(self, spill: Spill[CloudFrame]) -> None:
+        self._spill = spill
+        self._numbers: list[tuple[int, int]] = []  # of the frame, and in the store
+
+    def add(self, cloud: CloudFrame) -> None:
+        """Keep one more; raises as `KeptViews.add`."""
+        self._numbers.append((cloud.index, self._spill.put(cloud)))
+
+    def of(self, indices: Container[int]) -> Iterator[CloudFrame]:
+        """Those of some frames, one at a time."""
+        return (self._spill.get(number) for index, number in self._numbers if index in indices)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
 
 
 def about(views: Sequence[RangeView]) -> Sequence[About]:

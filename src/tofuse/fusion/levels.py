@@ -73,22 +73,26 @@ def levels(mesh: Mesh) -> Iterator[Level]:
         mesh = mesh.simplified(error)
 
 
-def _cut(
-    number: int, error_m: float, mesh: Mesh, origin: NDArray[np.float64], size: float
-) -> Level:
+def _cut(number: int, error_m: float, mesh: Mesh, origin: Float64, size: float) -> Level:
     """Put each face into the tile of its middle."""
-    middles = sum(mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3)) / 3.0
-    # What moved out by being put together stays with its neighbours.
-    place = np.maximum(np.floor((middles - origin) / size), 0).astype(np.int64)
-    found, tile = np.unique(place, axis=0, return_inverse=True)
-    tile = tile.ravel()
+    key, extents = np.zeros(len(mesh.faces), np.int64), []
+    for axis in range(3):
+        along = mesh.vertices[:, axis].astype(float)
+        a, b, c = mesh.faces.T
+        middle = (along[a] + along[b] + along[c]) / 3
+        # What moved out by being put together stays with its neighbours.
+        place = np.maximum(np.floor((middle - origin[axis]) / size), 0).astype(np.int64)
+        extents.append(int(place.max(initial=0)) + 1)
+        key = key * extents[-1] + place
+    found, counts = np.unique(key, return_counts=True)
+    places = np.stack(np.unravel_index(found, extents), 1).tolist()
     return Level(
         number,
         error_m,
         mesh,
-        np.argsort(tile, kind="stable"),
-        tuple((int(i), int(j), int(k)) for i, j, k in found),
-        np.cumsum(np.bincount(tile, minlength=len(found))),
+        np.argsort(key, kind="stable"),
+        tuple((i, j, k) for i, j, k in places),
+        np.cumsum(counts),
     )
 
 

@@ -191,10 +191,11 @@ class Mesh:
 
     def _groups(self, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Which vertices (N,) are put together, and how many are in each group (G,)."""
-        cell = np.floor(self.vertices.astype(float) / cell_m).astype(np.int64)
-        cell -= cell.min(0)
-        extent = cell.max(0) + 1
-        key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+        key = np.zeros(len(self), np.int64)
+        for along in self.vertices.T:  # one axis at a time takes a third of the memory
+            cell = np.floor(along.astype(float) / cell_m).astype(np.int64)
+            cell -= cell.min()
+            key = key * (cell.max() + 1) + cell
         number = np.empty(len(key), np.int64)
         first = number_keys(key, number)
         order = np.argsort(key[first])
@@ -216,8 +217,8 @@ class Mesh:
         self, group: NDArray[np.intp], count: NDArray[np.intp], faces: Int32, cell_m: float
     ) -> Mesh:
         def mean(values: NDArray[np.generic]) -> Float64:
-            columns = values.reshape(len(values), -1).astype(float).T
-            sums = [np.bincount(group, column, len(count)) for column in columns]
+            columns = values.reshape(len(values), -1).T
+            sums = [np.bincount(group, column.astype(float), len(count)) for column in columns]
             return np.stack(sums, -1).reshape(-1, *values.shape[1:]) / count.reshape(
                 -1, *(1,) * (values.ndim - 1)
             )

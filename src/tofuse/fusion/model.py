@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
-from tofuse.fusion.kept import KeptViews
+from tofuse.fusion.kept import KeptClouds, KeptViews
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.tsdf import fitting_voxel, fuse_surface
@@ -50,16 +51,16 @@ class ModelBuilder:
     options
         How.
     spill
-        Where range images are kept; unless given, half as many bytes of them as there may be of
-        voxels stay in memory.
+        Where views are kept; unless given, half as many bytes of them as there may be of voxels
+        stay in memory.
     """
 
-    def __init__(self, options: Fusion, spill: Spill[RangeView] | None = None) -> None:
+    def __init__(self, options: Fusion, spill: Spill[Any] | None = None) -> None:
         self._options = options
         if spill is None:
             spill = Spill(options.memory_mb * 500_000)
         self._ranges = KeptViews(spill)
-        self._clouds: list[CloudFrame] = []
+        self._clouds = KeptClouds(spill)
         self._bytes = 0
         self._voxel_m = 0.01  # of clouds
 
@@ -74,9 +75,9 @@ class ModelBuilder:
             So many points are kept of a cloud.
         """
         if isinstance(frame, CloudFrame):
-            if not self._clouds:
+            if not len(self._clouds):
                 self._voxel_m = self._options.voxel_m or choose_voxel(frame)
-            self._clouds.append(as_cloud(frame, most_points))
+            self._clouds.add(as_cloud(frame, most_points))
             return
         view = RangeView.of(frame, surface)
         self._ranges.add(view)
@@ -109,11 +110,10 @@ class ModelBuilder:
         errors
             Of the camera, which are taken out; see `Refinement.errors`.
         """
-        if self._clouds or not len(self._ranges):
+        if len(self._clouds) or not len(self._ranges):
             clouds = (
                 replace(c, points=without_errors(c.points, errors)) if errors else c
-                for c in self._clouds
-                if c.index in poses
+                for c in self._clouds.of(poses)
             )
             return Model(self._average(clouds, poses, self._voxel_m, advance), None)
         views = self._ranges.of(poses)
@@ -142,9 +142,8 @@ class ModelBuilder:
 
         Of many images some are taken, evenly, and of each some pixels.
         """
-        if self._clouds:
-            clouds = [c for c in self._clouds if c.index in poses]
-            return self._average(clouds, poses, self._voxel_m)
+        if len(self._clouds):
+            return self._average(self._clouds.of(poses), poses, self._voxel_m)
         ranges = self._ranges.of(poses)
         some = ranges[:: max(1, -(-len(ranges) // _SKETCHED))]
         voxel = self._range_voxel
