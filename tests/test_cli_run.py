@@ -137,6 +137,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "session_pairs",
         "changes",
         "T_up_world",
+        "tiles",
     }
     assert data["schema"] == 1
     opening = data["input"].pop("opening")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError
+from tofuse.files import ply as plys
 from tofuse.files.ply import read_ply, write_ply
 
 CUBE = """ply
@@ -149,3 +150,16 @@ def test_shapes_are_checked_when_writing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="normals"):
         write_ply(tmp_path / "a.ply", np.zeros((2, 3)), normals=np.zeros((3, 3)))
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_written_in_parts_it_has_the_same_bytes(tmp_path: Path, monkeypatch) -> None:
+    rng = np.random.default_rng(0)
+    points, faces = rng.normal(size=(23, 3)), rng.integers(0, 23, (41, 3))
+    more = {"color": rng.integers(0, 256, (23, 3)), "scalars": {"views": np.arange(23)}}
+    write_ply(tmp_path / "a.ply", points, faces=faces, **more)
+    for at_once in (1, 7, 23, 41):
+        monkeypatch.setattr(plys, "_AT_ONCE", at_once)
+        write_ply(tmp_path / "b.ply", points, faces=faces, **more)
+        assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    write_ply(tmp_path / "b.ply", points[:0], faces=faces[:0])
+    assert len(read_ply(tmp_path / "b.ply")) == 0

@@ -66,7 +66,17 @@ def write_glb(
         If the shapes disagree.
     """
     document, body = _document(
-        path, points, faces, normals, color, uv, texture, T_scene_node, scalars or {}, name, generator
+        path,
+        points,
+        faces,
+        normals,
+        color,
+        uv,
+        texture,
+        T_scene_node,
+        scalars or {},
+        name,
+        generator,
     )
     write_bytes(path, *_packed(document, body))
 

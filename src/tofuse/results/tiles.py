@@ -19,7 +19,7 @@ from tofuse.results.folder import RESULT, TILESET
 Float64 = NDArray[np.float64]
 
 # A surface of more triangles is tiled. So many are 110 MB of glTF, all of which has to be there
-# before anything is shown, and about what a laptop's own graphics draw 30 times a second.
+# before anything is shown.
 MOST_FACES = 4_000_000
 OVERVIEW_BYTES = 8_000_000
 # Of a vertex: place, normal, colour; and of a triangle: its corners.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.errors import InputError
 from tofuse.files.glb import unlit_glb
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.viewer.detail import MOST_FACES, Eye, chosen
@@ -152,7 +154,11 @@ class _Client:
                 if self._stopped:
                     return
                 wanted = chosen(self._layer.root, self._eye(), int(share * self._most))
-                self._exchange(wanted)
+                try:
+                    self._exchange(wanted)
+                except InputError as error:  # somebody has changed the folder
+                    print(f"tofuse: {error}", file=sys.stderr, flush=True)
+                    return
                 if self._moved.is_set():  # what is missing now is of other places
                     break
 
