@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -439,7 +440,6 @@ def _by_regions(
     """The surface, one region after the other: the same to the byte as of all of it at once."""
     frusta = Frusta.of(views, poses, _backs(layout.reach_m))
     block_m = EDGE * layout.voxel_m
-    pieces: Spill[Piece] = Spill(0)
     done = 0
 
     def step() -> None:
@@ -448,15 +448,14 @@ def _by_regions(
         if advance is not None and done % len(regions) == 0:
             advance()
 
-    for region in regions:
-        # One more block, as blocks are looked at as balls around them.
-        low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
-        touching = frusta.touching(block_m * low, block_m * high)
-        volume = Volume.of(layout, region)
-        volume.add(views, poses, step, touching)
-        pieces.put(volume.piece(options.min_views))
-        del volume
-    try:
+    store: Spill[Piece] = Spill(0)
+    with closing(store) as pieces:
+        for region in regions:
+            # One more block, as blocks are looked at as balls around them.
+            low, high = np.asarray(region.low - 1, float), np.asarray(region.high + 1, float)
+            touching = frusta.touching(block_m * low, block_m * high)
+            volume = Volume.of(layout, region)
+            volume.add(views, poses, step, touching)
+            pieces.put(volume.piece(options.min_views))
+            del volume
         return stitched(pieces, len(layout.keys), options.island)
-    finally:
-        pieces.close()
