@@ -41,6 +41,15 @@ PLANS: dict[str, object] = {
         "new": {},
         "old": {"run.json": FILE, "component-1": {"../../precious.txt": FILE}},
     },
+    "upwards in tiles": {
+        "new": {},
+        "old": {"run.json": FILE, "tiles": {"../precious.txt": FILE}},
+    },
+    "a foreign file in tiles of a component": {
+        "new": {},
+        "old": {"run.json": FILE, "component-1": {"tiles": {"cloud.ply": FILE}}},
+    },
+    "tiles in tiles": {"new": {}, "old": {"run.json": FILE, "tiles": {"tiles": {}}}},
     "a component elsewhere": {"new": {}, "old": {"run.json": FILE, "component-1/..": {}}},
     "no result replaced": {"new": {}, "old": {"cloud.ply": FILE}},
     "no result made": {"new": {"cloud.ply": FILE}, "old": {}},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from made_results import contents
 from test_files_glb import parse
 from test_report_html import make_room
 from tofuse.errors import InputError, OutputError
@@ -22,8 +24,10 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.geometry import se3
 from tofuse.results import tiles
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.folder import STAGING, OutputFolder, settle
+from tofuse.results.output import write_result
 from tofuse.results.tiles import Tiled, is_tiles, write_tiles
+from tofuse.results.types import Component
 
 N = 180
 
@@ -325,8 +329,6 @@ def test_a_component_may_be_tiled_as_well(tmp_path, small_limits) -> None:
     own = replace(result, mesh=waves())
     first = replace(result.components[0], result=None) if result.components else None
     if first is None:
-        from tofuse.results.types import Component
-
         first = Component(((0, 9),), np.eye(4), None, None)
     apart = replace(first, T_main_component=None, result=own)
     both = replace(result, mesh=waves(10), components=(first, apart))
@@ -338,6 +340,40 @@ def test_a_component_may_be_tiled_as_well(tmp_path, small_limits) -> None:
     (out / "component-1" / "tiles" / "more.glb").write_text("")
     with pytest.raises(OutputError, match="component-1"):
         OutputFolder(out, overwrite=True)
+
+
+@pytest.mark.parametrize("stopped_at", [0, 1, 3, 6, 12])
+def test_moves_that_were_stopped_are_finished_with_all_tiles(
+    tmp_path, small_limits, monkeypatch, stopped_at
+) -> None:
+    """Nothing is half of one result and half of another, tiles of a component included."""
+    first, _ = make_room()
+    apart = Component(((0, 9),), None, None, replace(first, mesh=waves(90)))
+    main = Component(((10, 23),), np.eye(4), None, None)
+    second = replace(first, mesh=waves(), components=(main, apart), seed=3)
+    out = tmp_path / "out"
+    write_result(replace(first, mesh=waves(100)), OutputFolder(out))
+    before = sorted(contents(out).items())
+    moves = 0
+    move = os.replace
+
+    def cut_off(a, b):
+        nonlocal moves
+        if Path(b).parent in (out, out / STAGING / "replaced"):
+            if moves >= stopped_at:
+                raise OSError("power")
+            moves += 1
+        move(a, b)
+
+    monkeypatch.setattr(os, "replace", cut_off)
+    with pytest.raises(OutputError):
+        write_result(second, OutputFolder(out, overwrite=True))
+    monkeypatch.setattr(os, "replace", move)
+    settle(out)
+    assert sorted(contents(out).items()) == before
+    write_result(second, OutputFolder(out, overwrite=True))
+    assert is_tiles(out / "component-1" / "tiles")
+    assert is_tiles(out / "tiles")
 
 
 def test_the_overview_is_as_fine_as_fits(tmp_path, small_limits) -> None:

@@ -19,7 +19,8 @@ from tofuse.files.tileset import Tile
 from tofuse.fusion import levels as detail
 from tofuse.report.pictures import draw
 from tofuse.results import tiles
-from tofuse.results.output import OutputFolder, write_result
+from tofuse.results.folder import OutputFolder
+from tofuse.results.output import write_result
 from tofuse.viewer.detail import Eye, chosen
 from tofuse.viewer.kept import NAME, write_kept
 from tofuse.viewer.result import TiledLayer, painted, read_result

@@ -287,11 +287,12 @@ def _check(path: Path, mark: Mark, names: Names) -> None:
         raise _UntrueError(f"{path.name} is not what it was")
 
 
-def _same(a: Mark, b: Mark) -> bool:
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict) and isinstance(b, dict):
+        return set(a) == set(b) and all(_same(a[name], b[name]) for name in a)
     if isinstance(a, dict) or isinstance(b, dict):
-        both = isinstance(a, dict) and isinstance(b, dict) and set(a) == set(b)
-        return both and all(_same(a[name], b[name]) for name in a)
-    return a[:2] == b[:2] and abs(a[2] - b[2]) <= _SAME_TIME_S
+        return False
+    return bool(a[:2] == b[:2] and abs(a[2] - b[2]) <= _SAME_TIME_S)
 
 
 def check_replaceable(path: Path, names: Names) -> None:
