@@ -55,7 +55,7 @@ _ROOMS = (
     "sensor",
 )
 _KINDS = "biufcSU"  # of arrays
-# How names of arrays begin that are pieces of a temporary file, which may be larger than memory.
+# How names of arrays begin that are pieces of a temporary file, of which memory may not hold all.
 PIECE = "piece-"
 _SMALL = 1 << 14  # bytes; smaller arrays of a type lie in one
 
