@@ -12,6 +12,7 @@ from test_fusion_tsdf import CAMERA, EYE, around_a_ball, frame_of, look, plane_r
 from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
 from tofuse.fusion.layout import Layout
+from tofuse.fusion.model import ModelBuilder
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.stitching import Piece, stitched
 from tofuse.fusion.tsdf import Volume, _backs, fuse_surface
@@ -19,6 +20,7 @@ from tofuse.fusion.views import RangeView
 from tofuse.kernels import tsdf
 from tofuse.kernels.blocks import EDGE, block_key, block_of
 from tofuse.kernels.threads import threads
+from tofuse.pipeline.states import decode, encode
 
 COLUMNS = ("vertices", "faces", "normals", "color", "sigma", "views")
 
@@ -199,3 +201,17 @@ def test_counts_stop_at_what_they_hold() -> None:
     volume.seen[near] = tsdf.MOST_SEEN
     volume.add([view], EYE[None])
     assert (volume.seen[near] == tsdf.MOST_SEEN).all()
+
+
+@pytest.mark.parametrize("memory_mb", [1, 600])
+def test_what_is_on_disk_comes_back_with_a_state_of_the_run(room, memory_mb) -> None:
+    _, poses = room
+    builder = ModelBuilder(Fusion(voxel_m=0.05, memory_mb=memory_mb))
+    for k, T in enumerate(poses):
+        builder.add(seen(T, k), None, 1000)
+    nodes, arrays = encode(builder)
+    again = decode(nodes, {name: np.asarray(array) for name, array in arrays.items()})
+    made = [each.fuse(dict(enumerate(poses))).mesh for each in (builder, again)]
+    same(*made)
+    again.add(seen(poses[0], len(poses)), None, 1000)
+    assert again.views == len(poses) + 1

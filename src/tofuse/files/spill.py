@@ -199,7 +199,8 @@ class Spill(Generic[T]):
                 item = type(item)(**(fields | own))
             self._last = arrays
             number, self._next = self._next, self._next + 1
-            empty = {name: np.empty((0,) * a.ndim, a.dtype) for name, a in own.items()}
+            # Of as many columns: items may look at that when they are made.
+            empty = {n: np.empty((0, *a.shape[1:])[: a.ndim], a.dtype) for n, a in own.items()}
             self._entries[number] = _Entry(
                 type(item)(**(fields | empty)),
                 {name: a.shape for name, a in own.items()},

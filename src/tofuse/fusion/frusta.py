@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.fusion.views import RangeView
+from tofuse.fusion.kept import Views
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import farthest_told
@@ -39,7 +38,7 @@ class Frusta:
     far: Float64
 
     @classmethod
-    def of(cls, views: Sequence[RangeView], poses: Float64, backs: Float32) -> Frusta:
+    def of(cls, views: Views, poses: Float64, backs: Float32) -> Frusta:
         """Look at views at their poses (N, 4, 4); `backs` as for `farthest_told`."""
         spans, far = np.empty((len(views), 4)), np.empty(len(views))
 

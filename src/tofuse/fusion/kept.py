@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Protocol
 
 from tofuse.files.spill import Spill
 from tofuse.fusion.views import RangeView, without_camera_errors
@@ -33,7 +33,17 @@ class About:
         return cls(view.index, view.depth, view.pitch, view.sigma_m, view.channels)
 
 
-class KeptViews(Sequence[RangeView]):
+class Views(Protocol):
+    """Views by their place: a list of them, or those of a store."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, which: int, /) -> RangeView: ...
+
+    def __iter__(self) -> Iterator[RangeView]: ...
+
+
+class KeptViews:
     """Views in a store, read when they are asked for.
 
     Attributes
@@ -83,15 +93,7 @@ class KeptViews(Sequence[RangeView]):
     def __len__(self) -> int:
         return len(self._numbers)
 
-    @overload
-    def __getitem__(self, which: int) -> RangeView: ...
-
-    @overload
-    def __getitem__(self, which: slice) -> list[RangeView]: ...
-
-    def __getitem__(self, which: int | slice) -> RangeView | list[RangeView]:
-        if isinstance(which, slice):
-            return [self._spill.get(number) for number in self._numbers[which]]
+    def __getitem__(self, which: int, /) -> RangeView:
         return self._spill.get(self._numbers[which])
 
     def __iter__(self) -> Iterator[RangeView]:
@@ -117,6 +119,6 @@ class KeptClouds:
         return len(self._numbers)
 
 
-def about(views: Sequence[RangeView]) -> Sequence[About]:
+def about(views: Views) -> Sequence[About]:
     """What is asked of all views at once, without reading those that are on disk."""
     return views.about if isinstance(views, KeptViews) else [About.of(view) for view in views]

@@ -9,13 +9,12 @@ would be, were all blocks fused at once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.fusion.kept import about
+from tofuse.fusion.kept import Views, about
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.views import RangeView
 from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, enter
@@ -84,9 +83,7 @@ class Layout:
     turns: int
 
     @classmethod
-    def of(
-        cls, views: Sequence[RangeView], poses: Float64, voxel_m: float, options: Fusion
-    ) -> Layout:
+    def of(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Layout:
         """Lay out the blocks near the surfaces of views at their poses (N, 4, 4)."""
         known = about(views)
         noise = [each.sigma_m for each in known if each.sigma_m > 0]
@@ -162,9 +159,7 @@ def _with_layer(own: Int64, around: Int64, places: Int32) -> Region:
     return Region(np.concatenate([own, np.setdiff1d(within, own)]), len(own), low, high)
 
 
-def _touched(
-    views: Sequence[RangeView], poses: Float64, block_m: float, reach: float, turns: int
-) -> Int64:
+def _touched(views: Views, poses: Float64, block_m: float, reach: float, turns: int) -> Int64:
     """Keys of the blocks near surfaces, ascending."""
 
     def touched(start: int, stop: int) -> Int64:

@@ -145,9 +145,9 @@ class ModelBuilder:
         if len(self._clouds):
             return self._average(self._clouds.of(poses), poses, self._voxel_m)
         ranges = self._ranges.of(poses)
-        some = ranges[:: max(1, -(-len(ranges) // _SKETCHED))]
+        some = range(0, len(ranges), max(1, -(-len(ranges) // _SKETCHED)))
         voxel = self._range_voxel
-        sketched = [view.as_cloud(_SKETCHED_PIXELS) for view in some]
+        sketched = (ranges[k].as_cloud(_SKETCHED_PIXELS) for k in some)
         return self._average(sketched, poses, voxel, normals=False)
 
     @property

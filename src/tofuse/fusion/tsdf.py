@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
-from tofuse.fusion.kept import about
+from tofuse.fusion.kept import Views, about
 from tofuse.fusion.layout import OF_CUBES, REACH_SIGMAS, Layout, Region, near
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
@@ -37,7 +37,7 @@ _LINEAR_NODES = 2.0
 _KNOWN = 2.0  # voxels: the largest standard deviation of a surface
 
 
-def fitting_voxel(views: Sequence[RangeView]) -> float:
+def fitting_voxel(views: Views) -> float:
     """Return a voxel edge in m that fits the sensor and the scene: 2 mm to 10 cm."""
     seen = [each for each in about(views) if each.depth > 0]
     if not seen:
@@ -88,9 +88,7 @@ class Volume:
         return index_of(self.keys)
 
     @classmethod
-    def around(
-        cls, views: Sequence[RangeView], poses: Float64, voxel_m: float, options: Fusion
-    ) -> Volume:
+    def around(cls, views: Views, poses: Float64, voxel_m: float, options: Fusion) -> Volume:
         """Lay out all blocks near the surfaces of views at their poses (N, 4, 4), all empty."""
         layout = Layout.of(views, poses, voxel_m, options)
         return cls.of(layout, layout.whole())
@@ -115,7 +113,7 @@ class Volume:
 
     def add(
         self,
-        views: Sequence[RangeView],
+        views: Views,
         poses: Float64,
         advance: Callable[[], None] | None = None,
         touching: NDArray[np.bool_] | None = None,
@@ -146,7 +144,7 @@ class Volume:
         flush()
         self.added += len(views)
 
-    def _add(self, views: Sequence[RangeView], poses: Float64, numbers: Int64) -> None:
+    def _add(self, views: Views, poses: Float64, numbers: Int64) -> None:
         """Add a few views of one camera at once: a block is then fetched once for all of them.
 
         `numbers` (N,) are theirs among all views.
@@ -396,7 +394,7 @@ def _straight_nodes(lookup: Float32) -> float:
 
 
 def fuse_surface(
-    views: Sequence[RangeView],
+    views: Views,
     poses: Float64,
     options: Fusion | None = None,
     advance: Callable[[], None] | None = None,
@@ -432,7 +430,7 @@ def fuse_surface(
 def _by_regions(
     layout: Layout,
     regions: Sequence[Region],
-    views: Sequence[RangeView],
+    views: Views,
     poses: Float64,
     options: Fusion,
     advance: Callable[[], None] | None,
