@@ -19,13 +19,16 @@ import pytest
 import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
+from tofuse.files import spill as spill_module
 from tofuse.files.arrays import read_npz, write_npz
+from tofuse.files.spill import Spill
 from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, Stages, digest
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.states import StateError, decode, encode, known_types
 from tofuse.results.folder import CHECKPOINT, STAGING
 from tofuse.results.output import run_json
+from tofuse.results.samples import FrameSample
 from tofuse.results.types import FrameRecord
 from tofuse.simulation.record import simulate
 
@@ -505,3 +508,32 @@ def test_a_full_disk_leaves_what_was_there(room_recording: Path, tmp_path: Path)
     assert "can't be written (file too large)" in done.stderr.lower()
     assert done.stderr.count("\n") == 1
     assert os.listdir(out) == ["run.json"]
+
+
+def test_what_is_on_disk_is_kept_piece_by_piece(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spill_module, "_PIECE", 1500)
+    spill: Spill[FrameSample] = Spill(2000, tmp_path)
+    rng = np.random.default_rng(0)
+    depths = [rng.random((30, 20)).astype(np.float16) for _ in range(8)]
+    for k, depth in enumerate(depths):
+        fate = np.zeros(depth.shape, np.uint8)
+        spill.put(FrameSample(k, depth, fate, depth.astype(np.float32), None))
+    assert spill.spilled_bytes > 5 * 1500
+    states = Checkpoints(tmp_path / "out", "key", print)
+    states.begin(fresh=True)
+    states.save("stage", {"both": [spill, spill]})
+    back = Checkpoints(tmp_path / "out", "key", print).load("stage")["both"]
+    assert back[0] is back[1]
+    spill.close()
+    for k, depth in enumerate(depths):
+        np.testing.assert_array_equal(back[0].get(k).depth, depth)
+        assert back[0].get(k).color is None
+    path = tmp_path / "out" / CHECKPOINT / "stage.state"
+    data = bytearray(path.read_bytes())
+    data[data.index(depths[0].tobytes()[:50])] ^= 1
+    path.write_bytes(data)
+    said: list[str] = []
+    assert Checkpoints(tmp_path / "out", "key", said.append).load("stage") is None
+    assert "damaged" in said[0]

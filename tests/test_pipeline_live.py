@@ -15,13 +15,15 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.base import Step, Tracker
 from tofuse.pipeline.config import from_method
-from tofuse.pipeline.live import DELAY, LiveLoops
+from tofuse.pipeline.frame_log import FrameLog
+from tofuse.pipeline.live import DELAY, LiveLoops, LivePoses
 from tofuse.pipeline.mapper import Mapper
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import ClosedLoop
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.posegraph.revisits import Revisits
 from tofuse.registration.base import Registration
+from tofuse.results.types import FrameRecord
 
 COUNT = 24
 SMALL = se3.exp(se3.log(DRIFT) / 2)
@@ -146,3 +148,29 @@ def test_an_error_in_a_job_is_not_swallowed():
     assert not any(loops.step() for _ in range(DELAY - 1))
     with pytest.raises(ZeroDivisionError):
         loops.step()
+
+
+class _AlwaysClosing:
+    """Loops of which every look finds one."""
+
+    points: ClassVar[bool] = False
+
+    def look(self):
+        record = LoopRecord(0, 1, True, "")
+        return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
+
+
+def test_the_graph_is_solved_less_often_the_longer_it_is():
+    live, log = LivePoses(_AlwaysClosing()), FrameLog()
+    solved = []
+    for k in range(3000):
+        step = Step("tracked", "", np.eye(4))
+        log.add(FrameRecord(k, float(k), "tracked", ""), step)
+        if live.follow(step, log):
+            solved.append(k)
+    live.finish()
+    gaps = np.diff(solved)
+    # Of up to a thousand frames every loop counts when it is due.
+    assert (gaps[: np.searchsorted(solved, 900)] == DELAY).all()
+    assert (gaps >= 0.01 * np.array(solved[1:])).all()
+    assert gaps[-1] <= 40

@@ -24,6 +24,7 @@ from tofuse.posegraph.accuracy import (
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate_recording
@@ -124,7 +125,9 @@ def test_what_a_pair_sees_decides(view, degenerate) -> None:
     surface = flat_wall() if view == "wall" else surface_of_corner()
     steps = [Measured(0, 1, np.eye(4), np.eye(6) * 1e6)]
     graph = build_graph([0, 1], np.tile(np.eye(4), (2, 1, 1)), steps)
-    (found,) = degenerate_directions(graph, {1: X}, (), {0: surface, 1: surface})
+    (found,) = degenerate_directions(
+        graph, {1: X}, (), dict.fromkeys((0, 1), PosedView(surface, np.eye(4)))
+    )
     assert (len(found) > 0) == degenerate
 
 

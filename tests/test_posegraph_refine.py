@@ -219,7 +219,7 @@ def test_a_view_that_loses_support_stays_with_its_neighbours():
 
 def test_the_store_never_holds_more_than_it_may():
     view = surfaces(path(1))[0]
-    store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10))
+    store = ViewStore(Spacing(angle=0.01, distance=0.01, most=10, loosest=1e6))
     for k in range(400):
         store.push(replace(view, index=k), se3.exp(np.array([0.05 * k, 0, 0, 0, 0, 0])))
         assert len(store.views) <= 10

@@ -11,6 +11,7 @@ from test_kernels_refinement import corner
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph import revisits
+from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing, ViewStore
@@ -170,3 +171,31 @@ def test_searched_loops_are_believed_or_agree(turn, monkeypatch, probable, wrong
 def test_options_are_checked(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Revisits(**options)
+
+
+def test_loops_are_looked_for_again_where_views_have_moved(turn):
+    frames, truth, start = turn
+    # Drift that bends the path so far that no candidate is left.
+    far = [truth[0]]
+    bend = se3.exp(5 * se3.log(DRIFT))
+    for k in range(1, len(truth)):
+        far.append(far[-1] @ se3.inverse(truth[k - 1]) @ truth[k] @ bend)
+    store = ViewStore(ALL)
+    loops = Revisits(spacing=ALL, searches=0, appearance=Appearance(most=0)).start(0, (), store)
+    for frame, T in zip(frames, far, strict=True):
+        store.push(surface_map(frame, SurfaceOptions(radii=(2,))), T)
+        loops.push(frame, T)
+    unsure = {f.index: np.zeros((6, 6)) for f in frames}
+
+    def accepted(poses):
+        known = {f.index: T for f, T in zip(frames, poses, strict=True)}
+        return {(c.record.i, c.record.j) for c in loops.finish(known, unsure) if c.record.accepted}
+
+    first = accepted(far)
+    assert (0, 12) not in first
+    assert not loops.look_again(dict(enumerate(far)))
+    assert loops.look_again(dict(enumerate(start)))
+    again = accepted(start)
+    assert again >= first
+    assert any(i == 0 and j >= 11 for i, j in again)
+    assert not loops.many

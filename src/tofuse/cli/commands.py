@@ -83,6 +83,7 @@ def run_options(arguments: argparse.Namespace) -> Options:
         texture=arguments.texture,
         faces=arguments.faces,
         voxel=arguments.voxel,
+        memory=arguments.memory,
         overwrite=arguments.overwrite,
     )
 

@@ -213,6 +213,12 @@ def _run(commands: Any) -> None:
         help="resolution of the model, e.g. 5mm (default: from the camera's resolution)",
     )
     p.add_argument(
+        "--memory",
+        type=_bytes,
+        metavar="SIZE",
+        help="what to hold in memory at most, about, as 4GB; the rest goes to disk (2GB)",
+    )
+    p.add_argument(
         "--rig",
         type=Path,
         metavar="FILE",

@@ -44,6 +44,9 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 from tofuse.results.verdict import ranked
 
+# So many times loops of a long path are looked for again.
+_LOOKS = 2
+
 T = TypeVar("T")
 
 Float64 = NDArray[np.float64]
@@ -170,8 +173,8 @@ class BackEnd:
             # Where the camera may be: the motion there need not be like that of other stretches.
             wary = self.graph((), cautious=True) if self._unobservable else tracked
             unsure = dict(zip(wary.ids.tolist(), pose_covariances(wary), strict=True))
-            found = self._kept.loops.finish(self._poses, unsure)
-            loops = with_joins(found, self._joins)
+            loops = with_joins(self._kept.loops.finish(self._poses, unsure), self._joins)
+            loops = self._closed_again(loops)
             graph = self.graph(loops)
         sequential = led = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
@@ -194,6 +197,24 @@ class BackEnd:
             seen = self.graph(loops).with_poses(graph.poses)
             judged = Judged(led, replace(optimisation, graph=seen))
         return Closed(loops, sequential, optimisation, told, judged)
+
+    def _closed_again(self, loops: list[ClosedLoop]) -> list[ClosedLoop]:
+        """Look for loops again where those that were found move views that others are between.
+
+        A long path drifts by more than a loop may be off, and is right in its middle once its ends
+        are joined.
+        """
+        for _ in range(_LOOKS if self._kept.loops.many else 0):
+            graph = self.graph(loops)
+            if not graph.loop.any():
+                break
+            graph = without_left_out(self._config.optimiser.optimise(graph)).graph
+            poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
+            if not self._kept.loops.look_again(poses):
+                break
+            unsure = dict(zip(graph.ids.tolist(), pose_covariances(graph), strict=True))
+            loops = with_joins(self._kept.loops.finish(poses, unsure), self._joins)
+        return loops
 
     def _refine(self, closed: Closed) -> Refined:
         graph = closed.optimisation.graph
@@ -384,7 +405,7 @@ class BackEnd:
             for e in self._posed
             if e.step is not None and e.step.reference is not None
         }
-        views = {v.index: v.view for v in self._kept.views.of(self._poses)}
+        views = {v.index: v for v in self._kept.views.of(self._poses)}
         directions = degenerate_directions(graph, self._unobservable, own, views)
         return without_degenerate(graph, directions, bridges)
 

@@ -62,6 +62,9 @@ class Config:
     tolerance_m
         A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
         of the model's diagonal, at least 1 cm.
+    memory_mb
+        What a run may hold in memory, about; `pipeline.budget` divides it. What is more is kept on
+        disk until it is asked for.
     """
 
     method: str
@@ -77,10 +80,13 @@ class Config:
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True
     tolerance_m: float | None = None
+    memory_mb: int = 2000
 
     def __post_init__(self) -> None:
         if self.tolerance_m is not None and not 0 < self.tolerance_m < np.inf:
             raise ValueError(f"tolerance_m is {self.tolerance_m}, not above 0")
+        if not 500 <= self.memory_mb <= 10_000_000:
+            raise ValueError(f"memory_mb is {self.memory_mb}, not 500 or more")
 
     @property
     def window(self) -> int:

@@ -24,6 +24,9 @@ Float64 = NDArray[np.float64]
 # A job begins at one frame and counts this many frames later, however soon it was done: the poses
 # are then the same on every machine. A slow machine waits there.
 DELAY = 10
+# The graph is solved anew at the earliest after this fraction of the frames that it has, so that
+# what a frame costs does not grow with those before it.
+_LATER = 0.01
 
 
 class LiveLoops:
@@ -93,6 +96,9 @@ class LivePoses:
     def __init__(self, loops: Loops) -> None:
         self._loops = LiveLoops(loops)
         self._component = 0
+        self._waiting = False  # loops that count, but have moved nothing yet
+        self._since = 0  # frames of this component since the graph was solved
+        self._size = 0  # frames of this component
         # Of the components that are connected to the first one, and what loops that closed on the
         # way have moved in the present one.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
@@ -102,10 +108,16 @@ class LivePoses:
         """Take the next frame; returns the loops of its component if new ones count now."""
         if step.component != self._component:
             self._component, self._T_closed_tracked = step.component, np.eye(4)
+            self._waiting, self._since, self._size = False, 0, 0
         for link in step.links:
             self._connect(link, log)
-        if step.T_component_camera is None or not self._loops.step():
+        if step.T_component_camera is None:
             return []
+        self._size, self._since = self._size + 1, self._since + 1
+        self._waiting |= self._loops.step()
+        if not self._waiting or self._since < _LATER * self._size:
+            return []
+        self._waiting, self._since = False, 0
         here = {e.record.index for e in log.of_component(step.component).posed}
         return [c for c in self._loops.closed if {c.record.i, c.record.j} <= here]
 

@@ -8,12 +8,14 @@ from functools import partial
 import numpy as np
 
 from tofuse.evaluation.sightings import whole
+from tofuse.files.spill import Scratch
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.pipeline.backend import Kept
+from tofuse.pipeline.budget import views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import Ready
 from tofuse.posegraph.loops import GivenLoop
@@ -42,7 +44,8 @@ class Observations:
 
     def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
         ends = [frame for loop in given for frame in (loop.i, loop.j)]
-        self.views: ViewStore[SurfaceMap] = ViewStore(Spacing(), always=ends)
+        scratch = Scratch(views_bytes(config.memory_mb))
+        self.views: ViewStore[SurfaceMap] = ViewStore(Spacing(), always=ends, scratch=scratch)
         self.loops = config.loops.start(seed, given, self.views)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)
@@ -62,7 +65,7 @@ class Observations:
             # Only who looks at surfaces states errors that can be relied on; ICP's are too small.
             self._knows_errors = True
             if self.views.wants(surface.index, surface.depth, T, step.component):
-                self.views.push(surface.thinned(_COLUMNS), T, step.component)
+                self.views.push(surface.thinned(_COLUMNS).bare(), T, step.component)
         view: Frame = ready.clean
         # Who looks at surfaces leaves the points alone, which take long to make.
         if surface is None or self.loops.points or self._refiner.points:

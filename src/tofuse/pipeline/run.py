@@ -17,6 +17,7 @@ from tofuse.filters.unwrap import Unwrap, wrapped_light
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of
+from tofuse.pipeline.budget import voxels_mb
 from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.judging import device_sentence
@@ -81,6 +82,7 @@ class Options:
     texture: bool = False
     faces: int | None = None
     voxel: float | None = None
+    memory: int | None = None
     overwrite: bool = False
 
 
@@ -269,6 +271,10 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         config = changed(config, {"fusion": {"faces": options.faces}}, where="--faces")
     if options.voxel is not None:
         config = changed(config, {"fusion": {"voxel_m": options.voxel}}, where="--voxel")
+    if options.memory is not None:
+        megabytes = options.memory // 1_000_000
+        divided = {"memory_mb": megabytes, "fusion": {"memory_mb": voxels_mb(megabytes)}}
+        config = changed(config, divided, where="--memory")
     if options.tolerance is not None:
         config = changed(config, {"tolerance_m": options.tolerance}, where="--tolerance")
     front: list[dict[str, Any]] = []

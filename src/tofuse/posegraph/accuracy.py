@@ -21,6 +21,7 @@ from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.trust import joint_covariance, pose_covariances
+from tofuse.posegraph.views import PosedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
 
 Float64 = NDArray[np.float64]
@@ -115,7 +116,7 @@ def degenerate_directions(
     graph: PoseGraph,
     unobservable: Mapping[int, Float64],
     own: Collection[tuple[int, int]],
-    views: Mapping[int, SurfaceMap],
+    views: Mapping[int, PosedView[SurfaceMap]],
 ) -> list[Float64]:
     """For every edge the directions that it does not measure: (k, 6), right perturbations of j.
 
@@ -141,7 +142,8 @@ def degenerate_directions(
         if (i, j) in own:
             found = unobservable.get(j, _NONE)
         elif len(known) and i in views and j in views:
-            aligned = align(views[j], [Target(views[i], np.eye(4))], T_i_j, _ALIGNMENT)
+            target = [Target(views[i].view.bare(), np.eye(4))]
+            aligned = align(views[j].view.bare(), target, T_i_j, _ALIGNMENT)
             found = aligned.unobservable * UNITS
         # A direction is known to some degrees only, and what is left of it would still look
         # measured: where a pair is degenerate, so it is in all that its views were.

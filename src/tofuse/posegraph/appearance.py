@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.registration.likeness import mutual_unlikeness
+from tofuse.registration.likeness import (
+    alike,
+    mutual_unlikeness,
+    unlikeness,
+    unlikeness_of_pairs,
+)
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -17,6 +22,9 @@ Float64 = NDArray[np.float64]
 # Of pairs of nearly the same views (this many positions off either way) so many are taken: two can
 # confirm each other, and more would take the place of other loops.
 _BESIDE, _TOGETHER = 3, 2
+# Of up to so many views every two are compared. Of more, so many in between are asked whether the
+# camera left.
+_ALL, _BETWEEN = 512, 64
 # How far apart views that look alike may stand: rad, and share of the depth.
 ALIKE = 0.35
 # The trajectory may be off by so many of its standard deviations.
@@ -82,6 +90,17 @@ class Appearance:
         refused: list[tuple[int, int]] = []
         if self.most == 0 or len(looks) < 3:
             return chosen, refused
+        for _, i, j in self._most_alike(looks):
+            mine = chosen if possible(i, j) else refused
+            full = len(mine) >= self.most or _beside(i, j, mine) >= _TOGETHER
+            if not full and not _beside(i, j, known):
+                mine.append((i, j))
+        return chosen, refused
+
+    def _most_alike(self, looks: Sequence[Float32]) -> list[tuple[float, int, int]]:
+        """How much views i < j differ that look alike, though the camera left in between."""
+        if len(looks) > _ALL:
+            return self._most_alike_of_many(np.stack(looks))
         far = mutual_unlikeness(looks, self.shift)
         away = far >= self.left
         found = [
@@ -90,17 +109,29 @@ class Appearance:
             for i in np.flatnonzero(far[: j - 1, j] <= self.unlike)
             if (away[i, i + 1 : j] & away[i + 1 : j, j]).any()
         ]
-        for _, i, j in sorted(found):
-            mine = chosen if possible(i, j) else refused
-            full = len(mine) >= self.most or _beside(i, j, mine) >= _TOGETHER
-            if not full and not _beside(i, j, known):
-                mine.append((i, j))
-        return chosen, refused
+        return sorted(found)
+
+    def _most_alike_of_many(self, looks: Float32) -> list[tuple[float, int, int]]:
+        """The same by an index: each view is compared with those that are likely to be like it."""
+        i, j = alike(looks, self.shift)
+        far = unlikeness_of_pairs(looks, i, j, self.shift)
+        found = []
+        for k in np.lexsort((j, i, far)):
+            if far[k] > self.unlike:
+                break
+            a, b = int(i[k]), int(j[k])
+            between = np.unique(np.linspace(a + 1, b - 1, min(b - a - 1, _BETWEEN)).round())
+            some = looks[between.astype(np.intp)]
+            left = unlikeness(looks[a], some, self.shift) >= self.left
+            if (left & (unlikeness(looks[b], some, self.shift) >= self.left)).any():
+                found.append((float(far[k]), a, b))
+        return found
 
     def plausible(
         self,
         between: Float64,
-        path: Float64,
+        length: float,
+        turned: float,
         depth: float,
         covariance: Float64 | None = None,
         unsure: float = 0.0,
@@ -111,8 +142,8 @@ class Appearance:
         ----------
         between
             (4, 4) from where it has the later view to where it was found.
-        path
-            (N, 4, 4) T_world_camera from the earlier view to the later one.
+        length, turned
+            Of the path from the earlier view to the later one, m, and of the turns on it, rad.
         depth
             Of what they see, m: a view that turns is off to the side as well, by about that.
         covariance
@@ -121,9 +152,6 @@ class Appearance:
         unsure
             Added to what it may be off, in rad and as a share of the depth.
         """
-        steps = se3.inverse(path[:-1]) @ path[1:]
-        length = float(np.linalg.norm(steps[:, :3, 3], axis=1).sum())
-        turned = float(np.sum(se3.angle(steps)))
         far = self.drift * (length + depth * turned) + unsure * depth
         wide = self.drift * (turned + length / depth) + unsure
         C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance

@@ -33,7 +33,12 @@ from tofuse.posegraph.views import PosedView
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.confidence import CONTRADICTION, logistic
-from tofuse.registration.likeness import look_of, mutual_unlikeness
+from tofuse.registration.likeness import (
+    alike,
+    look_of,
+    mutual_unlikeness,
+    unlikeness_of_pairs,
+)
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
@@ -66,6 +71,8 @@ _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
 # Links that say something else than those that are believed must weigh less than this.
 _RIVAL = 0.5
 _SHIFT = 0.35
+# Of up to so many views every two are compared by how they look.
+_ALL = 512
 # No model of probabilities is to be trusted beyond what it was fitted to: some hundred poses.
 _MOST_SURE = 0.998
 _NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
@@ -101,7 +108,7 @@ class Stretch:
     @cached_property
     def depth(self) -> float:
         """Typical distance of what its views see, m."""
-        return float(np.median([v.view.depth for v in self.views])) if self.views else 1.0
+        return float(np.median([v.depth for v in self.views])) if self.views else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,10 +324,17 @@ class _Joiner:
         views = sorted(self._views.values(), key=lambda v: v.index)
         if len(self._islands) < 2 or len(views) < 2:
             return
-        far = mutual_unlikeness([look_of(v.view) for v in views], _SHIFT)
         component = np.array([self._component_of[v.index] for v in views])
-        i, j = np.nonzero(np.triu(component[:, None] != component))
-        order = np.lexsort((j, i, far[i, j]))
+        looks = np.stack([look_of(v.view) for v in views])
+        if len(looks) <= _ALL:
+            i, j = np.nonzero(np.triu(component[:, None] != component))
+            far = mutual_unlikeness(looks, _SHIFT)[i, j]
+        else:  # an index: not the square of a long path
+            i, j = alike(looks, _SHIFT)
+            across = component[i] != component[j]
+            i, j = i[across], j[across]
+            far = unlikeness_of_pairs(looks, i, j, _SHIFT)
+        order = np.lexsort((j, i, far))
         between: dict[tuple[int, int], int] = {}
         for k in order.tolist():
             if self._searches < 1 or len(self._islands) < 2:
@@ -428,7 +442,7 @@ class _Joiner:
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
             aligned = align(b.view, [Target(a.view, np.eye(4))], T_a_b, options)
             if aligned.overlap >= _OVERLAP:
-                self._usual.learn(aligned, b.view.depth)
+                self._usual.learn(aligned, b.depth)
                 found = agreement(b.view, a.view, T_a_b, self_scaled(self._usual))
                 seen.append(found.contradiction)
         if len(seen) > 3:
@@ -629,7 +643,7 @@ class _Joiner:
         Tb = np.stack([T_a_b @ self._T_island(b, v.index) for v in theirs])
         for p, v in enumerate(ours):
             between = se3.inverse(Ta[p]) @ Tb
-            apart = np.linalg.norm(between[:, :3, 3], axis=1) / v.view.depth
+            apart = np.linalg.norm(between[:, :3, 3], axis=1) / v.depth
             away = apart + np.asarray(se3.angle(between))
             near += [(float(away[q]), p, int(q)) for q in np.flatnonzero(away < IN_SIGHT)]
         found = []
@@ -662,7 +676,7 @@ class _Joiner:
                 at = [Target(first.view, np.eye(4))]
                 scale = self._usual.noise_scale
                 aligned = align(second.view, at, T, _NEARBY, usual_scale=scale)
-                if self._drifted(T, aligned.T_world_source, first.view.depth, drift):
+                if self._drifted(T, aligned.T_world_source, first.depth, drift):
                     near = agreement(
                         second.view, first.view, aligned.T_world_source, self_scaled(self._usual)
                     )

@@ -92,6 +92,18 @@ class Loops(Protocol):
         """Add the next frame that has a pose."""
         ...
 
+    @property
+    def many(self) -> bool:
+        """Whether there are so many views that it is worth while to look for loops again."""
+        return False
+
+    def look_again(self, poses: Mapping[int, Float64]) -> bool:
+        """Whether poses are so far from those of the last `finish` that others would be candidates.
+
+        Then `finish` may be called again, with these.
+        """
+        return False
+
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
         """Return what finds the loops that the newest frame closes; None if it closes none.
 

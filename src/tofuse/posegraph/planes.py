@@ -48,7 +48,7 @@ class Planes(Refining):
         A view has lost support if it fell by more.
     """
 
-    spacing: Spacing = Spacing(most=100)  # noqa: RUF009 - immutable
+    spacing: Spacing = Spacing(most=100, loosest=1e6)  # noqa: RUF009 - immutable
     refine: PlaneOptions = PlaneOptions()  # noqa: RUF009 - immutable
     points: int = 5000
     loss: float = 0.03

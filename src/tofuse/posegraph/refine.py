@@ -158,6 +158,9 @@ class Refined:
     measured, information
         (M, 4, 4) T_i_j that each pair would have if it were alone, and (M, 6, 6) of its right
         perturbation, as far as the noise of the views and what their patches share tell.
+    scales
+        (2M, 3) exposure, and factors of the sigmas of distance and albedo, of each pair there and
+        then of each back.
     """
 
     poses: Float64
@@ -168,6 +171,7 @@ class Refined:
     after: Support
     measured: Float64
     information: Float64
+    scales: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +270,18 @@ def refine(
         _allow_for_shared(views, poses, state, options)
     measured = _alone(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
-    return Refined(poses, errors, pairs, tuple(moved), before, after, *measured)
+    scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
+    return Refined(poses, errors, pairs, tuple(moved), before, after, *measured, scales)
+
+
+def support_of(
+    views: Sequence[KeptView], poses: Float64, refined: Refined, options: RefineOptions
+) -> Support:
+    """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
+    state = _directed(views, refined.pairs, options, _no_pairs(), Beside.nothing())
+    state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
+    known = (refined.errors == 0).astype(np.int64)
+    return _support(views, poses, refined.errors, known, state, options.rounds[-1], options)
 
 
 @dataclass(frozen=True, eq=False)

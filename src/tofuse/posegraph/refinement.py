@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.files.spill import Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.maps.surface_map import SurfaceMap
@@ -16,8 +17,9 @@ from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.outside import Told
 from tofuse.posegraph.refine import Beside, Refined, RefineOptions, refine
-from tofuse.posegraph.suspicion import Suspicion, loop_gap, suspicion
-from tofuse.posegraph.views import KeptView, ViewStore
+from tofuse.posegraph.submaps import InSubmap, fell, refine_submaps
+from tofuse.posegraph.suspicion import Suspicion, loop_gap, of_submaps, suspicion
+from tofuse.posegraph.views import KeptView, Outline, PosedView, Spilled, ViewStore
 from tofuse.recordings.frames import Frame
 
 Float32 = NDArray[np.float32]
@@ -142,15 +144,20 @@ class Joint(Refining):
         Errors of the camera that are estimated as well: "offset", "scale", "focal".
     loss
         A view has lost support if it fell by more.
+    submap
+        Up to so many views are refined together; of more, so many at a time, see `submaps`.
     """
 
     refine: RefineOptions = RefineOptions()  # noqa: RUF009 - immutable
     calibrate: tuple[CameraError, ...] = ()
     loss: float = 0.03
+    submap: int = 300
 
     def __post_init__(self) -> None:
         if not 0 <= self.loss <= 1:
             raise ValueError(f"loss is {self.loss}, not 0 to 1")
+        if not 10 <= self.submap <= 100_000:
+            raise ValueError(f"submap is {self.submap}, not 10 to 100000")
 
     def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
         """See `Refining.start`."""
@@ -171,44 +178,100 @@ class _Joint(Refiner):
         """See `Refiner.finish`."""
         options = self._options
         row = {int(index): k for k, index in enumerate(ids)}
-        views = [
-            KeptView.of(posed.view.once(), options.refine.points) for posed in self._store.of(row)
-        ]
-        at = np.array([row[v.surface.index] for v in views], np.intp)
-        if len(views) < 2:
-            return Refinement(poses, views=len(views))
+        posed = self._store.of(row)
+        at = np.array([row[p.index] for p in posed], np.intp)
+        if len(posed) < 2:
+            return Refinement(poses, views=len(posed))
         before = poses[at]
-        numbers = [_ERRORS[name] for name in options.calibrate]
-        beside = _beside([v.surface.index for v in views], told or Told())
-        refined = refine(views, before, options.refine, calibrate=numbers, beside=beside)
-        support = refined.before.of_views(len(views)), refined.after.of_views(len(views))
+        together = _together if len(posed) <= options.submap else _in_submaps
+        refined, found = together(options, posed, before, told or Told(), self._store)
+        support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
-        unchanged = Refinement(poses, False, len(views), len(refined.pairs), support=mean)
+        unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
         gained = support[1] - support[0]
-        if not len(refined.pairs) or _fell(gained):
+        if not len(refined.pairs) or fell(gained):
             return unchanged
         after = without_losers(before, refined.poses, gained < -options.loss)
         if mean[1] < mean[0]:
             # They were refined before, and are as good as they can be; but what the pairs measure
             # says how good that is.
             after = before
-        if numbers:
-            gap = loop_gap(views, refined, refined.poses, refined.errors, options.refine)
-            found = Suspicion(gap=gap)
-        else:
-            found = suspicion(views, refined, options.refine, beside)
         return replace(
             moved_to(unchanged, at, after),
-            suspicion=found,
+            suspicion=found(),
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
-            edges=_measured([v.surface.index for v in views], refined),
+            edges=_measured([p.index for p in posed], refined),
         )
 
 
-def _fell(gained: Float64) -> bool:
-    """Whether the support of views (N,) fell on average by more than chance explains."""
-    error = float(gained.std(ddof=1)) / np.sqrt(len(gained))
-    return float(gained.mean()) < -error
+def _together(
+    options: Joint,
+    posed: Sequence[PosedView[SurfaceMap]],
+    poses: Float64,
+    told: Told,
+    _: ViewStore[SurfaceMap],
+) -> tuple[Refined, Callable[[], Suspicion]]:
+    """Refine all views at once; returns also what tells what they say of their camera."""
+    views = [_kept(p, options) for p in posed]
+    beside = _beside([p.index for p in posed], told)
+    numbers = [_ERRORS[name] for name in options.calibrate]
+    refined = refine(views, poses, options.refine, calibrate=numbers, beside=beside)
+    return refined, lambda: _suspicion(
+        InSubmap(views, np.arange(len(views)), refined, beside), options
+    )
+
+
+def _in_submaps(
+    options: Joint,
+    posed: Sequence[PosedView[SurfaceMap]],
+    poses: Float64,
+    told: Told,
+    store: ViewStore[SurfaceMap],
+) -> tuple[Refined, Callable[[], Suspicion]]:
+    """Refine views submap by submap; returns also what tells what they say of their camera."""
+    said: list[Suspicion] = []
+    ids = [p.index for p in posed]
+    refined = refine_submaps(
+        [_Seen.of(_kept(p, options), store.outlines) for p in posed],
+        poses,
+        options.refine,
+        options.submap,
+        lambda some: [_kept(posed[k], options) for k in some],
+        lambda some: _beside(ids if some is None else [ids[k] for k in some], told),
+        lambda one: said.append(_suspicion(one, options)),
+        [_ERRORS[name] for name in options.calibrate],
+    )
+    return refined, lambda: of_submaps(said)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A view's outline, which may be on disk."""
+
+    middle: Float64
+    kept: Spilled[Outline]
+
+    @classmethod
+    def of(cls, view: KeptView, spill: Spill[Outline]) -> _Seen:
+        return cls(view.middle, Spilled(view.outline, spill))
+
+    @property
+    def outline(self) -> Outline:
+        """See `Outlined`."""
+        return self.kept.get()
+
+
+def _kept(posed: PosedView[SurfaceMap], options: Joint) -> KeptView:
+    return KeptView.of(posed.view.once().bare(), options.refine.points)
+
+
+def _suspicion(one: InSubmap, options: Joint) -> Suspicion:
+    """What refined views say of their camera."""
+    refined = one.refined
+    if not options.calibrate:
+        return suspicion(one.views, refined, options.refine, one.beside)
+    gap = loop_gap(one.views, refined, refined.poses, refined.errors, options.refine)
+    return Suspicion(gap=gap)
 
 
 def _measured(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:

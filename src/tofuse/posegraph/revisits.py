@@ -25,7 +25,16 @@ from tofuse.posegraph.loops import (
     in_order,
 )
 from tofuse.posegraph.trust import relative_covariance
-from tofuse.posegraph.views import KeptView, PosedView, Spacing, ViewStore, overlaps
+from tofuse.posegraph.views import (
+    KeptView,
+    Outline,
+    Outlined,
+    PosedView,
+    Spacing,
+    Spilled,
+    ViewStore,
+    overlaps,
+)
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
 from tofuse.registration.likeness import look_of
@@ -34,8 +43,10 @@ from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit
 from tofuse.registration.view_pair import follow, register_pair
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
+View = PosedView[SurfaceMap]
 
 _POINTS = 600
 # The trajectory has drifted when a loop closes: little, or much. Neighbouring pixels share their
@@ -51,6 +62,24 @@ _TOO_FAR = "looks alike, but the trajectory can't have drifted so far"
 _LEAST_OVERLAP = 0.3
 # Pairs of neighbouring views from which is learnt how views of this camera fit.
 _LEARN = 40
+# Poses that have moved by more, as a share of the depth and in rad, have other candidates.
+_OFF = 0.1
+# Searches are for so many views, or for each so many of them.
+_FOR_SEARCHES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What candidates are found by: little in memory for each view."""
+
+    middle: Float64
+    look: Float32
+    kept: Spilled[Outline]
+
+    @property
+    def outline(self) -> Outline:
+        """See `Outlined`."""
+        return self.kept.get()
 
 
 @part("loops", "revisits")
@@ -80,7 +109,7 @@ class Revisits(LoopDetector):
         Most directions that a loop may leave open: there its covariance says that it knows nothing.
     searches
         At most so many of the candidates that did not fit are searched, those of the largest
-        overlap.
+        overlap; so many again for each 200 views.
     search
         How far and how finely.
     same_m, same_rad
@@ -118,7 +147,7 @@ class Revisits(LoopDetector):
         return _RevisitLoops(self, given, views)
 
     def candidates(
-        self, views: Sequence[KeptView], poses: Float64, *, first: int = 0
+        self, views: Sequence[Outlined], poses: Float64, *, first: int = 0
     ) -> list[tuple[int, int]]:
         """Positions (i, j), i < j, first <= j, of the views that may form a loop.
 
@@ -126,8 +155,9 @@ class Revisits(LoopDetector):
         """
         pairs, shares = overlaps(views, poses, self.apart, first=first)
         found: list[tuple[int, int]] = []
+        ends = np.searchsorted(pairs[:, 1], np.arange(len(views) + 1))
         for j in range(first, len(views)):
-            mine = pairs[:, 1] == j
+            mine = slice(ends[j], ends[j + 1])
             partners, share = pairs[mine, 0], shares[mine]
             # The unbroken run of partners up to this view is what it never left.
             seen = np.zeros(j + 1, bool)
@@ -150,18 +180,39 @@ class _RevisitLoops(Loops):
         self._chosen: ViewStore[SurfaceMap] = ViewStore(options.spacing)
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
-        self._kept: dict[int, KeptView] = {}
+        self._seen: dict[int, _Seen] = {}
         self._confirmed: dict[tuple[int, int], ClosedLoop] = {}
         self._usual = UsualFit(options.unusual)
         self._learnt: set[tuple[int, int]] = set()
         self._covariances: dict[int, Float64] = {}
+        self._way: dict[int, Float64] = {}
+        # Of an earlier `finish`, at other poses.
+        self._closed: dict[tuple[int, int], ClosedLoop] = {}
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Loops.push`."""
         self._poses[view.index] = T_component_camera
         newest = self._store.views[-1] if self._store.views else None
         if newest is not None and newest.index == view.index:
-            self._chosen.push(newest.view, T_component_camera, newest.component)
+            self._chosen.share(newest)
+
+    @property
+    def many(self) -> bool:
+        """See `Loops.many`."""
+        return len(self._chosen.views) > self._options.spacing.most
+
+    def look_again(self, poses: Mapping[int, Float64]) -> bool:
+        """See `Loops.look_again`."""
+        posed = self._chosen.of(poses)
+        before = np.array([self._poses[p.index] for p in posed])
+        between = se3.inverse(before) @ np.array([poses[p.index] for p in posed])
+        depth = np.array([p.depth for p in posed])
+        off = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
+        if off.max() <= _OFF:
+            return False
+        # From elsewhere, what was refused may fit.
+        self._confirmed = {p: c for p, c in self._confirmed.items() if c.record.accepted}
+        return True
 
     def look(self) -> Callable[[], list[ClosedLoop]] | None:
         """See `Loops.look`. Only in the present component are poses comparable so far."""
@@ -171,7 +222,7 @@ class _RevisitLoops(Loops):
         posed = [p for p in posed if p.component == posed[-1].component]
         poses = np.stack([p.T_component_camera for p in posed])
         pairs = self._options.candidates(self._views(posed), poses, first=len(posed) - 1)
-        ends = [(posed[i].view, posed[j].view) for i, j in pairs]
+        ends = [(posed[i], posed[j]) for i, j in pairs]
         if not ends:
             return None
 
@@ -186,38 +237,48 @@ class _RevisitLoops(Loops):
     ) -> list[ClosedLoop]:
         """See `Loops.finish`. What a person gives takes the place of what was found."""
         self._poses, self._covariances = dict(poses), dict(covariances)
+        self._way = _ways(poses)
         posed = self._chosen.of(poses)
         self._learn(posed)
-        surfaces = [p.view for p in posed]
-        at = np.array([poses[s.index] for s in surfaces]).reshape(-1, 4, 4)
-        pairs = self._options.candidates(self._views(posed), at)
+        at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
+        seen = self._views(posed)
+        pairs = self._options.candidates(seen, at)
         found = run_chunks(
-            lambda a, _: self._confirm(*(surfaces[k] for k in pairs[a])), len(pairs), len(pairs)
+            lambda a, _: self._confirm(*(posed[k] for k in pairs[a])), len(pairs), len(pairs)
         )
-        closed = {(loop.record.i, loop.record.j): loop for loop in found}
-        by_index = {s.index: s for s in surfaces}
+        closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
+        closed |= {(loop.record.i, loop.record.j): loop for loop in found}
+        by_index = {p.index: p for p in posed}
         refused = sorted(
             (pair for pair, loop in closed.items() if not loop.record.accepted),
             key=lambda pair: -(closed[pair].record.overlap or 0.0),
         )
-        alike, impossible = self._alike(surfaces, closed)
+        times = max(1, -(-len(posed) // _FOR_SEARCHES))
+        alike, impossible = self._alike(posed, seen, closed, times)
         closed |= {p: ClosedLoop(LoopRecord(*p, False, _TOO_FAR)) for p in impossible}
-        asked = [*refused[: self._options.searches], *alike]
+        asked = [*refused[: self._options.searches * times], *alike]
         closed.update(self._searched(asked, by_index, closed, alike))
-        known = {p.index: p.view for p in self._store.of(poses)}
+        self._closed = {p: c for p, c in closed.items() if c.record.accepted}
+        known = {p.index: p for p in self._store.of(poses)}
         for loop in self._given_loops:
             closed[loop.i, loop.j] = given_loop(
                 loop, known, lambda i, j: self._confirm(known[i], known[j])
             )
         return in_order(closed)
 
-    def _views(self, posed: Sequence[PosedView[SurfaceMap]]) -> list[KeptView]:
-        """The same views as `overlaps` takes them, made once."""
-        known = self._kept
-        self._kept = {p.index: known.get(p.index) or KeptView.of(p.view, _POINTS) for p in posed}
-        return list(self._kept.values())
+    def _views(self, posed: Sequence[View]) -> list[_Seen]:
+        """What candidates among these views are found by, made once."""
+        known = self._seen
+        self._seen = {p.index: known.get(p.index) or self._seen_of(p) for p in posed}
+        return list(self._seen.values())
 
-    def _learn(self, posed: Sequence[PosedView[SurfaceMap]]) -> None:
+    def _seen_of(self, posed: View) -> _Seen:
+        surface = posed.view.bare()
+        outline = KeptView.of(surface, _POINTS).outline
+        kept = Spilled(outline, self._store.outlines)
+        return _Seen(outline.middle, look_of(surface), kept)
+
+    def _learn(self, posed: Sequence[View]) -> None:
         """Learn how neighbouring views of this camera fit."""
         for a, b in itertools.pairwise(posed):
             pair = a.index, b.index
@@ -231,18 +292,18 @@ class _RevisitLoops(Loops):
             if aligned.overlap >= _LEAST_OVERLAP:
                 self._usual.learn(aligned, b.view.depth)
 
-    def _confirm(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
+    def _confirm(self, target: View, source: View) -> ClosedLoop:
         """Align the later view with the earlier one, and back; once for each pair."""
         pair = target.index, source.index
         if pair not in self._confirmed:
             self._confirmed[pair] = self._followed(target, source)
         return self._confirmed[pair]
 
-    def _followed(self, target: SurfaceMap, source: SurfaceMap) -> ClosedLoop:
+    def _followed(self, target: View, source: View) -> ClosedLoop:
         """Register two views from where the trajectory has them."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Else all views would keep, until the end, what they are compared with here.
-        made = follow(source.bare(), target.bare(), guess, usual=self._usual)
+        made = follow(source.view.bare(), target.view.bare(), guess, usual=self._usual)
         if made is None:
             return ClosedLoop(LoopRecord(target.index, source.index, False, _UNLIKE))
         objection = self._objection(made)
@@ -260,17 +321,22 @@ class _RevisitLoops(Loops):
         return ClosedLoop(record, made.T_target_source, made.information)
 
     def _alike(
-        self, surfaces: Sequence[SurfaceMap], closed: Mapping[tuple[int, int], ClosedLoop]
+        self,
+        posed: Sequence[View],
+        seen: Sequence[_Seen],
+        closed: Mapping[tuple[int, int], ClosedLoop],
+        times: int,
     ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """Frames (i, j) that look alike and are no candidates yet: possible ones, and others."""
-        place = {s.index: k for k, s in enumerate(surfaces)}
+        place = {p.index: k for k, p in enumerate(posed)}
         known = [(place[i], place[j]) for (i, j), loop in closed.items() if loop.record.accepted]
-        both = self._options.appearance.candidates(
-            [look_of(s) for s in surfaces],
-            lambda i, j: self._plausible(surfaces[i], surfaces[j], np.eye(4), ALIKE),
+        appearance = replace(self._options.appearance, most=self._options.appearance.most * times)
+        both = appearance.candidates(
+            [s.look for s in seen],
+            lambda i, j: self._plausible(posed[i], posed[j], np.eye(4), ALIKE),
             known,
         )
-        indices = [[(surfaces[i].index, surfaces[j].index) for i, j in pairs] for pairs in both]
+        indices = [[(posed[i].index, posed[j].index) for i, j in pairs] for pairs in both]
         return (
             [pair for pair in indices[0] if pair not in closed],
             [pair for pair in indices[1] if pair not in closed],
@@ -279,7 +345,7 @@ class _RevisitLoops(Loops):
     def _searched(
         self,
         pairs: Sequence[tuple[int, int]],
-        surfaces: Mapping[int, SurfaceMap],
+        posed: Mapping[int, View],
         closed: Mapping[tuple[int, int], ClosedLoop],
         alike: Sequence[tuple[int, int]],
     ) -> dict[tuple[int, int], ClosedLoop]:
@@ -291,7 +357,7 @@ class _RevisitLoops(Loops):
         refused = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
         for i, j in pairs:
             made = register_pair(
-                surfaces[j], surfaces[i], usual=self._usual, options=self._options.search
+                posed[j].view, posed[i].view, usual=self._usual, options=self._options.search
             )
             if made is None:
                 refused[i, j] += "; there are too few surfaces to search with"
@@ -300,9 +366,7 @@ class _RevisitLoops(Loops):
             if not made.is_probable:
                 refused[i, j] += f"; by a search {made.reason}"
                 continue
-            if (i, j) in alike and not self._plausible(
-                surfaces[i], surfaces[j], made.T_target_source
-            ):
+            if (i, j) in alike and not self._plausible(posed[i], posed[j], made.T_target_source):
                 refused[i, j] = _TOO_FAR
                 continue
             found[i, j] = made
@@ -334,20 +398,16 @@ class _RevisitLoops(Loops):
             no[p] = ClosedLoop(replace(record, reason=refused[p], margin=margins.get(p)))
         return no | believed
 
-    def _plausible(
-        self, target: SurfaceMap, source: SurfaceMap, T: Float64, unsure: float = 0.0
-    ) -> bool:
+    def _plausible(self, target: View, source: View, T: Float64, unsure: float = 0.0) -> bool:
         """Whether the trajectory may have drifted so far as T_target_source says."""
-        path = np.stack(
-            [self._poses[k] for k in sorted(self._poses) if target.index <= k <= source.index]
-        )
-        T_target_source = se3.inverse(path[0]) @ path[-1]
+        T_target_source = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         off = se3.inverse(T_target_source) @ T
         depth = 0.5 * (target.depth + source.depth)
         C = relative_covariance(
             T_target_source, self._covariances[target.index], self._covariances[source.index]
         )
-        return self._options.appearance.plausible(off, path, depth, C, unsure)
+        length, turned = (self._way[source.index] - self._way[target.index]).tolist()
+        return self._options.appearance.plausible(off, length, turned, depth, C, unsure)
 
     def _same(self, i: int, j: int, T: Float64, k: int, m: int, other: Float64) -> bool:
         """Whether the loop k, m, beside the loop i, j, puts the camera of j where that does."""
@@ -368,3 +428,13 @@ class _RevisitLoops(Loops):
         if len(made.unobservable) > self._options.weak:
             return f"{len(made.unobservable)} directions are degenerate"
         return "" if made.believed else made.reason
+
+
+def _ways(poses: Mapping[int, Float64]) -> dict[int, Float64]:
+    """(2,) length of the path from the first frame to each, m, and of the turns on it, rad."""
+    order = sorted(poses)
+    path = np.stack([poses[k] for k in order])
+    steps = se3.inverse(path[:-1]) @ path[1:]
+    far = np.linalg.norm(steps[:, :3, 3], axis=1), np.asarray(se3.angle(steps))
+    way = np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack(far, 1), axis=0)])
+    return dict(zip(order, way, strict=True))

@@ -25,6 +25,8 @@ Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
 Bool = NDArray[np.bool_]
 
+# Numbers of a dense right side that is solved for at a time.
+_AT_ONCE = 4_000_000
 _FLAT = 1e-12  # of the largest diagonal entry: the least damping that a direction gets
 
 
@@ -239,9 +241,11 @@ class Factor:
         if self._lu is None or not len(moving):
             return out.reshape(len(vertices) * k, -1)
         at = (k * system.number[vertices[moving]][:, None] + np.arange(k)).ravel()
-        for start in range(0, len(moving), 64):  # bounds the memory
-            these = moving[start : start + 64]
-            columns = at[k * start : k * (start + 64)]
+        # At once so many that the memory does not grow with the graph.
+        some = max(1, min(64, _AT_ONCE // (k * k * len(system.free))))
+        for start in range(0, len(moving), some):
+            these = moving[start : start + some]
+            columns = at[k * start : k * (start + some)]
             unit = np.zeros((k * len(system.free), len(columns)))
             unit[columns, np.arange(len(columns))] = 1
             found = self._lu.solve(unit)[at].reshape(len(moving), k, len(these), k)

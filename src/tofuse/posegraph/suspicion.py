@@ -168,6 +168,19 @@ def suspicion(
     )
 
 
+def of_submaps(said: Sequence[Suspicion]) -> Suspicion:
+    """What submaps of one recording say together.
+
+    They share the camera: an error of it is in most of them, and in few only if it is none. Of the
+    alarms the one counts whose error is in the middle.
+    """
+    alarms = sorted((s for s in said if s.alarm), key=lambda s: s.errors.get(s.best, 0.0))
+    if 2 * len(alarms) > len(said):
+        return alarms[len(alarms) // 2]
+    quiet = [s for s in said if not s.alarm]
+    return next((s for s in quiet if s.gap is not None), quiet[0] if quiet else Suspicion())
+
+
 def _gain(found: Refined, views: Sequence[KeptView]) -> float:
     n = len(views)
     return float(found.after.of_views(n).mean() - found.before.of_views(n).mean())

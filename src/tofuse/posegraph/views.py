@@ -1,20 +1,23 @@
-"""Views that the global stages work on: few enough to keep, and which of them overlap."""
+"""Views that the global stages work on: where they are kept, and which of them overlap."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
+from weakref import finalize
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from tofuse.files.spill import Scratch, Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.maps.surface_map import Projection, SurfaceMap
 from tofuse.posegraph import shared_error
 from tofuse.registration.projective import points_of
 
@@ -28,6 +31,51 @@ _OVERLAP_COLUMNS = 40
 # Points see a surface if they are as near to it, as a share of their z, and face it like this.
 _NEAR = 0.1
 _FACING = 0.5
+# Of up to so many views every two are compared; of more, each with so many that look at places near
+# to what it looks at, and with those just before it. So the work grows with the path alone, and not
+# with its square.
+_ALL, _NEAREST, _JUST_BEFORE = 512, 192, 64
+# Share of the memory for views that goes to their outlines: these are small, but all are asked for.
+_FOR_OUTLINES = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What of a view tells what it overlaps with.
+
+    Attributes
+    ----------
+    points
+        (N, POINT_SIZE) of some pixels, see `points_of`.
+    target
+        (H, W, PIXEL_SIZE) what points of others are compared with, few pixels.
+    projection
+        Where they land there.
+    """
+
+    points: Float32
+    target: Float32
+    projection: Projection
+
+    @property
+    def middle(self) -> Float64:
+        """(3,) of the points, in the camera's frame."""
+        p = self.points[:, POINT : POINT + 3]
+        return np.asarray(p.mean(0, dtype=float) if len(p) else np.zeros(3), np.float64)
+
+
+class Outlined(Protocol):
+    """What knows its outline."""
+
+    @property
+    def middle(self) -> Float64:
+        """(3,) middle of its outline's points, in its camera's frame."""
+        ...
+
+    @property
+    def outline(self) -> Outline:
+        """See `Outline`."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +92,16 @@ class KeptView:
         return cls(surface, points_of(surface, every))
 
     @cached_property
-    def coarse(self) -> SurfaceMap:
-        """The surface at few pixels, which is enough to tell what overlaps."""
-        return self.surface.thinned(_OVERLAP_COLUMNS)
+    def outline(self) -> Outline:
+        """What tells what it overlaps with."""
+        some = self.points[:: max(1, len(self.points) // _OVERLAP_POINTS)]
+        coarse = self.surface.thinned(_OVERLAP_COLUMNS)
+        return Outline(some, coarse.target, coarse.projection)
+
+    @cached_property
+    def middle(self) -> Float64:
+        """(3,) of what it sees, in the camera's frame."""
+        return self.outline.middle
 
     @cached_property
     def patches(self) -> NDArray[np.int64]:
@@ -71,17 +126,23 @@ class Spacing:
         share of the median depth.
     most
         When there are more, every other one is dropped, and twice the motion is asked for.
+    loosest
+        But no more than so many times as much: what is seen of a place does not depend on how much
+        else is seen. From then on views become more as the path goes on.
     """
 
     angle: float = 0.03
     distance: float = 0.015
     most: int = 300
+    loosest: float = 4.0
 
     def __post_init__(self) -> None:
         if not (self.angle >= 0 and self.distance >= 0):
             raise ValueError("angle and distance must be 0 or more")
         if not 2 <= self.most <= 100_000:
             raise ValueError(f"most is {self.most}, not 2 to 100000")
+        if not self.loosest >= 1:
+            raise ValueError(f"loosest is {self.loosest}, not 1 or more")
 
 
 class Storable(Protocol):
@@ -101,22 +162,62 @@ class Storable(Protocol):
 V = TypeVar("V", bound=Storable)
 
 
-@dataclass(frozen=True, eq=False)
-class PosedView(Generic[V]):
-    """A view with its (4, 4) pose in the frame of its component."""
+T = TypeVar("T")
 
-    view: V
-    T_component_camera: Float64
-    component: int = 0
+
+class Spilled(Generic[T]):
+    """An item that may be on disk, for as long as anybody knows of it."""
+
+    def __init__(self, item: T, spill: Spill[T]) -> None:
+        self.__setstate__({"_spill": spill, "_number": spill.put(item)})
+
+    def get(self) -> T:
+        """Return the item."""
+        return self._spill.get(self._number)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._spill: Spill[T] = state["_spill"]
+        self._number: int = state["_number"]
+        finalize(self, self._spill.drop, self._number).atexit = False
+
+
+class PosedView(Generic[V]):
+    """A view with its pose.
+
+    Parameters
+    ----------
+    T_component_camera
+        (4, 4) pose in the frame of its component.
+    spill
+        Where it is kept; in memory unless given.
+
+    Attributes
+    ----------
+    index
+        Of the frame in its recording.
+    depth
+        Median distance of what it sees, m.
+    """
+
+    def __init__(
+        self,
+        view: V,
+        T_component_camera: Float64,
+        component: int = 0,
+        spill: Spill[V] | None = None,
+    ) -> None:
+        self.index, self.depth = view.index, view.depth
+        self.T_component_camera, self.component = T_component_camera, component
+        self._kept: V | Spilled[V] = view if spill is None else Spilled(view, spill)
 
     @property
-    def index(self) -> int:
-        """Of the frame in its recording."""
-        return self.view.index
+    def view(self) -> V:
+        """What is kept, read from disk where it is not in memory: better asked for once."""
+        return self._kept.get() if isinstance(self._kept, Spilled) else self._kept
 
 
 class ViewStore(Generic[V]):
-    """The views that global stages work on: spaced by motion, and never more than so many.
+    """The views that global stages work on: spaced by motion.
 
     Parameters
     ----------
@@ -124,16 +225,27 @@ class ViewStore(Generic[V]):
         Which views are kept.
     always
         Frames that are kept in any case.
+    scratch
+        How much of it may be in memory, the outlines of views included; all unless given.
 
     Attributes
     ----------
     views
         In the order of their frames. The first of each component stays.
+    outlines
+        Where outlines of these views may be kept.
     """
 
-    def __init__(self, spacing: Spacing, always: Collection[int] = ()) -> None:
+    def __init__(
+        self,
+        spacing: Spacing,
+        always: Collection[int] = (),
+        scratch: Scratch = Scratch(),  # noqa: B008 - immutable
+    ) -> None:
         self.views: list[PosedView[V]] = []
+        self.outlines: Spill[Outline] = scratch.part(_FOR_OUTLINES)
         self._spacing, self._always = spacing, frozenset(always)
+        self._spill: Spill[V] = scratch.part(1 - _FOR_OUTLINES)
         self._stretch = 1.0
 
     def wants(
@@ -153,15 +265,26 @@ class ViewStore(Generic[V]):
         """Add the next view if it is wanted; returns whether it is."""
         if not self.wants(view.index, view.depth, T_component_camera, component):
             return False
-        self.views.append(PosedView(view, T_component_camera, component))
-        if len(self.views) > self._spacing.most:
-            self._drop_every_other()
-            self._stretch *= 2
+        self._add(PosedView(view, T_component_camera, component, self._spill))
+        return True
+
+    def share(self, posed: PosedView[V]) -> bool:
+        """Add the next view, which another store has, if it is wanted; returns whether it is."""
+        if not self.wants(posed.index, posed.depth, posed.T_component_camera, posed.component):
+            return False
+        self._add(posed)
         return True
 
     def of(self, frames: Collection[int]) -> list[PosedView[V]]:
         """Views of some frames."""
         return [view for view in self.views if view.index in frames]
+
+    def _add(self, posed: PosedView[V]) -> None:
+        self.views.append(posed)
+        s = self._spacing
+        if len(self.views) > s.most and 2 * self._stretch <= s.loosest:
+            self._drop_every_other()
+            self._stretch *= 2
 
     def _drop_every_other(self) -> None:
         kept: list[PosedView[V]] = []
@@ -177,12 +300,13 @@ class ViewStore(Generic[V]):
 
 
 def overlaps(
-    views: Sequence[KeptView], poses: Float64, least: float, *, first: int = 0
+    views: Sequence[Outlined], poses: Float64, least: float, *, first: int = 0
 ) -> tuple[Integers, Float64]:
     """Pairs of views that see at least a share `least` of each other, and that share.
 
     The share is the smaller of both ways. It counts points that lie near a surface of the other
-    view which faces the same way, so it allows for poses that have drifted somewhat.
+    view which faces the same way, so it allows for poses that have drifted somewhat. Of many views
+    only those are compared that may overlap, see `nearby`.
 
     Parameters
     ----------
@@ -195,10 +319,10 @@ def overlaps(
     -------
     pairs (M, 2), i < j, in the order of j, then i; shares (M,).
     """
+    target, source = nearby(looked_at(views, poses), first)
     axes = poses[:, :3, 2]
-    target, source = np.nonzero(np.triu(axes @ axes.T > 0, 1))
-    late = source >= first
-    target, source = target[late], source[late]
+    facing = np.einsum("ni,ni->n", axes[target], axes[source]) > 0
+    target, source = target[facing], source[facing]
     share = _shares(views, poses, target, source, least)
     near = share >= least
     target, source = target[near], source[near]
@@ -208,14 +332,52 @@ def overlaps(
     return np.stack([target[order], source[order]], 1), share[order]
 
 
+def looked_at(views: Sequence[Outlined], poses: Float64) -> Float64:
+    """(N, 3) middles of what views see, in the world of their poses (N, 4, 4)."""
+    middles = np.array([view.middle for view in views]).reshape(-1, 3)
+    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], middles) + poses[:, :3, 3])
+
+
+def nearby(middles: Float64, first: int = 0) -> tuple[Integers, Integers]:
+    """Pairs of views that are worth comparing, by the middles (N, 3) of what they see.
+
+    All, where there are few views. Of many each is paired with those of the nearest middles, and
+    with those just before it. Returns the views i < j of all pairs with j >= first.
+    """
+    n = len(middles)
+    if n <= _ALL:
+        i, j = np.triu_indices(n, 1)
+    elif first == n - 1:  # of the newest view alone, a search costs less than a tree
+        away = np.linalg.norm(middles[:-1] - middles[-1], axis=1)
+        nearest = np.argpartition(away, _NEAREST)[:_NEAREST]
+        i = np.union1d(nearest, np.arange(max(0, n - 1 - _JUST_BEFORE), n - 1))
+        j = np.full(len(i), n - 1)
+    else:
+        _, near = cKDTree(middles).query(middles, k=_NEAREST)
+        here = np.repeat(np.arange(n), _NEAREST)
+        before = np.arange(n)[:, None] - np.arange(1, _JUST_BEFORE + 1)
+        there = np.concatenate([near.ravel(), before.ravel()])
+        here = np.concatenate([here, np.repeat(np.arange(n), _JUST_BEFORE)])
+        known = (there >= 0) & (there != here)
+        low, high = np.minimum(here, there)[known], np.maximum(here, there)[known]
+        i, j = np.divmod(np.unique(low.astype(np.int64) * n + high), n)
+    late = j >= first
+    return np.asarray(i[late], np.intp), np.asarray(j[late], np.intp)
+
+
 def _shares(
-    views: Sequence[KeptView], poses: Float64, target: Integers, source: Integers, least: float
+    views: Sequence[Outlined],
+    poses: Float64,
+    target: Integers,
+    source: Integers,
+    least: float,
 ) -> Float64:
     """Share of each source's points that its target sees; 0 where that is below `least`."""
-    some = [v.points[:: max(1, len(v.points) // _OVERLAP_POINTS)] for v in views]
+    used, row = np.unique(source, return_inverse=True)
+    some = [views[k].outline.points for k in used]
     starts = np.concatenate([[0], np.cumsum([len(points) for points in some])])
     points = np.concatenate(some) if some else np.zeros((0, POINT_SIZE), np.float32)
-    inverse = se3.inverse(poses)
+    inverse, at = se3.inverse(poses), np.ascontiguousarray(poses[used])
     # All sources of a target in turn: then the target need not be fetched again.
     order = np.argsort(target, kind="stable")
     different, begin = np.unique(target[order], return_index=True)
@@ -225,17 +387,17 @@ def _shares(
     def work(a: int, b: int) -> None:
         for k in range(a, b):
             rows = order[begin[k] : end[k]]
-            view = views[different[k]].coarse
+            view = views[different[k]].outline
             found = np.empty(len(rows))
             kernels.overlaps(
                 points,
                 starts,
-                source[rows],
+                row[rows],
                 view.target,
                 view.projection.lookup,
                 view.projection.frame,
                 inverse[different[k]],
-                poses,
+                at,
                 _NEAR,
                 _FACING,
                 least,

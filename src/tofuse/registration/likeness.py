@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
@@ -24,6 +25,8 @@ _CHUNKS = 16
 _MOST_DEPTH, _MOST_LIGHT = 0.3, 0.5
 # Share of the cells of which both views know the albedo, below which it is not compared.
 _LIT = 0.2
+# Of the index of looks: principal components, and answers to each question.
+_COMPONENTS, _ANSWERS = 8, 6
 
 
 def look_of(view: SurfaceMap) -> Float32:
@@ -66,9 +69,9 @@ def unlikeness(look: Float32, others: Float32, shift: float) -> Float64:
     return best
 
 
-def mutual_unlikeness(looks: Sequence[Float32], shift: float) -> Float64:
+def mutual_unlikeness(looks: Sequence[Float32] | Float32, shift: float) -> Float64:
     """(N, N) how much views differ from each other, see `unlikeness`."""
-    stack = np.stack(looks)
+    stack = np.asarray(looks)
     far = np.ones((len(stack), len(stack)))
 
     def rows(a: int, b: int) -> None:
@@ -77,6 +80,74 @@ def mutual_unlikeness(looks: Sequence[Float32], shift: float) -> Float64:
 
     run_chunks(rows, len(stack), _CHUNKS)
     return np.minimum(far, far.T)
+
+
+def unlikeness_of_pairs(
+    looks: Float32, i: NDArray[np.intp], j: NDArray[np.intp], shift: float
+) -> Float64:
+    """(M,) how much the views of pairs differ, of views (N, 2, 9, 12), see `unlikeness`."""
+    out = np.ones(len(i))
+    order = np.argsort(i, kind="stable")
+    different, begin = np.unique(i[order], return_index=True)
+    end = np.append(begin[1:], len(order))
+
+    def work(a: int, b: int) -> None:
+        for k in range(a, b):
+            rows = order[begin[k] : end[k]]
+            out[rows] = unlikeness(looks[different[k]], looks[j[rows]], shift)
+
+    run_chunks(work, len(different), _CHUNKS)
+    return out
+
+
+def alike(looks: Float32, shift: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs i < j of views (N, 2, 9, 12) that are likely to look alike: some of each view.
+
+    An index by the first principal components of blocks of cells. It is asked for each view at each
+    shift, and answers with the nearest ones; what is nearest there is compared cell by cell by who
+    asks. Views next to each other in time are left out, as these always look alike.
+    """
+    n = len(looks)
+    described = _blocks(looks, 0, 0)
+    mean = described.mean(0)
+    _, _, axes = np.linalg.svd(described - mean, full_matrices=False)
+    axes = axes[:_COMPONENTS]
+    tree = cKDTree((described - mean) @ axes.T)
+    here, there = [], []
+    across, down = round(shift * _COLUMNS), round(shift * _ROWS / 2)
+    for v in range(-down, down + 1):
+        for u in range(-across, across + 1):
+            asked = (_blocks(looks, v, u) - mean) @ axes.T
+            _, near = tree.query(asked, k=min(_ANSWERS, n))
+            here.append(np.repeat(np.arange(n), near.shape[1]))
+            there.append(near.ravel())
+    a, b = np.concatenate(here), np.concatenate(there)
+    i, j = np.minimum(a, b), np.maximum(a, b)
+    apart = j > i + 1
+    i, j = np.divmod(np.unique(i[apart] * n + j[apart]), n)
+    return i, j
+
+
+def _blocks(looks: Float32, v: int, u: int) -> Float64:
+    """(N, 24) means over blocks of 3 x 3 cells, of looks moved by v rows and u columns.
+
+    Where a block is not known it is as views are on average; light is less its own mean.
+    """
+    moved = np.full_like(looks, np.nan)
+    to_rows, from_rows = slice(max(-v, 0), _ROWS - max(v, 0)), slice(max(v, 0), _ROWS + min(v, 0))
+    to, fro = slice(max(-u, 0), _COLUMNS - max(u, 0)), slice(max(u, 0), _COLUMNS + min(u, 0))
+    moved[:, :, to_rows, to] = looks[:, :, from_rows, fro]
+    cells = moved.reshape(len(looks), 2, _ROWS // 3, 3, _COLUMNS // 3, 3).astype(float)
+    known = np.isfinite(cells)
+    count = known.sum((3, 5))
+    total = np.where(known, cells, 0).sum((3, 5))
+    # As differences are counted: up to what is as good as unknown.
+    means = total / np.maximum(count, 1) / np.array([_MOST_DEPTH, _MOST_LIGHT])[:, None, None]
+    seen = count > 0
+    own = np.where(seen, means, 0).sum((2, 3)) / np.maximum(seen.sum((2, 3)), 1)
+    means[:, 1] -= own[:, 1, None, None]
+    typical = np.where(seen, means, 0).sum(0) / np.maximum(seen.sum(0), 1)
+    return np.where(seen, means, typical).reshape(len(looks), -1)
 
 
 def _differ(here: Float32, there: Float32) -> Float64:
