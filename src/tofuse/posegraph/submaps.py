@@ -143,14 +143,17 @@ def refine_submaps(
     """
     pairs = chosen(overlaps(outlines, poses, options.overlap)[0], options.neighbours)
     parts = [s for s in submaps(looked_at(outlines, poses), pairs, most) if len(s.pairs)]
-    found: list[tuple[Submap, Refined]] = []
-    for part in parts:
+
+    def refined_alone(part: Submap) -> Refined:
+        # The views go before those of the next submap come.
         views, here = load(part.views), beside(part.views)
         local = np.searchsorted(part.views, part.pairs)
         start = se3.inverse(poses[part.views[0]]) @ poses[part.views]
         refined = refine(views, start, options, calibrate=calibrate, beside=here, pairs=local)
         seen(InSubmap(views, part.views, refined, here))
-        found.append((part, _believed(refined, start)))
+        return _believed(refined, start)
+
+    found = [(part, refined_alone(part)) for part in parts]
     if not found:
         none = np.zeros(0)
         nobody = Support(none.astype(np.intp), none.astype(np.intp), none, none)
@@ -162,10 +165,10 @@ def refine_submaps(
     T_i_j = np.concatenate([r.measured for _, r in found])
     information = np.concatenate([r.information for _, r in found])
     solved = _solved(poses, asked, T_i_j, information, beside(None))
-    after = []
-    for part, refined in found:
-        views = load(part.views)
-        after.append(support_of(views, solved[part.views], refined, options))
+    after = [
+        support_of(load(part.views), solved[part.views], refined, options)
+        for part, refined in found
+    ]
     return Refined(
         solved,
         errors,
