@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 
 from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
+from tofuse.files.memory import give_back
 
 Bytes = NDArray[np.uint8]
 
 _PIECE = 16 << 20  # bytes that are copied at a time
+_OFTEN = 128 << 20  # bytes that leave memory before it is given back to the system
 
 
 class SpillFile:
@@ -174,6 +176,7 @@ class Spill(Generic[T]):
         self._held: OrderedDict[int, T] = OrderedDict()  # the longest unused first
         self._held_bytes = 0
         self._next = 0
+        self._let_go = 0  # bytes since memory was given back
         self._last: dict[str, NDArray[Any]] = {}
         self._file = SpillFile(folder)
         self._lock = RLock()
@@ -261,6 +264,11 @@ class Spill(Generic[T]):
             self._write(oldest)
             del self._held[oldest]
             self._held_bytes -= self._entries[oldest].nbytes
+            self._let_go += self._entries[oldest].nbytes
+        if self._let_go > _OFTEN:
+            # Else what is free lies in pieces between what stays, and more than the budget is held.
+            self._let_go = 0
+            give_back()
 
     def _write(self, number: int) -> None:
         entry, item = self._entries[number], self._held[number]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Shares of the whole. The rest is the program itself (some 400 MB), the frames at work, what stages
 # make of the views that they ask for, and the result.
-_VOXELS, _VIEWS = 0.3, 0.2
+_VOXELS, _VIEWS = 0.3, 0.15
 
 
 def voxels_mb(memory_mb: int) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
+from tofuse.files.memory import give_back
 from tofuse.kernels.threads import thread_count, threads, undivided
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
@@ -21,7 +22,6 @@ from tofuse.pipeline.config import Config, check_views, from_method, kind_of
 from tofuse.pipeline.frame_log import FrameLog, record_of
 from tofuse.pipeline.intake import Intake
 from tofuse.pipeline.live import LivePoses
-from tofuse.pipeline.memory import give_back
 from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
