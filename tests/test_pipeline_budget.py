@@ -1,0 +1,31 @@
+"""What `--memory` is divided into."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.fusion.options import Fusion
+from tofuse.pipeline.budget import views_bytes, voxels_mb
+from tofuse.pipeline.config import from_method
+from tofuse.pipeline.run import Options, resolve
+
+
+def test_memory_is_divided_in_one_place() -> None:
+    config = resolve(Options(Path("out"), memory=1_000_000_000))
+    assert config.memory_mb == 1000
+    assert config.fusion.memory_mb == voxels_mb(1000) == 300
+    # Voxels, half as much for images, and views leave room for the program itself.
+    assert 1.5 * voxels_mb(2000) * 1_000_000 + views_bytes(2000) < 0.7 * 2e9
+
+
+def test_unless_asked_for_it_is_as_ever() -> None:
+    config = from_method("default")
+    assert config.fusion.memory_mb == Fusion().memory_mb == voxels_mb(config.memory_mb)
+
+
+def test_too_little_memory_is_refused() -> None:
+    with pytest.raises(InputError, match="memory"):
+        resolve(Options(Path("out"), memory=100_000_000))
