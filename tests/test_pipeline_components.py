@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +11,10 @@ from made_rooms import OTHER, at, seen
 from test_pipeline_checkpoint import Kept
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
-from tofuse.pipeline import checkpoint
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Silent
+from tofuse.pipeline.states import decode, encode
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.joining import Joining
 from tofuse.registration.search import SearchOptions
@@ -137,7 +135,7 @@ def test_a_copy_in_the_middle_goes_on_to_the_same(there_and_back, joined, after)
     for frame in frames[:after]:
         mapper.push(frame)
     # As checkpoints do, which load types of the package only.
-    copy = checkpoint._OwnTypes(io.BytesIO(pickle.dumps(mapper, 5))).load()
+    copy = decode(*encode(mapper))
     copy.go_on(1, Silent())
     for frame in frames[after:]:
         copy.push(frame)
