@@ -21,7 +21,10 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "src" / "tofuse" / "kernels" / "signatures.txt"
-ALONE = "import os, sys; os.cpu_count = lambda: 1; from tofuse.cli import main; sys.exit(main())"
+ALONE = (
+    "import sys; from tofuse.kernels import ahead; ahead.usable_cores = lambda: 1; "
+    "from tofuse.cli import main; sys.exit(main())"
+)
 BOTH = "import sys; from tofuse.cli import main; sys.exit(main())"
 
 

@@ -130,6 +130,21 @@ def files_with(path: str | Path, *suffixes: str) -> list[Path]:
     return [p for p in list_folder(path) if p.suffix.lower() in suffixes]
 
 
+def files_named(path: Path, named: Callable[[str], object]) -> list[Path]:
+    """Return files of a folder whose name is `named`, in name order; none if it is no folder."""
+    if not is_folder(path):
+        return []
+    try:
+        return [p for p in list_folder(path) if named(p.name) and is_file(p)]
+    except InputError:
+        return []
+
+
+def if_file(path: Path) -> Path | None:
+    """Return the path if it is that of a file that can be looked at."""
+    return path if is_file(path) else None
+
+
 def is_file(path: Path) -> bool:
     """Whether `path` is a file that can be looked at."""
     try:

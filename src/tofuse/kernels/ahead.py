@@ -23,12 +23,15 @@ from tofuse.kernels.cores import usable_cores
 
 _LIST = Path(__file__).with_name("signatures.txt")
 _DONE = "compiled"
-_SCALARS = {"f4": "float32", "f8": "float64", "i8": "int64", "b1": "boolean"}
-_DTYPES = _SCALARS | {
+_DTYPES = {
+    "b1": "boolean",
     "i1": "int8",
     "i4": "int32",
+    "i8": "int64",
     "u1": "uint8",
     "u2": "uint16",
+    "f4": "float32",
+    "f8": "float64",
     "c16": "complex128",
 }
 _NAMES = {name: short for short, name in _DTYPES.items()} | {"bool": "b1"}

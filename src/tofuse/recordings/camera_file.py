@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,30 @@ def read_json(path: str | Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise InputError("holds no JSON object", where=path, remedy="write {...}")
     return data
+
+
+def number_in(
+    data: Mapping[str, Any],
+    name: str,
+    where: str | Path,
+    default: float | None = None,
+    remedy: str = "correct it",
+) -> float:
+    """Return a number of what was read from a file; `remedy` is for one that is too large.
+
+    Raises
+    ------
+    InputError
+        If it is missing and has no default, is no number, or does not fit into a float.
+    """
+    value = data.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        problem = "is missing" if value is None else f"is {value!r:.60}"
+        raise InputError(problem, where=f"{where}: {name}", remedy="give a number")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError("is too large", where=f"{where}: {name}", remedy=remedy) from error
 
 
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.errors import InputError
 from tofuse.files.images import read_color
-from tofuse.files.reading import is_file, is_folder, list_folder, read_bytes
+from tofuse.files.reading import files_named, if_file, is_file, read_bytes
 from tofuse.parts import part
 from tofuse.recordings.camera_file import CameraFile, load_camera
 from tofuse.recordings.frames import RangeFrame
@@ -110,15 +110,9 @@ class Depth16Source(FileSource):
 
 
 def _files(path: Path) -> list[Path]:
-    if not is_folder(path):
-        return []
-    try:
-        return [p for p in list_folder(path) if p.name.lower().endswith(_ENDS) and is_file(p)]
-    except InputError:
-        return []
+    return files_named(path, lambda name: name.lower().endswith(_ENDS))
 
 
 def _color(file: Path) -> Path | None:
     end = next(end for end in _ENDS if file.name.lower().endswith(end))
-    path = file.with_name(f"{file.name[: -len(end)]}_image.jpg")
-    return path if is_file(path) else None
+    return if_file(file.with_name(f"{file.name[: -len(end)]}_image.jpg"))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import is_file, is_folder, list_folder, read_text
+from tofuse.files.reading import files_named, is_file, is_folder, list_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
@@ -38,7 +38,7 @@ class Kinect2:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        files = _depth_files(path)
+        files = files_named(path, _DEPTH.fullmatch)
         if not files:
             return None
         if any(_calibration(path, name) is not None for name, _ in _VIEWS.values()):
@@ -51,7 +51,7 @@ class Kinect2:
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = _depth_files(path)
+        files = files_named(path, _DEPTH.fullmatch)
         if not files:
             raise InputError("has no NNNN_depth.png", where=path, remedy="check the path")
         color = [_color(file) for file in files]
@@ -66,15 +66,6 @@ class Kinect2:
         source.metadata["sensor"] = "Kinect v2 (ToF)"
         source.warnings.append("no time stamps: frames are numbered in seconds")
         return source
-
-
-def _depth_files(path: Path) -> list[Path]:
-    if not is_folder(path):
-        return []
-    try:
-        return [p for p in list_folder(path) if _DEPTH.fullmatch(p.name) and is_file(p)]
-    except InputError:
-        return []
 
 
 def _color(file: Path) -> Path | None:

@@ -16,7 +16,7 @@ from tofuse.files.reading import is_file, name_order, read_head
 from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens, read_json
+from tofuse.recordings.camera_file import checked_lens, number_in, read_json
 from tofuse.recordings.frames import RangeFrame, UInt8
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.phones import refuse_replacement, resized
@@ -89,7 +89,7 @@ class NerfstudioSource(FileSource):
         timed = bool(np.isfinite(times).all())
         super().__init__(times if timed else np.arange(len(self.frames), dtype=float))
         self.unit_m = _unit(about, file, any("depth_file_path" in f.own for f in self.frames))
-        self.sigma_unit_m = _number(about, "sigma_unit_scale_factor", file, 1e-4)
+        self.sigma_unit_m = number_in(about, "sigma_unit_scale_factor", file, 1e-4, _REMEDY)
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
         if left_out:
             self.warnings.append(f"{file}: {left_out} frames have no depth: left out")
@@ -197,8 +197,8 @@ class _Frame:
 
     def number_of(self, name: str, default: float | None = None) -> float:
         if name in self.own:
-            return _number(self.own, name, self.where, default)
-        return _number(self.common, name, self.file, default)
+            return number_in(self.own, name, self.where, default, _REMEDY)
+        return number_in(self.common, name, self.file, default, _REMEDY)
 
     def lens(self, size: tuple[int, int]) -> Pinhole:
         """The camera of depth images of a size (width, height), of which colour may have more."""
@@ -259,7 +259,7 @@ def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
     """Metres of one count: as the file says, or nerfstudio's millimetre."""
     for name in ("depth_unit_scale_factor", "integer_depth_scale"):
         if name in about:
-            unit = _number(about, name, file)
+            unit = number_in(about, name, file, remedy=_REMEDY)
             if not 1e-9 <= unit <= 1:
                 raise InputError(f"is {unit:g}", where=f"{file}: {name}", remedy="give metres")
             return unit
@@ -270,19 +270,6 @@ def _unit(about: dict[str, Any], file: Path, nerfstudio: bool) -> float:
             remedy="write how many metres one count of depth is",
         )
     return 0.001
-
-
-def _number(
-    data: dict[str, Any], name: str, where: Path | str, default: float | None = None
-) -> float:
-    value = data.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        problem = "is missing" if value is None else f"is {value!r:.60}"
-        raise InputError(problem, where=f"{where}: {name}", remedy="give a number")
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise InputError("is too large", where=f"{where}: {name}", remedy=_REMEDY) from error
 
 
 def _array(path: Path) -> Float32:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import files_with, is_file, is_folder
+from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import read_json
@@ -66,8 +66,8 @@ class PolycamSource(PhoneSource):
         super().__init__(
             files,
             _times(files),
-            confidence=[_found(folder / "confidence" / file.name) for file in files],
-            color=[_found(folder / "images" / f"{file.stem}.jpg") for file in files],
+            confidence=[if_file(folder / "confidence" / file.name) for file in files],
+            color=[if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
         for file in files:
             path = folder / "cameras" / f"{file.stem}.json"
@@ -131,7 +131,3 @@ def _numbers(facts: dict[str, Any], names: tuple[str, ...] | list[str], path: Pa
         return np.array([facts[name] for name in names], float)
     except OverflowError as error:
         raise InputError("holds a number that is too large", where=path) from error
-
-
-def _found(path: Path) -> Path | None:
-    return path if is_file(path) else None

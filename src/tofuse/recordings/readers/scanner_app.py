@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.reading import is_file, is_folder, list_folder
+from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import read_json
@@ -39,7 +39,7 @@ class ScannerApp:
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
-        files = _depth_files(path)
+        files = files_named(path, _DEPTH.fullmatch)
         if any(is_file(_beside(file, "frame", ".json")) for file in files[:9]):
             return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
         return None
@@ -47,15 +47,15 @@ class ScannerApp:
     def open(self, path: Path, options: ReaderOptions) -> PhoneSource:
         """See `Reader.open`."""
         refuse_replacement(options, "3dscannerapp")
-        files = _depth_files(path)
+        files = files_named(path, _DEPTH.fullmatch)
         if not files:
             raise InputError("has no depth_*.png", where=path, remedy="export with all data")
         size = first_size(files)
         source = PhoneSource(
             files,
             np.full(len(files), np.nan),
-            confidence=[_found(_beside(file, "conf", ".png")) for file in files],
-            color=[_found(_beside(file, "frame", ".jpg")) for file in files],
+            confidence=[if_file(_beside(file, "conf", ".png")) for file in files],
+            color=[if_file(_beside(file, "frame", ".jpg")) for file in files],
         )
         poses = np.full((len(files), 4, 4), np.nan)
         unknown: list[InputError] = []
@@ -137,18 +137,5 @@ def _fill_times(source: PhoneSource) -> None:
     source.timestamps[~known] = np.interp(index[~known], index[known], source.timestamps[known])
 
 
-def _depth_files(path: Path) -> list[Path]:
-    if not is_folder(path):
-        return []
-    try:
-        return [p for p in list_folder(path) if _DEPTH.fullmatch(p.name) and is_file(p)]
-    except InputError:
-        return []
-
-
 def _beside(file: Path, name: str, suffix: str) -> Path:
     return file.with_name(f"{name}_{file.stem.split('_', 1)[1]}{suffix}")
-
-
-def _found(path: Path) -> Path | None:
-    return path if is_file(path) else None

@@ -13,7 +13,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
-from tofuse.recordings.camera_file import checked_lens
+from tofuse.recordings.camera_file import checked_lens, number_in
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.phones import first_size
 from tofuse.recordings.reader import ReaderOptions, Sniff
@@ -49,9 +49,9 @@ class Zense:
         rate = FRAME_RATE_HZ
         if settings is not None:
             values = _read(settings)
-            rate = _number(values, "capture_fps", settings, FRAME_RATE_HZ)
+            rate = number_in(values, "capture_fps", settings, FRAME_RATE_HZ)
             if options.camera is None:
-                lens = {name: _number(values, key, settings) for name, key in _LENS.items()}
+                lens = {name: number_in(values, key, settings) for name, key in _LENS.items()}
                 camera = checked_lens(Pinhole, _size(values, files, settings), lens, settings)
         if not 0.01 <= rate <= 1e4:
             rate = FRAME_RATE_HZ
@@ -88,22 +88,11 @@ def _read(path: Path) -> dict[str, Any]:
     return values
 
 
-def _number(values: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
-    value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        problem = "is missing" if value is None else f"is {value!r:.60}"
-        raise InputError(problem, where=f"{path}: {key}", remedy="give a number")
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise InputError("is too large", where=f"{path}: {key}", remedy="correct it") from error
-
-
 def _size(values: dict[str, Any], files: list[Path], path: Path) -> tuple[int, int]:
     """Return (width, height) as the file tells, or else of the images."""
     if "image_width" not in values or "image_height" not in values:
         return first_size(files)
-    size = tuple(_number(values, key, path) for key in ("image_width", "image_height"))
+    size = tuple(number_in(values, key, path) for key in ("image_width", "image_height"))
     if not all(2 <= side <= 16384 for side in size):
         raise InputError(f"is {size[0]:g} x {size[1]:g}", where=f"{path}: image_width")
     return int(size[0]), int(size[1])
