@@ -7,7 +7,8 @@ import pytest
 
 from test_posegraph_refine import OPTIONS, path, surfaces
 from tofuse.geometry import se3
-from tofuse.posegraph.refine import Beside, Refined, refine
+from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.refine import Beside, Refined, refine, response
 from tofuse.posegraph.suspicion import Gap, longest_loop, suspicion
 from tofuse.posegraph.views import KeptView
 
@@ -48,6 +49,22 @@ def test_a_camera_that_does_not_err_is_not():
     found = suspicion(views, refined, OPTIONS, Beside.nothing())
     assert not found.alarm
     assert found.gap is None
+
+
+def test_a_focal_length_that_nothing_holds_is_not_known():
+    # Without rotation a wrong focal length makes everything wider alike: views agree all the same.
+    truth = path(12)
+    truth[:, :3, :3] = np.eye(3)
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.01)]
+    turned = [KeptView.of(s, 1500) for s in surfaces(path(12), noise=0.01)]
+
+    def sigma(views: list[KeptView], poses: np.ndarray) -> float:
+        pairs = refine(views, poses, OPTIONS).pairs
+        said = response(views, poses, pairs, OPTIONS)
+        return float(said.sigma(pairs, len(views))[kernels.FOCAL])
+
+    assert sigma(views, truth) > 0.1
+    assert sigma(turned, path(12)) < 0.02
 
 
 def test_few_views_suspect_nothing():

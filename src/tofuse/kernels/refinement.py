@@ -206,8 +206,14 @@ def pair_equations(
         f = 1 - e2
         out[SUPPORT] += f * f * f
         # The mean of both views' normals: noise in one of them then counts half.
-        jacobian_row(J, 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2), px, py, pz)
+        m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
+        jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = 0.0
+        # In the errors the same mean: else the difference of both views' normals, which no motion
+        # explains, would seem to tell of them.
+        n0 = r00 * m0 + r01 * m1 + r02 * m2
+        n1 = r10 * m0 + r11 * m1 + r12 * m2
+        n2 = r20 * m0 + r21 * m1 + r22 * m2
         for p in range(asked):
             J[7 + p] = (m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]) - (
                 n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2]
@@ -239,13 +245,15 @@ def pair_equations(
         s0 = np.float64(point[LIGHT_SLOPE])
         s1 = np.float64(point[LIGHT_SLOPE + 1])
         s2 = np.float64(point[LIGHT_SLOPE + 2])
-        jacobian_row(J, 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2), px, py, pz)
+        m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
+        jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = -1.0
         for p in range(asked):
             J[7 + p] = m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
         if asked > FOCAL:
             # Where the target's own pixels look is moved by its focal length alone.
-            J[7 + FOCAL] -= tx * xn + ty * yn
+            J[7 + FOCAL] -= (r00 * m0 + r01 * m1 + r02 * m2) * x
+            J[7 + FOCAL] -= (r10 * m0 + r11 * m1 + r12 * m2) * y
         _add(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
     q = H
     for p in range(UNKNOWNS):
