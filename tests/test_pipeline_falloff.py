@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.maps.surface_map import SurfaceOptions
+from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.falloff import estimate_falloff
 from tofuse.pipeline.learn import learnt
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.sensor.models import camera_model
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
@@ -23,6 +24,16 @@ from tofuse.simulation.scene import build
 @pytest.fixture(scope="module")
 def frames() -> list[RangeFrame]:
     scene, path = build("room", texture=True)
+    effects = Effects.none(shot_noise=True)
+    model = camera_model("sr4000")
+    taken = [render(scene, path, model, k, effects=effects).frame for k in range(0, 48, 2)]
+    return [replace(frame, index=n, timestamp=n / 15) for n, frame in enumerate(taken)]
+
+
+@pytest.fixture(scope="module")
+def wall() -> list[RangeFrame]:
+    """Along a wall with pictures on it, which only light tells from standing still."""
+    scene, path = build("wall", texture=True)
     effects = Effects.none(shot_noise=True)
     model = camera_model("sr4000")
     taken = [render(scene, path, model, k, effects=effects).frame for k in range(0, 48, 2)]
@@ -63,3 +74,18 @@ def test_a_recording_without_amplitude_or_motion_shows_none(frames):
     source = ArraySource(tuple(dark))
     config = learnt(from_method("default"), Recording.of(source, "made", "arrays"), threads=1)
     assert config.odometry.surface.falloff == 0.0
+
+
+@pytest.mark.parametrize("exponent", [0.0, 4.0])
+def test_light_helps_where_geometry_does_not_tell_the_motion(wall, exponent):
+    given = recording(wall, exponent)
+    views = [surface_map(frame, SurfaceOptions(falloff=0.0)) for frame in given]
+    by_shape = replace(ProjectiveOptions(), photometric=False)
+    assert len(align(views[4], [Target(views[0], np.eye(4))], np.eye(4), by_shape).unobservable)
+    found = estimate_falloff(given, lambda f: f, SurfaceOptions())
+    assert found == pytest.approx(exponent, abs=0.6)
+
+
+def test_a_few_pairs_are_enough(frames):
+    few = recording(frames[:4], 4.0)
+    assert estimate_falloff(few, lambda f: f, SurfaceOptions()) == pytest.approx(4.0, abs=0.6)
