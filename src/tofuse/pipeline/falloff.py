@@ -175,7 +175,8 @@ def _without(view: SurfaceMap, exponent: float) -> SurfaceMap:
     x, y = np.moveaxis(view.rays, -1, 0)
     length2 = 1 + x * x + y * y
     more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
-    return replace(view, photo=view.photo + np.float32(exponent) * more)
+    photo = np.asarray(view.photo + exponent * more, np.float32)
+    return replace(view, photo=photo)
 
 
 def _slope(source: SurfaceMap, target: SurfaceMap, T: Float64) -> _Slope | None:
