@@ -1,9 +1,11 @@
 """Attacks on the boundary of the program: damaged files, cut-off writes, poor surroundings.
 
     python benchmarks/attack.py [--quick] [--files N] [--kills N] [--only files|kills|surroundings]
+                                [--journal FILE] [--minutes M]
 
 Prints for each how many were tried and how many held; ends with 1 if any did not. What is promised,
-and so what it is to hold, is in docs/reliability.md.
+and so what it is to hold, is in docs/reliability.md. The whole takes hours. With a journal it goes
+on where it was stopped, or where `--minutes` ended it, and the table is of all that was done.
 """
 
 from __future__ import annotations
@@ -12,63 +14,98 @@ import argparse
 import itertools
 import sys
 import tempfile
-from collections import Counter
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from attacks import mutation
-from attacks.environments import ENVIRONMENTS, attempt
+from attacks.environments import ENVIRONMENTS, Environment, attempt
+from attacks.journal import Journal
 from attacks.power import Power, PowerCut
 
 FILES, KILLS = 20_000, 500
 QUICK_FILES, QUICK_KILLS, QUICK_ENVIRONMENTS = 300, 60, 12
+FILES_IN_PIECE, KILLS_IN_PIECE = 100, 25
+
+Work = Callable[[], tuple[int, list[str]]]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="some hundreds in all")
-    parser.add_argument("--files", type=int)
-    parser.add_argument("--kills", type=int)
+    parser.add_argument("--files", type=int, help=f"damaged files in all; {FILES} unless given")
+    parser.add_argument("--kills", type=int, help=f"power cuts; {KILLS} unless given")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=("files", "kills", "surroundings"))
+    parser.add_argument("--journal", type=Path, help="keeps what is done, to go on from")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin nothing after these")
     arguments = parser.parse_args()
     quick, only = arguments.quick, arguments.only
     files = arguments.files or (QUICK_FILES if quick else FILES)
     kills = arguments.kills or (QUICK_KILLS if quick else KILLS)
-    rows: list[tuple[str, int, int]] = []
-    if only in (None, "kills"):
-        rows.append(cut_writes(kills, arguments.seed))
-    if only in (None, "surroundings"):
-        rows.append(surroundings(QUICK_ENVIRONMENTS if quick else len(ENVIRONMENTS)))
-    if only in (None, "files"):
-        rows += damaged_files(files, arguments.seed)
+    most = QUICK_ENVIRONMENTS if quick else len(ENVIRONMENTS)
+    begun = time.monotonic()
+    journal = Journal(arguments.journal, {"seed": arguments.seed, "files": files, "kills": kills})
+    with tempfile.TemporaryDirectory() as base:
+        plan = {
+            "kills": lambda: cut_writes(kills, arguments.seed),
+            "surroundings": lambda: surroundings(most, Path(base)),
+            "files": lambda: damaged_files(files, arguments.seed),
+        }
+        work = [part() for name, part in plan.items() if only in (None, name)]
+        left = False
+        for name, number, attack in itertools.chain(*work):
+            left = time.monotonic() - begun > 60 * arguments.minutes
+            if left:
+                break
+            journal.do(name, number, attack)
+    rows = journal.table()
     print(f"\n{'attack':40} {'tried':>7} {'held':>7}")
     for name, tried, held in rows:
         print(f"{name:40} {tried:7} {held:7}")
     tried, held = (sum(row[k] for row in rows) for k in (1, 2))
-    print(f"{'all':40} {tried:7} {held:7}")
+    print(f"{'all':40} {tried:7} {held:7}{'  (not done yet)' if left else ''}")
     return 0 if tried == held else 1
 
 
-def damaged_files(total: int, seed: int) -> list[tuple[str, int, int]]:
+def pieces(total: int, size: int) -> Iterator[tuple[int, int, int]]:
+    """Number, first and count of the pieces of so many."""
+    for number, first in enumerate(range(0, total, size)):
+        yield number, first, min(size, total - first)
+
+
+def damaged_files(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
     """Damaged files of each format, as many of each."""
-    names = list(mutation.subjects())
-    each = -(-total // len(names))
-    rows = []
-    for name in names:
-        outcomes = Counter()
-        for k, outcome in mutation.run(name, each, 1_000_000 * seed):
-            outcomes[outcome] += 1
-            if outcome not in ("read", "refused"):
-                print(f"{name}, seed {k}: {outcome}", flush=True)
-        rows.append((f"damaged: {name}", each, outcomes["read"] + outcomes["refused"]))
-    return rows
+    subjects = mutation.subjects()
+    each = -(-total // len(subjects))
+
+    def work(name: str, first: int, count: int) -> tuple[int, list[str]]:
+        outcomes = mutation.run(name, count, 1_000_000 * seed + first)
+        return count, [f"seed {k}: {said}" for k, said in outcomes if said not in HELD]
+
+    for number, first, count in pieces(each, FILES_IN_PIECE):
+        for name in subjects:
+            yield f"damaged: {name}", number, lambda n=name, f=first, c=count: work(n, f, c)
 
 
-def cut_writes(total: int, seed: int) -> tuple[str, int, int]:
+HELD = ("read", "refused")
+
+
+def cut_writes(total: int, seed: int) -> Iterator[tuple[str, int, Work]]:
     """Power cuts at random calls to the system: writing, and then going on, again and again."""
+    for number, first, count in pieces(total, KILLS_IN_PIECE):
+        yield (
+            "power cuts while a result is written",
+            number,
+            lambda f=first, c=count: cuts(f, c, seed),
+        )
+
+
+def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
+    """Some of the power cuts."""
     mutation.subjects()  # which finds the tests
     import made_results
     from tofuse.results.folder import OutputFolder, is_result, settle
@@ -81,14 +118,14 @@ def cut_writes(total: int, seed: int) -> tuple[str, int, int]:
         found = made_results.contents(folder)
         return {n: data for n, data in found.items() if not n.startswith(".tofuse-")}
 
-    rng = np.random.default_rng(seed)
-    held = 0
+    faults = []
     with tempfile.TemporaryDirectory() as base:
         results = {}
         for number in (1, 2):
             write(Path(base) / f"whole-{number}", number)
             results[number] = shown(Path(base) / f"whole-{number}")
-        for k in range(total):
+        for k in range(first, first + count):
+            rng = np.random.default_rng([seed, k])
             folder = Path(base) / f"cut-{k:06}"
             write(folder, 1)
             (folder / "mine.txt").write_bytes(b"mine")
@@ -103,32 +140,30 @@ def cut_writes(total: int, seed: int) -> tuple[str, int, int]:
                 OutputFolder(folder, overwrite=True).discard()
                 found = made_results.contents(folder)
                 mine = found.pop("mine.txt", None)
-                good = mine == b"mine" and found in results.values() and is_result(folder)
+                if mine != b"mine" or found not in results.values() or not is_result(folder):
+                    faults.append(f"cut {k}: neither the old result nor the new one")
             except Exception as error:
-                print(f"kill {k}: {type(error).__name__}: {error}", flush=True)
-                good = False
-            held += good
-            if not good:
-                print(f"kill {k} with seed {seed}: neither the old result nor the new one")
-    return "power cuts while a result is written", total, held
+                faults.append(f"cut {k}: {type(error).__name__}: {error}")
+    return count, faults
 
 
-def surroundings(most: int) -> tuple[str, int, int]:
+def surroundings(most: int, base: Path) -> Iterator[tuple[str, int, Work]]:
     """Runs that lack something."""
     from tofuse.simulation.record import simulate
 
     chosen = ENVIRONMENTS[:: max(1, len(ENVIRONMENTS) // most)][:most]
-    held = 0
-    with tempfile.TemporaryDirectory() as base:
-        recording = simulate("peaks", Path(base) / "rec", frames=2)
-        for k, environment in enumerate(chosen):
-            where = Path(base) / f"{k}"
-            where.mkdir()
-            outcome = attempt(environment, recording, where, "--method", "thesis")
-            held += not outcome.faults
-            if outcome.faults:
-                print(f"{environment.name}: {', '.join(outcome.faults)}", flush=True)
-    return "surroundings that lack something", len(chosen), held
+    recording = base / "rec"
+
+    def work(environment: Environment) -> tuple[int, list[str]]:
+        if not recording.exists():
+            simulate("peaks", recording, frames=2)
+        with tempfile.TemporaryDirectory(dir=base) as where:
+            outcome = attempt(environment, recording, Path(where), "--method", "thesis")
+        faults = "; ".join(outcome.faults)
+        return 1, [f"{environment.name}: {faults}"] if faults else []
+
+    for number, environment in enumerate(chosen):
+        yield "surroundings that lack something", number, lambda e=environment: work(e)
 
 
 if __name__ == "__main__":

@@ -49,4 +49,24 @@ def test_damaged_files_are_read_or_refused(attacks, tmp_path: Path) -> None:
 
 def test_power_cuts(attacks) -> None:
     attack, _ = attacks
-    assert attack.cut_writes(10, seed=3)[1:] == (10, 10)
+    assert attack.cuts(0, 10, seed=3) == (10, [])
+
+
+def test_a_journal_goes_on_where_it_was_stopped(attacks, tmp_path: Path) -> None:
+    from attacks.journal import Journal
+
+    path, settings = tmp_path / "new" / "a.jsonl", {"seed": 1}
+    done: list[int] = []
+
+    def work(number: int) -> tuple[int, list[str]]:
+        done.append(number)
+        return 10, ["it fell over"] if number == 1 else []
+
+    for most in (2, 3):
+        journal = Journal(path, settings)
+        for number in range(most):
+            journal.do("some", number, lambda n=number: work(n))
+    assert done == [0, 1, 2]
+    assert Journal(path, settings).table() == [("some", 30, 29)]
+    with pytest.raises(SystemExit, match="other settings"):
+        Journal(path, {"seed": 2})

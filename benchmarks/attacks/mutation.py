@@ -8,7 +8,6 @@ crashes is found out and the others go on.
 from __future__ import annotations
 
 import json
-import math
 import resource
 import shutil
 import signal
@@ -45,6 +44,7 @@ def subjects() -> dict[str, Subject]:
     if str(TESTS) not in sys.path:
         sys.path.insert(0, str(TESTS))
     import made_exports
+    import made_ifm
     import test_recordings_fuzz as plain
     import test_recordings_fuzz_cameras as cameras
 
@@ -59,7 +59,8 @@ def subjects() -> dict[str, Subject]:
     for name in ("blaze", "royale"):
         make = getattr(made_exports, f"make_{name}")
         found[name] = Subject(_in(make, "original"), _recording("original", None))
-    return found | _scans() | _bags() | _small()
+    h5 = _possible({"ifm-h5": made_ifm.make_h5}, lambda _name: "original/a.h5")
+    return found | h5 | _scans() | _bags() | _small()
 
 
 def _in(make: Callable[[Path], Any], inside: str) -> Callable[[Path], None]:
@@ -126,32 +127,50 @@ def _bags() -> dict[str, Subject]:
 
             path.mkdir()
             bag = bags.Bag(path, kind)
-            bag.info("/camera/depth/camera_info")
-            for k in range(2):
-                bag.image(bags.TOPIC, 10 + k, bags.COUNTS[k], "16UC1")
+            bags.depth_bag(bag)
+            bag.info("/camera/color/camera_info", D=(), lens=bags.RGB_LENS)
+            for part, T in (("depth", bags.T_RIG_DEPTH), ("color", bags.T_RIG_COLOR)):
+                bag.tf("/tf_static", 9.0, "rig", part, T)
+            for k, T in enumerate(bags.T_WORLD_RIG):
+                bag.tf("/tf", 9.95 + 0.1 * k, "map", "rig", T)
+                image = bags.color_at(k)
+                bag.image(bags.COLOR_TOPIC, 10 + 0.1 * k, image, "rgb8", frame="color", width=32)
             bag.close()
 
         return write
+
+    def real_sense(kind: str) -> Callable[[Path], None]:
+        def write(path: Path) -> None:
+            path.mkdir()
+            bags.real_sense(path, kind, "None", name="Intel RealSense L515", color="rgb8")
+
+        return write
+
+    def orbbec(path: Path) -> None:
+        path.mkdir()
+        bags.orbbec(path, (0.0,) * 8, color="jpeg", R=bags.T_COLOR[:3, :3])
 
     try:
         import test_recordings_ros as bags
 
         kinds = {f"rosbag {kind}": make(kind) for kind in bags.KINDS}
+        kinds |= {f"realsense {kind}": real_sense(kind) for kind in ("ros1", "ros2")}
+        kinds["orbbec"] = orbbec
     except ImportError:
         return {}
     found = _possible(kinds, lambda name: f"original/{name}")
-    return {name: Subject(s.make, _below(s.read)) for name, s in found.items()}
+    return {
+        name: Subject(subject.make, lambda folder, name=name: _bag(folder, name.split()[0]))
+        for name, subject in found.items()
+    }
 
 
-def _below(_read: Callable[[Path], object]) -> Callable[[Path], object]:
+def _bag(folder: Path, maker: str) -> None:
     """Read what lies in the one folder: a bag is a file or a folder."""
-
-    def read(folder: Path) -> None:
-        (inside,) = (folder / "original").iterdir()
-        for path in sorted(inside.iterdir()):
-            _recording(str(path.relative_to(folder)), "ros")(folder)
-
-    return read
+    format_ = "ros" if maker == "rosbag" else f"{maker}-bag"
+    (inside,) = (folder / "original").iterdir()
+    for path in sorted(inside.iterdir()):
+        _recording(str(path.relative_to(folder)), format_)(folder)
 
 
 def _possible(
@@ -473,12 +492,6 @@ def run(name: str, count: int, first: int = 0) -> Iterator[tuple[int, str]]:
         last = (said.strip().splitlines() or ["nothing was said"])[-1]
         yield done, f"its process ended with {worker.returncode}: {last[:150]}"
         done += 1
-
-
-def shares(names: list[str], total: int) -> dict[str, int]:
-    """How many of a total each subject gets."""
-    each = math.ceil(total / max(1, len(names)))
-    return dict.fromkeys(names, each)
 
 
 if __name__ == "__main__":
