@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help demo test lint docs format lock clean
+.PHONY: help demo test lint docs format lock audit sbom clean
 
 help:                       ## this list
 	@awk -F ':.*## *' '/^[a-z]+:.*##/ { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -25,6 +25,7 @@ lint: .venv/.ready          ## formatting, style, strict types, and who may impo
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python requirements/check.py
 
 # Pictures of the gallery are of results of this code: made again where it changed.
 docs/gallery/index.md: .venv/.ready $(wildcard website/*.py) $(shell find src -name '*.py')
@@ -41,11 +42,31 @@ format: .venv/.ready        ## put the code into its standard form
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+# Versions and the hashes of all their files. What users install, with the extras but not the benchmarks' peers, is runtime.txt.
+PIN = $(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --generate-hashes --upgrade
 lock: .venv/.ready          ## pin the newest versions that pyproject.toml allows
 	$(BIN)/python -m pip install --quiet uv
-	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group dev pyproject.toml requirements/build.in -o requirements/dev.txt --upgrade
-	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --group docs -c requirements/dev.txt -o requirements/docs.txt --upgrade
-	$(BIN)/uv pip compile --universal --python-version 3.11 --no-header --quiet --all-extras pyproject.toml -o requirements/extras.txt --upgrade
+	$(PIN) --group dev pyproject.toml requirements/build.in -o requirements/dev.txt
+	$(PIN) --group docs -c requirements/dev.txt -o requirements/docs.txt
+	$(PIN) --extra dask --extra hdf5 --extra ros --extra scan --extra texture --extra viewer pyproject.toml -c requirements/dev.txt -o requirements/runtime.txt
+	$(PIN) --all-extras pyproject.toml -o requirements/extras.txt
+	$(PIN) --group release -o requirements/release.txt
+
+build/release/.ready: requirements/release.txt
+	$(PYTHON) -m venv build/release
+	build/release/bin/python -m pip install --quiet --disable-pip-version-check -r requirements/release.txt
+	@touch $@
+
+audit: .venv/.ready build/release/.ready  ## look for known vulnerabilities of what is pinned
+	$(BIN)/python requirements/check.py
+	build/release/bin/pip-audit --disable-pip --require-hashes -r requirements/dev.txt
+	build/release/bin/pip-audit --disable-pip --require-hashes -r requirements/runtime.txt
+
+sbom: build/release/.ready  ## what a user installs, in CycloneDX: build/sbom.json
+	rm -rf build/described
+	$(PYTHON) -m venv --without-pip build/described
+	build/release/bin/python -m pip --python build/described/bin/python install --quiet --disable-pip-version-check -r requirements/runtime.txt
+	build/release/bin/cyclonedx-py environment --pyproject pyproject.toml --mc-type library --output-reproducible --of JSON -o build/sbom.json build/described/bin/python
 
 clean:                      ## remove the environment and what was built
 	rm -rf .venv build dist

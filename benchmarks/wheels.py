@@ -56,8 +56,8 @@ def main() -> int:
 
 def missing(uv: str, system: str, python: str, extra: str | None) -> str:
     """Return what has no wheel there; nothing if all do."""
-    command = [uv, "pip", "compile", "--quiet", "--no-header", "--only-binary", ":all:",
-               "--python-platform", system, "--python-version", python, "pyproject.toml"]  # fmt: skip
+    command = [uv, "pip", "compile", "--quiet", "--no-header", "--only-binary", ":all:"]
+    command += ["--python-platform", system, "--python-version", python, "pyproject.toml"]
     command += [] if extra is None else ["--extra", extra]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     return "" if done.returncode == 0 else reason(done.stderr)
@@ -76,7 +76,9 @@ def cell(lacking: dict[str, str]) -> str:
         return f"{PYTHONS[0]} to {PYTHONS[-1]}"
     if all(lacking.values()) and len(set(lacking.values())) == 1:
         return f"no {lacking[PYTHONS[0]]}"
-    return "; ".join(f"{python}: {f'no {what}' if what else 'yes'}" for python, what in lacking.items())
+    return "; ".join(
+        f"{python}: {f'no {what}' if what else 'yes'}" for python, what in lacking.items()
+    )
 
 
 if __name__ == "__main__":
