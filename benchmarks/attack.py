@@ -28,7 +28,7 @@ from attacks.power import Power, PowerCut
 
 FILES, KILLS = 20_000, 500
 QUICK_FILES, QUICK_KILLS, QUICK_ENVIRONMENTS = 300, 60, 12
-FILES_IN_PIECE, KILLS_IN_PIECE = 100, 25
+FILES_IN_PIECE, KILLS_IN_PIECE = 200, 25
 
 Work = Callable[[], tuple[int, list[str]]]
 

@@ -396,9 +396,9 @@ def rows(folder: Path, counts: list[int], more: list[str], *, truth: bool) -> It
         yield "        ms: " + ", ".join(f"{name} {ms:.1f}" for name, ms in stages.items())
 
 
-def there_and_back(recording: Path, count: int) -> Path:
+def there_and_back(recording: Path, count: int, folder: Path | None = None) -> Path:
     """A native folder of links to images: the recording forwards, backwards, and so on."""
-    folder = OUT / f"back-{recording.name}-{count}"
+    folder = folder or OUT / f"back-{recording.name}-{count}"
     if (folder / "camera.json").exists():
         return folder
     if not (recording / "camera.json").exists():

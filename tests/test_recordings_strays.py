@@ -9,9 +9,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import tofuse
+from made_recordings import make_sr4000
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.arrays import read_npz
@@ -130,3 +132,18 @@ def test_absurd_numbers_beside_the_images_are_no_warnings_of_numpy(recording) ->
     rows = "".join(f"{0.01 * k},1e308,1e308,1e308,1e308,0,0\n" for k in range(50))
     (recording / "imu.csv").write_text("t,ax,ay,az,gx,gy,gz\n" + rows)
     assert not any(isinstance(item, InputError) for item in tofuse.open(recording).read_all())
+
+
+def test_time_is_not_asked_of_what_is_no_file(tmp_path: Path) -> None:
+    """A device has no end, and a queue is waited for until somebody writes."""
+    folder = tmp_path / "rec"
+    make_sr4000(folder, 4)
+    first, second, *_ = sorted(folder.iterdir())
+    for path in (first, second):
+        path.unlink()
+    first.symlink_to("/dev/zero")
+    os.mkfifo(second)
+    recording = tofuse.open(folder, format="sr4000")
+    np.testing.assert_allclose(np.diff(recording.timestamps[2:]), 0.03125)
+    bad = [isinstance(item, InputError) for item in recording.read_all()]
+    assert bad == [True, True, False, False]

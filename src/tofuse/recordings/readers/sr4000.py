@@ -139,11 +139,13 @@ class Sr4000Source(FileSource):
 
 def _time_stamp(path: Path) -> float:
     """Seconds, from the last lines of a file; NaN if there are none."""
+    if not is_file(path):  # a queue would be waited for, a device read for ever
+        return float("nan")
     try:
         with path.open("rb") as file:
             file.seek(0, 2)
             file.seek(max(0, file.tell() - _TAIL))
-            found = _TIME.search(file.read())
+            found = _TIME.search(file.read(_TAIL))
         return float(found.group(1)) / 1000 if found else float("nan")
     except (OSError, ValueError):
         return float("nan")
