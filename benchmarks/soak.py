@@ -6,8 +6,8 @@
 
 `frames` reads a recording of so many images, which goes forth and back through a made room, and
 maps it in one go. `runs` makes whole runs in one process, of clouds and of images by turns, with
-all of their files. `live` takes what a camera sends in an hour of its own time, of which some is missing,
-some comes twice and some after its successor: once into a recording, once into a mapper.
+all of their files. `live` takes what a camera sends in an hour of its own time, of which some is
+missing, some comes twice and some after its successor: once into a recording, once into a mapper.
 
 Each prints the resident memory, open file handles and threads at ten places on the way. Memory must
 not grow, from the middle on, by more than what is kept of a frame on purpose (its record and how it

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
 import struct
 import zipfile
 from pathlib import Path
@@ -24,6 +26,7 @@ from tofuse.files.tileset import read_tileset
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.results.export import FORMATS, export
+from tofuse.results.folder import LOCK, OutputFolder
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)
@@ -420,3 +423,45 @@ def test_an_empty_cloud(result: Path) -> None:
     assert pypcd4.PointCloud.from_path(pcd).points == 0
     with pytest.raises(InputError, match="there are no points"):
         export(result, ["e57"])
+
+
+def test_one_process_at_a_time_writes_beside_a_result(result: Path, tmp_path: Path) -> None:
+    with OutputFolder(result, overwrite=True):
+        with pytest.raises(OutputError, match="is being written by another process"):
+            export(result, ["kitti"])
+        assert export(result, ["kitti"], tmp_path / "other")[0].exists()  # the old one is whole
+    seen: list[OutputError] = []
+
+    def during(_result: object, _path: Path) -> None:
+        with pytest.raises(OutputError, match="is being written by another process") as caught:
+            OutputFolder(result, overwrite=True)
+        seen.append(caught.value)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FORMATS, "log", ("trajectory.log", during))
+        export(result, ["log"])
+    assert len(seen) == 1
+    assert not (result / LOCK).exists()
+
+
+def test_the_lock_of_a_component_is_that_of_its_result(result: Path) -> None:
+    """A run replaces its components' folders as a whole, so nothing of ours may lie there."""
+    part = result / "component-1"
+    shutil.copytree(result, result.parent / "copy")
+    shutil.move(result.parent / "copy", part)
+    with OutputFolder(result, overwrite=True):
+        with pytest.raises(OutputError, match="is being written") as caught:
+            export(part, ["kitti"])
+        assert caught.value.where == str(result)
+    assert export(part, ["kitti"])[0].exists()
+    assert not list(part.glob(".tofuse-*"))
+
+
+def test_a_result_that_is_replaced_meanwhile_is_no_result(result: Path, tmp_path: Path) -> None:
+    def during(_result: object, _path: Path) -> None:
+        os.utime(result / "run.json", ns=(1, 1))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FORMATS, "log", ("trajectory.log", during))
+        with pytest.raises(InputError, match="was replaced by another run while it was read"):
+            export(result, ["log"], tmp_path / "other")

@@ -17,13 +17,14 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, new_folder, output_error
 from tofuse.files.images import jpeg_bytes
 from tofuse.files.ply import read_ply
+from tofuse.files.stamps import stamp
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
 from tofuse.fusion.exchange import Shape
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import baked
 from tofuse.fusion.upright import upright
 from tofuse.results.colmap import write_colmap
-from tofuse.results.folder import TILES, TILESET, is_result, settle
+from tofuse.results.folder import RESULT, TILES, TILESET, claimed, home, is_result, settle
 from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.output import read_run_json
 from tofuse.results.tiles import is_tiles, write_tiles
@@ -247,6 +248,8 @@ def export(
 ) -> list[Path]:
     """Write a result in other formats; returns the files.
 
+    Where the files go, no other process may write meanwhile.
+
     Parameters
     ----------
     folder
@@ -267,12 +270,13 @@ def export(
     Raises
     ------
     InputError
-        If the folder holds no result, a format is unknown, or lacks what it needs.
+        If the folder holds no result, a format is unknown, or lacks what it needs; or the result
+        was replaced while it was read.
     OutputError
-        If a file is there already, or can't be written.
+        If a file is there already, or can't be written, or another process writes into the folder.
     """
     folder = Path(folder)
-    settle(folder)
+    settle(home(folder))
     if not is_result(folder):
         raise InputError("holds no result", where=folder, remedy="give the --out of `tofuse run`")
     unknown = [name for name in formats if name not in FORMATS]
@@ -280,13 +284,30 @@ def export(
         raise InputError(f"is {unknown[0]!r}", where="FORMAT", remedy=f"use one of {list(FORMATS)}")
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
-    for path in files.values():
-        if path.exists() and not overwrite:
-            raise OutputError(
-                "is there already", where=path, remedy="give --overwrite to replace it"
-            )
     make_folder(target)
-    result = _Result(folder, faces, every, pinhole)
-    for name, path in files.items():
-        FORMATS[name][1](result, path)
+    with claimed(target), _unchanged(folder):
+        for path in files.values():
+            if path.exists() and not overwrite:
+                raise OutputError(
+                    "is there already", where=path, remedy="give --overwrite to replace it"
+                )
+        result = _Result(folder, faces, every, pinhole)
+        for name, path in files.items():
+            FORMATS[name][1](result, path)
     return list(files.values())
+
+
+@contextmanager
+def _unchanged(folder: Path) -> Iterator[None]:
+    """Refuse what was read of a result in the block if a run replaced it meanwhile.
+
+    Whoever writes elsewhere holds no lock of the result, which may be read-only.
+    """
+    before = stamp(folder / RESULT.marker)
+    yield
+    if not is_result(folder) or stamp(folder / RESULT.marker) != before:
+        raise InputError(
+            "was replaced by another run while it was read",
+            where=folder,
+            remedy="export it again with --overwrite",
+        )

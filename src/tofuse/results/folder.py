@@ -237,6 +237,31 @@ def check_free(path: str | Path) -> None:
         Claim(lock, what=path).release()
 
 
+def home(folder: Path) -> Path:
+    """Return the folder whose lock a folder is under: that of its result, for a component's."""
+    parent = folder.resolve().parent
+    if component_number(folder.resolve()) is not None and is_result(parent):
+        return parent
+    return folder
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder in the block: no run replaces what is in it.
+
+    Raises
+    ------
+    OutputError
+        If another process writes into it, or it can't be written.
+    """
+    place = home(folder)
+    claim = Claim(place / LOCK, what=place)
+    try:
+        yield
+    finally:
+        claim.release()
+
+
 def _recover(folder: Path, contract: Contract) -> None:
     """Finish the moves of a program that was stopped at them."""
     staging = folder / STAGING
