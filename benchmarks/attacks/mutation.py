@@ -8,6 +8,7 @@ crashes is found out and the others go on.
 from __future__ import annotations
 
 import json
+import os
 import resource
 import shutil
 import signal
@@ -25,7 +26,7 @@ import numpy as np
 
 TESTS = Path(__file__).parents[2] / "tests"
 _SECONDS = 20  # of the processor, for one file
-_WAITING = 15  # times as long may pass on the clock of a busy machine
+_WAITING = 6  # times as long may pass on the clock of a busy machine
 _MORE_BYTES = 3 << 30  # of addresses, than what is loaded has
 _DEEP = 100_000
 _WORDS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999", b"", b"x", b"\xff", b"1e-300", b"1e300",
@@ -388,8 +389,6 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
 
 def _odd(path: Path, rng: np.random.Generator) -> None:
     """Something that is no file."""
-    import os
-
     if os.path.lexists(path):
         return
     match int(rng.integers(6)):
@@ -481,6 +480,7 @@ def run(name: str, count: int, first: int = 0) -> Iterator[tuple[int, str]]:
         worker = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             cwd=Path(__file__).parents[1],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
         )  # fmt: skip
         assert worker.stdout is not None
         assert worker.stderr is not None
