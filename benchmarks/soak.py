@@ -249,7 +249,7 @@ def live(
         sent = camera.sent
     good &= judged(f"mapping of {what}", held, FRAME_BYTES)
     result = mapper.finish()
-    repeated = len(mapper.repeated)
+    repeated = len(mapper.log.repeated)
     print(f"{len(result.trajectory)} of {sent.frames} frames have a pose, {repeated} came twice")
     return good and len(result.trajectory) == sent.frames and repeated == sent.doubled
 

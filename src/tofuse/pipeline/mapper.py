@@ -219,6 +219,11 @@ class Mapper:
             self._tracker = config.odometry.start(self.seed)
 
     @property
+    def log(self) -> FrameLog:
+        """What became of every frame so far."""
+        return self._log
+
+    @property
     def views(self) -> Sequence[PosedView[SurfaceMap]]:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
         return self._kept.views.views

@@ -24,6 +24,7 @@ from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.self_calibration import self_calibrated
+from tofuse.pipeline.state_checks import check_tracked
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.noise import noise_model_for
@@ -104,7 +105,9 @@ def _once(
         tracked = stages.load(_TRACKING)
         if tracked is None:
             tracked = Tracked(Mapper(config, seed=seed, threads=threads, loops=loops))
-        elif tracked.done:
+        else:
+            check_tracked(tracked, recording)
+        if tracked.done:
             progress.note(f"goes on after frame {tracked.done} of a run that was stopped")
         tracked.mapper.go_on(threads, progress)
         if tracked.done < len(recording):

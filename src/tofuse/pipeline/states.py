@@ -1,7 +1,8 @@
 """Objects of our own types as plain data and arrays, and back: what a checkpoint holds.
 
 No code and no name of anything else comes out of such data. A class is found by its name in a list
-of those that these rooms define, and is filled, not called. What is shared stays shared.
+of those that these rooms define, and is filled, not called; what its constructor checks is checked
+then (`state_checks`). What is shared stays shared.
 
 The data is a list of nodes. A value is a plain number, text or nothing; or the number of a node, in
 a list of its own. A node is its kind and what belongs to it.
@@ -22,7 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.errors import InputError
 from tofuse.files.spill import SpillFile
+from tofuse.pipeline.state_checks import check_objects
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -230,11 +233,15 @@ class _Decoder:
     def run(self) -> Any:
         try:
             (state,) = self._item(0)
+            ours = frozenset(known_types().values())
+            check_objects(item for item in self._made.values() if type(item) in ours)
         except StateError:
             raise
         except RecursionError:
             raise StateError("it is nested too deeply") from None
-        except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        except InputError as error:
+            raise StateError(str(error)) from error
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise StateError(f"it is none ({type(error).__name__}: {error})") from error
         return state
 

@@ -1,0 +1,160 @@
+"""What the objects of a state must be like before anything works on them.
+
+A state is filled, not constructed, and compiled code does not look whether an index lies within an
+array. So what a constructor refuses is refused here too, and arrays must have the types and shapes
+that their classes promise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.files.spill import _Entry
+from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.mesh import Mesh
+from tofuse.fusion.views import RangeView
+from tofuse.geometry import se3
+from tofuse.kernels.alignment import PIXEL_SIZE, POINT_SIZE
+from tofuse.maps.surface_map import Projection, SurfaceMap
+from tofuse.odometry.base import Step
+from tofuse.odometry.keyframe_map import Keyframe
+from tofuse.pipeline.frame_log import Entry
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.refinement import Refinement
+from tofuse.posegraph.views import Outline, PosedView
+from tofuse.registration.base import Registration
+from tofuse.results.samples import FrameSample
+from tofuse.results.types import FrameRecord
+
+if TYPE_CHECKING:
+    from tofuse.pipeline.reconstruct import Tracked
+    from tofuse.recordings.recording import Recording
+
+# Type and sizes of arrays; letters stand for any, within one object the same. An exclamation mark:
+# all are finite. Attributes that an object lacks, or that are None, are not looked at.
+_ARRAYS: dict[type, dict[str, str]] = {
+    SurfaceMap: {
+        "rays": "f4 H W 2", "z": "f4 H W", "sigma": "f4 H W", "planes": "f4 H W 4",
+        "plane_variance": "f4 H W", "photo": "f4 H W 3", "pixel_variance": "f4 H W",
+        "target": f"f4 H W {PIXEL_SIZE}",
+    },
+    Projection: {"rays": "f4 H W 2", "lookup": "f4 A B 2", "frame": "f8! 4", "lengths2": "f4 H W"},
+    Outline: {"points": f"f4 N {POINT_SIZE}", "target": f"f4 H W {PIXEL_SIZE}"},
+    RangeView: {"z": "u2 H W", "normals": "i1 H W 3", "strength": "u1 H W"},
+    Step: {"T_component_camera": "f8! 4 4", "moving": "b1 H W"},
+    Keyframe: {"T_component_camera": "f8! 4 4"},
+    PosedView: {"T_component_camera": "f8! 4 4"},
+    Registration: {"T_target_source": "f8! 4 4", "information": "f8! 6 6",
+                   "unobservable": "f8! N 6"},
+    FrameRecord: {"covariance": "f8 6 6", "unobservable": "f8! N 6"},
+    Entry: {"T_odometry": "f8! 4 4", "gravity": "f8! 4"},
+    FrameSample: {"depth": "f2 H W", "fate": "u1 H W", "amplitude": "f4 H W"},
+    PoseGraph: {"ids": "i8 N", "poses": "f8! N 4 4", "edges": "i8 M 2", "loop": "b1 M",
+                "measurements": "f8! M 4 4", "information": "f8! M 6 6"},
+    Refinement: {"poses": "f8! N 4 4"},
+    Mesh: {"vertices": "f4! N 3", "faces": "i4 M 3", "normals": "f4 N 3", "color": "u1 N 3",
+           "sigma": "f4 N", "views": "i4 N", "offset": "f8! 3"},
+    Cloud: {"points": "f4! N 3", "normals": "f4 N 3", "color": "u1 N 3", "sigma": "f4 N",
+            "views": "i4 N", "offset": "f8! 3"},
+}  # fmt: skip
+
+
+def check_objects(items: Iterable[Any]) -> None:
+    """Refuse objects of ours that their classes would not have made.
+
+    Raises
+    ------
+    ValueError, InputError
+        Which attribute is wrong. Constructors may raise others.
+    """
+    found = list(items)
+    # What was put away lies in a file: an entry has its shapes, beside an item without arrays.
+    entries = [item for item in found if type(item) is _Entry]
+    shells = {id(entry.shell) for entry in entries}
+    for entry in entries:
+        arrays = dict(vars(entry.shell))
+        for name, shape in entry.shapes.items():
+            arrays[name] = np.broadcast_to(np.zeros((), arrays[name].dtype), _sizes(shape))
+        check_arrays(type(entry.shell), arrays)
+    for item in found:
+        if id(item) in shells:
+            continue
+        made = getattr(item, "__post_init__", None)
+        if made is not None:
+            made()
+        check_arrays(type(item), vars(item))
+        if type(item) is Mesh and not _within(item.faces, len(item.vertices)):
+            raise ValueError("a triangle of a mesh names a vertex that is not there")
+
+
+def check_arrays(kind: type, found: Mapping[str, Any]) -> None:
+    """Refuse arrays of a class that are not of the types and shapes that it promises.
+
+    Raises
+    ------
+    ValueError, InputError
+        Which of them, and what it is.
+    """
+    sizes: dict[str, int] = {}
+    for name, promised in _ARRAYS.get(kind, {}).items():
+        array = found.get(name)
+        if array is None:
+            continue
+        code, *wanted = promised.split()
+        if not isinstance(array, np.ndarray) or array.dtype != np.dtype(code.rstrip("!")):
+            raise ValueError(f"{name} of a {kind.__name__} is no array of {code.rstrip('!')}")
+        fits = len(array.shape) == len(wanted) and all(
+            size == (int(want) if want.isdecimal() else sizes.setdefault(want, size))
+            for size, want in zip(array.shape, wanted, strict=True)
+        )
+        if not fits:
+            raise ValueError(f"{name} of a {kind.__name__} has shape {array.shape}")
+        if code.endswith("!") and not np.isfinite(array).all():
+            raise ValueError(f"{name} of a {kind.__name__} is not finite")
+        if name.startswith("T_"):
+            se3.check_pose(array, where=f"{name} of a {kind.__name__}")
+
+
+def check_tracked(tracked: Tracked, recording: Recording) -> None:
+    """Refuse what was tracked of another recording than this one.
+
+    Raises
+    ------
+    ValueError
+        What does not agree.
+    """
+    entries = tracked.mapper.log.entries
+    done = tracked.done
+    if type(done) is not int or not 0 <= done <= len(recording) or len(entries) != done:
+        raise ValueError(f"{len(entries)} frames are kept of {done} that were tracked")
+    indices = [entry.record.index for entry in entries]
+    times = np.array([entry.record.timestamp for entry in entries])
+    if indices != recording.indices[:done].tolist():
+        raise ValueError("the frames that were tracked have other numbers")
+    if not np.array_equal(times, recording.timestamps[:done]):
+        raise ValueError("the frames that were tracked have other times")
+    known = set(indices)
+    for entry in entries:
+        step = entry.step
+        named = [] if step is None else [k for link in step.links for k in (link.i, link.j)]
+        if step is not None and step.reference is not None:
+            named.append(step.reference)
+        if not known.issuperset(named):
+            raise ValueError(f"frame {entry.record.index} was registered to one that is not there")
+    if not known.issuperset(view.index for view in tracked.mapper.views):
+        raise ValueError("a view is of a frame that is not there")
+
+
+def _within(index: NDArray[Any], count: int) -> bool:
+    return not index.size or bool(index.min() >= 0 and index.max() < count)
+
+
+def _sizes(shape: Any) -> tuple[int, ...]:
+    sizes = tuple(shape)
+    if not all(type(size) is int and 0 <= size < 1 << 31 for size in sizes):
+        raise ValueError("an array that was put away has no shape")
+    return sizes
