@@ -12,7 +12,7 @@ import pytest
 
 import tofuse
 from made_rooms import at, seen
-from tofuse.files.spill import Scratch
+from tofuse.files.spill import Scratch, Spill
 from tofuse.fusion.mesh import Mesh
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.pipeline import reconstruct
