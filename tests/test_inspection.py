@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+import made_rooms
 import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
@@ -429,3 +430,17 @@ def test_wraps_behind_a_turning_object_are_told_but_do_not_matter(room_recording
     assert "faulty_recording" in {r.code for r in moving.diagnostics.reasons}
     assert "faulty_recording" not in {r.code for r in turning.diagnostics.reasons}
     assert turning.recording["findings"] == moving.recording["findings"]
+
+
+@pytest.mark.parametrize("degrees", [6.0, 15.0])
+def test_a_thing_that_turns_before_a_still_camera_is_told_from_a_moving_camera(degrees) -> None:
+    """Its background stands, so a run without --object would give the camera no motion."""
+    frames = []
+    for k in range(16):
+        thing = ((0.0, 0.3, 0.4), (0.5, 0.6, 0.15), np.radians(degrees) * k)
+        frames.append(made_rooms.seen(made_rooms.at(0, -1.2, 0), k, boxes=[thing]))
+    findings = inspect_recording(of(frames)).findings
+    hints = [str(f) for f in findings if "--object" in str(f)]
+    assert hints, [str(f) for f in findings]
+    told = inspect_recording(of(frames), turning=True).findings
+    assert not any("--object" in str(f) for f in told)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.inspection import channels
 from tofuse.inspection.finding import Finding
@@ -91,13 +92,16 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
     """Does something stand where the frame before, or the next, saw through?"""
     if sample.turning or not sample.pairs:
         return
-    # What moves slowly shows after a while, if the camera stands still.
-    pairs = sample.apart if _stands_still(sample) else sample.pairs
-    fit = [p for p in pairs if p.found.score > _FITS_WELL and p.fits and p.shift < _FAST]
-    if len(fit) < max(2, _OFTEN * len(pairs)):
-        return
-    shares = np.array([p.moved_share for p in fit])
-    often = float(np.mean(shares > _MOVED))
+    # What moves slowly shows after a while, if the camera stands still. Edges that moved do not
+    # tell whether it does: they may be those of the thing.
+    still = [p for p in sample.apart if _still(p)]
+    apart = _moved(still) if len(still) >= _OFTEN * len(sample.apart) else np.zeros(0)
+    shares = max(
+        _moved(sample.pairs),
+        apart,
+        key=lambda found: np.mean(found > _MOVED) if len(found) else 0.0,
+    )
+    often = float(np.mean(shares > _MOVED)) if len(shares) else 0.0
     if often >= _OFTEN:
         yield Finding(
             "moving_objects",
@@ -107,6 +111,14 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
             "modelled, turning before a still camera, give --object.",
             {"moved_share": float(np.median(shares)), "pairs_share": often},
         )
+
+
+def _moved(pairs: Sequence[Pair]) -> NDArray[np.float64]:
+    """Of pairs that fit, how much of the image moved; nothing if too few do."""
+    fit = [p for p in pairs if p.found.score > _FITS_WELL and p.fits and p.shift < _FAST]
+    if len(fit) < max(2, _OFTEN * len(pairs)):
+        return np.zeros(0)
+    return np.array([p.moved_share for p in fit])
 
 
 def check_walls(sample: Sample) -> Iterator[Finding]:
