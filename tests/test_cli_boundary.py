@@ -141,6 +141,16 @@ def test_a_fault_of_ours_is_a_line_too_and_can_be_seen(capfd, monkeypatch) -> No
         cli.faults_told(fail)
 
 
+@pytest.mark.parametrize("place", ["prepare_process", "faults_told"])
+def test_an_interruption_before_the_command_is_a_line_too(place, capfd, monkeypatch) -> None:
+    def interrupted(*_args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, place, interrupted)
+    assert cli.console() == 130
+    assert capfd.readouterr().err == f"tofuse: interrupted; {cli._WHOLE}\n"
+
+
 def test_signals_that_are_ignored_stay_so(tmp_path: Path) -> None:
     """As under nohup."""
     script = (

@@ -19,16 +19,21 @@ from contextlib import contextmanager
 
 _NOT_READ = 128 + 13  # what a process has that a broken pipe ended
 _WHOLE = "existing files are unchanged, or the new result is complete"
+_INTERRUPTED = f"interrupted; {_WHOLE}"
 _MEMORY = "out of memory; use --every, --max-depth or a larger voxel_m"
 
 
 def console() -> int:
     """Run the command of this process, which ends with it, and return its exit status."""
-    prepare_process()
-    with ended_by_signals():
-        status = faults_told(main)
-    # Else all that is left is looked through for cycles once more, which takes half a second.
-    gc.freeze()
+    try:
+        prepare_process()
+        with ended_by_signals():
+            status = faults_told(main)
+        # Else all that is left is looked through for cycles once more, which takes half a second.
+        gc.freeze()
+    except KeyboardInterrupt:  # before the command began, or after it ended
+        _say(_INTERRUPTED)
+        return 130
     return status
 
 
@@ -127,7 +132,7 @@ def told(command: Callable[[], int]) -> int:
             _say(str(error))
             return 2
         except KeyboardInterrupt:
-            _say(f"interrupted; {_WHOLE}")
+            _say(_INTERRUPTED)
             return 130
         except Ended as error:
             _say(f"asked to end; {_WHOLE}")
