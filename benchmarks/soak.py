@@ -233,7 +233,8 @@ def live(
     print(f"{sent}, {done.frames} recorded, {done.dropped} dropped; ended: {done.ended_by}")
     good &= (done.frames, done.dropped) == (sent.frames, 0)
     recording = open_recording(base / "recorded")
-    good &= len(recording) == sent.frames and any("time goes" in w for w in recording.warnings)
+    warned = any("time goes back" in line for line in recording.warnings)
+    good &= len(recording) == sent.frames and warned == (sent.late > 0)
     if not mapped:
         return good
     held.clear()

@@ -76,9 +76,10 @@ def cell(lacking: dict[str, str]) -> str:
         return f"{PYTHONS[0]} to {PYTHONS[-1]}"
     if all(lacking.values()) and len(set(lacking.values())) == 1:
         return f"no {lacking[PYTHONS[0]]}"
-    return "; ".join(
-        f"{python}: {f'no {what}' if what else 'yes'}" for python, what in lacking.items()
-    )
+    have = [python for python in PYTHONS if not lacking[python]]
+    parts = [f"{have[0]} to {have[-1]}"] if have else []
+    parts += [f"{python}: no {what}" for python, what in lacking.items() if what]
+    return "; ".join(parts)
 
 
 if __name__ == "__main__":
