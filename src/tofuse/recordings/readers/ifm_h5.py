@@ -65,7 +65,11 @@ class IfmH5Source(FileSource):
         try:
             h5py = importlib.import_module("h5py")
         except ImportError as error:
-            raise InputError("is an HDF5 file", where=path, remedy="pip install h5py") from error
+            raise InputError(
+                "is an HDF5 file, which needs the package h5py",
+                where=path,
+                remedy="pip install 'tofuse[hdf5]'",
+            ) from error
         self._one_at_a_time = threading.Lock()
         try:
             file = h5py.File(path, "r")
