@@ -67,7 +67,7 @@ def test_files_that_lack_something(tmp_path: Path, monkeypatch) -> None:
     whole, unread, refused = read_through(tmp_path / "c.h5", None)
     assert (whole, unread, refused) == (1, 2, 0)
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    with pytest.raises(InputError, match="pip install h5py"):
+    with pytest.raises(InputError, match=r"pip install 'tofuse\[hdf5\]'"):
         open_recording(tmp_path / "c.h5")
 
 
