@@ -41,6 +41,7 @@ PART_ROOMS = (
     "tofuse.registration",
     "tofuse.odometry",
     "tofuse.posegraph",
+    "tofuse.lab",
     "tofuse.recordings.readers",
     "tofuse.live.devices",
 )

@@ -98,7 +98,13 @@ class Config:
         return dict(parts.to_dict(self))
 
 
-_ROOMS = ("tofuse.filters", "tofuse.registration", "tofuse.odometry", "tofuse.posegraph")
+_ROOMS = (
+    "tofuse.filters",
+    "tofuse.registration",
+    "tofuse.odometry",
+    "tofuse.posegraph",
+    "tofuse.lab",
+)
 
 
 def methods() -> dict[str, Callable[[ViewKind], Config]]:

@@ -1,0 +1,103 @@
+"""Comprehensive ICP (Almhdie, Leger, Deriche and Ledee 2007): pairs that no two points share."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.kernels.kdtree import KdTree
+from tofuse.parts import part
+from tofuse.registration.icp import Icp
+from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, Search
+from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.selectors import All, Random
+from tofuse.registration.stopping import SmallStep
+from tofuse.registration.variants import Variant
+
+# Neighbours that a point asks for at first; it asks for twice as many when all are taken.
+_FIRST = 8
+
+
+@part("matcher", "comprehensive", label="validated")
+@dataclass(frozen=True)
+class Comprehensive(Matcher):
+    """The shortest pairs of all, each point in one pair at most.
+
+    The paper writes the distances of all points into a lookup matrix, takes the smallest entry,
+    strikes out its row and its column, and goes on. The same pairs come from a kd-tree, without
+    the matrix: each source point offers its nearest target point that is free, and the shortest
+    offer is taken.
+    """
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def prepare(self, target: Points) -> Search:
+        """Build the tree, once for all iterations: the target doesn't move."""
+        return _LookupSearch(KdTree(target.points))
+
+
+@dataclass(frozen=True, eq=False)
+class _LookupSearch:
+    tree: KdTree
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        points, size = alignment.moved, len(self.tree)
+        near, squared = self.tree.neighbours(points, min(_FIRST, size))
+        lists = dict(enumerate(zip(near, squared, strict=True)))
+        offers = [(float(squared[k, 0]), k, 0) for k in range(len(points))]
+        heapq.heapify(offers)
+        taken = np.zeros(size, bool)
+        pairs = []
+        while offers:
+            distance2, source, rank = heapq.heappop(offers)
+            if distance2 > reach * reach:
+                break
+            target = int(lists[source][0][rank])
+            if not taken[target]:
+                taken[target] = True
+                pairs.append((source, target, distance2))
+                continue
+            rank += 1
+            if rank == len(lists[source][0]) < size:
+                index, far = self.tree.neighbours(points[source : source + 1], min(2 * rank, size))
+                lists[source] = index[0], far[0]
+            if rank < len(lists[source][0]):
+                heapq.heappush(offers, (float(lists[source][1][rank]), source, rank))
+        pairs.sort()
+        i, j, d2 = np.array(pairs).reshape(-1, 3).T
+        return Matches(i.astype(np.int64), j.astype(np.int64), np.sqrt(d2))
+
+
+@part("registration", "cicp", label="validated")
+@dataclass(frozen=True)
+class Cicp(Variant):
+    """ICP with the pairs of a comprehensive lookup matrix (Almhdie et al. 2007).
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source, against all of the target.
+    max_iterations
+        Iterations after which it ends in any case.
+    """
+
+    resolution: float = 0.01
+    points: int = 1000
+    max_iterations: int = 100
+
+    def parts(self) -> Icp:
+        """See `Variant.parts`."""
+        return Icp(
+            self.resolution,
+            source=Random(self.points),
+            target=All(),
+            matcher=Comprehensive(),
+            rejectors=(),
+            metric=PointToPoint(),
+            stopping=SmallStep(max_iterations=self.max_iterations),
+        )

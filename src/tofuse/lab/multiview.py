@@ -1,0 +1,242 @@
+"""Registration of many views at once by corresponding points (section 2.10, eq 2.8).
+
+Views are paired, moved by the pairs, and paired again. How the pairs move the views is what the
+methods differ in: each is a `Relaxing`, in a file of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.kernels.icp import transform_points
+from tofuse.kernels.kdtree import KdTree
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.posegraph.outside import Told
+from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
+from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.registration.shape import shape_at
+
+Float64 = NDArray[np.float64]
+
+# Views overlap if this share of the points of one has a partner in the other, and so many.
+_OVERLAP, _FEWEST = 0.1, 30
+# Views are at rest when no point has moved by more, in resolutions.
+_AT_REST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A view that takes part.
+
+    Attributes
+    ----------
+    view
+        The points, as a cloud.
+    points, normals
+        (n, 3) in the view's frame, m; normals may be NaN.
+    boundary
+        (n,) where the surface ends. What another view sees beyond is nearest to these points, and
+        is no partner of theirs (Turk and Levoy 1994).
+    tree
+        Of the points.
+    """
+
+    view: CloudFrame
+    points: Float64
+    normals: Float64
+    boundary: NDArray[np.bool_]
+    tree: KdTree
+
+    @classmethod
+    def of(cls, view: CloudFrame) -> Cloud:
+        """Make a cloud ready."""
+        points = view.points.astype(np.float64)
+        shape = shape_at(view, np.arange(len(points)))
+        return cls(view, points, shape.normals, shape.boundary, KdTree(points))
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Points of view i and the closest points of view j to them.
+
+    Attributes
+    ----------
+    i, j
+        Positions of the views.
+    p_i, p_j
+        (m, 3) the points, each in its own view's frame.
+    n_j
+        (m, 3) unit normals of view j there, in its frame; may be NaN.
+    """
+
+    i: int
+    j: int
+    p_i: Float64
+    p_j: Float64
+    n_j: Float64
+
+
+class Relaxing(Refining, Protocol):
+    """A refinement that moves all views by corresponding points.
+
+    Attributes
+    ----------
+    points
+        Of each view that take part, at an even stride, at most.
+    reach
+        Largest distance of paired points, in resolutions (the median distance of neighbours).
+    rounds
+        How often the views are paired, at most.
+    views
+        That take part, at most, spaced by the motion of the camera; the others follow them.
+    """
+
+    part_kind: ClassVar[str] = "refinement"
+
+    @property
+    def points(self) -> int:
+        """See above."""
+        ...
+
+    @property
+    def reach(self) -> float:
+        """See above."""
+        ...
+
+    @property
+    def rounds(self) -> int:
+        """See above."""
+        ...
+
+    @property
+    def views(self) -> int:
+        """See above."""
+        ...
+
+    def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
+        """Return the poses (N, 4, 4) T_world_view that the pairs ask for; the first stays."""
+        ...
+
+    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+        """See `Refining.start`."""
+        return _Relaxation(self)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    index: int
+    depth: float
+    view: CloudFrame
+
+
+class _Relaxation(Refiner):
+    points: ClassVar[bool] = True
+
+    def __init__(self, method: Relaxing) -> None:
+        self._method = method
+        self._store: ViewStore[_Kept] = ViewStore(Spacing(most=method.views, loosest=1e6))
+
+    def push(self, view: Frame, T_component_camera: Float64) -> None:
+        """See `Refiner.push`."""
+        stride = max(1, -(-len(view) // self._method.points))
+        points = view.points[::stride]
+        depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+        kept = CloudFrame(view.index, view.timestamp, points, origin=np.asarray(view.origin))
+        self._store.push(_Kept(view.index, depth, kept), T_component_camera)
+
+    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+        """See `Refiner.finish`; kept unless the views' points are less near than before."""
+        row = {int(index): k for k, index in enumerate(ids)}
+        kept = [posed.view for posed in self._store.of(row)]
+        kept = [k for k in kept if len(k.view) >= _FEWEST]
+        if len(kept) < 2:
+            return Refinement(poses, views=len(kept))
+        at = np.array([row[k.index] for k in kept], np.intp)
+        clouds = [Cloud.of(k.view) for k in kept]
+        after = relaxed(self._method, clouds, poses[at])
+        reach = self._method.reach * resolution_of(clouds)
+        pairs, again = (paired(clouds, some, reach) for some in (poses[at], after))
+        support = (
+            _support(poses[at], pairs, reach, clouds),
+            _support(after, again, reach, clouds),
+        )
+        unchanged = Refinement(poses, False, len(clouds), len(again), support=support)
+        better = bool(again) and support[1] >= support[0]
+        return moved_to(unchanged, at, after) if better else unchanged
+
+
+def relaxed(method: Relaxing, clouds: Sequence[Cloud], poses: Float64) -> Float64:
+    """Pair and move views until they are at rest; poses (N, 4, 4) T_world_view, the first stays."""
+    resolution = resolution_of(clouds)
+    for _ in range(method.rounds):
+        pairs = paired(clouds, poses, method.reach * resolution)
+        if not pairs:
+            break
+        moved = method.relax(poses, pairs, clouds)
+        moved = se3.orthonormalise(poses[0] @ se3.inverse(moved[0]) @ moved)
+        shift = max(
+            float(np.abs(transform_points(a, c.points) - transform_points(b, c.points)).max())
+            for a, b, c in zip(poses, moved, clouds, strict=True)
+        )
+        poses = moved
+        if shift < _AT_REST * resolution:
+            break
+    return poses
+
+
+def resolution_of(clouds: Sequence[Cloud]) -> float:
+    """Median distance of neighbours of the median view, m."""
+    nearest = [np.median(c.tree.neighbours(c.points, 2)[1][:, 1]) for c in clouds]
+    return float(np.sqrt(np.median(nearest)))
+
+
+def paired(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list[Pairs]:
+    """Closest points, both ways, of all views that overlap; `reach` in m."""
+    out = []
+    for i, source in enumerate(clouds):
+        for j, target in enumerate(clouds):
+            if i == j:
+                continue
+            moved = transform_points(se3.inverse(poses[j]) @ poses[i], source.points)
+            near, _ = target.tree.nearest(moved, reach)
+            a = np.flatnonzero((near >= 0) & ~target.boundary[near])
+            if len(a) >= max(_FEWEST, _OVERLAP * len(moved)):
+                b = near[a]
+                out.append(Pairs(i, j, source.points[a], target.points[b], target.normals[b]))
+    return out
+
+
+def squared_error(poses: Float64, pairs: Sequence[Pairs]) -> float:
+    """E of eq 2.8: the sum of the squared distances of all paired points, m^2."""
+    return sum(
+        float(
+            ((transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j)) ** 2).sum()
+        )
+        for p in pairs
+    )
+
+
+def rotation_to(H: Float64) -> Float64:
+    """The rotation R (3, 3) that makes the trace of R H greatest (Arun 1987; Umeyama 1991)."""
+    U, _, Vt = np.linalg.svd(H)
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    return np.asarray(Vt.T @ np.diag([1.0, 1.0, sign]) @ U.T)
+
+
+def _support(
+    poses: Float64, pairs: Sequence[Pairs], reach: float, clouds: Sequence[Cloud]
+) -> float:
+    """How near points lie to those of other views: up to 1 for each view that sees them too."""
+    total = sum(len(c.points) for c in clouds)
+    nearness = 0.0
+    for p in pairs:
+        gap = transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j)
+        nearness += float((1 - np.linalg.norm(gap, axis=1) / reach).sum())
+    return nearness / max(total, 1)

@@ -1,0 +1,210 @@
+"""The normal distributions transform, points to distributions (Magnusson 2009, chapter 6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.kernels.icp import transform_points
+from tofuse.kernels.kdtree import KdTree
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.interfaces import Float64, Int64, Points
+from tofuse.registration.selectors import All, Random
+
+# Points that a cell needs, and the smallest variance of it, relative to the largest.
+_FEWEST, _FLATTEST = 6, 1e-3
+# Share of points that lie anywhere (section 6.2.1: p_o).
+_OUTLIERS = 0.55
+_HALVINGS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Normal distributions of the target's points, by cells of a grid."""
+
+    size: float
+    tree: KdTree
+    mean: Float64
+    inverse: Float64
+
+    @property
+    def constants(self) -> tuple[float, float]:
+        """d_1 and d_2 of eq 6.8: the Gaussian that is like a mixture with uniform outliers."""
+        c1, c2 = 10 * (1 - _OUTLIERS), _OUTLIERS / self.size**3
+        d3 = -math.log(c2)
+        d1 = -math.log(c1 + c2) - d3
+        return d1, -2 * math.log((-math.log(c1 * math.exp(-0.5) + c2) - d3) / d1)
+
+
+@part("registration", "ndt", label="validated")
+@dataclass(frozen=True)
+class Ndt(Registrar):
+    """Points of the source against normal distributions of the target's, from coarse to fine.
+
+    The target is cut into cells, each with the mean and covariance of its points. The score ::
+
+        s(T) = -sum d_1 exp(-d_2 / 2 (T p - mu)^T Sigma^-1 (T p - mu))
+
+    of the points, each in the cell whose mean is nearest, is made large by Newton's method with its
+    analytic gradient and Hessian, shifted where that is not positive, and halved steps. Cells halve
+    from level to level. The cells' covariances are widened to a thousandth of their longest axis
+    (section 6.2.3).
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    coarsest, finest
+        Edges of the cells at first and at last, in resolutions.
+    max_iterations
+        Of each level.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    coarsest: float = 40.0
+    finest: float = 5.0
+    max_iterations: int = 30
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if not 0 < self.finest <= self.coarsest:
+            raise ValueError(f"finest is {self.finest}, not above 0 and at most coarsest")
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> Registration:
+        """See `Registrar.register`; correspondences are points in cells of the finest level.
+
+        Raises
+        ------
+        RegistrationError
+            If no point of the source lies in a cell of the target's.
+        """
+        selector = All() if self.points is None else Random(self.points)
+        data = Points.of(source, selector.select(source, rng)).points
+        model = target.points.astype(np.float64)
+        T, size, levels = se3.orthonormalise(guess), self.coarsest * self.resolution, 0
+        iterations = 0
+        while True:
+            cells = _cells(model, size)
+            T, count, converged = self._level(data, cells, T)
+            iterations, levels = iterations + count, levels + 1
+            if size <= self.finest * self.resolution:
+                break
+            size = max(size / 2, self.finest * self.resolution)
+        near, square, r, inverse = _placed(data, cells, T)
+        if len(near) < _FEWEST:
+            raise RegistrationError(f"only {len(near)} points lie in cells of the target's")
+        d2 = cells.constants[1]
+        weight = np.exp(-d2 / 2 * square)
+        J = _jacobian(data[near], T)
+        information = np.einsum("n,nki,nkl,nlj->ij", weight, J, inverse, J)
+        distance = np.linalg.norm(r, axis=1)
+        return Registration(
+            T_target_source=T,
+            converged=converged,
+            iterations=iterations,
+            correspondences=len(near),
+            points=len(data),
+            error=float(distance.sum()) / (len(data) * self.resolution),
+            rms_m=float(np.sqrt((distance**2).mean())),
+            information=(information + information.T) / 2,
+        )
+
+    def _level(self, data: Float64, cells: _Cells, T: Float64) -> tuple[Float64, int, bool]:
+        middle = data.mean(0)
+        to, back = np.eye(4), np.eye(4)
+        to[:3, 3], back[:3, 3] = middle, -middle
+        arm = data - middle
+        size = max(float(np.sqrt((arm**2).sum(1).mean())), self.resolution)
+        units = np.array([1, 1, 1, 1 / size, 1 / size, 1 / size])
+        value, g, H = _score(arm, cells, T @ to)
+        for k in range(self.max_iterations):
+            if value == 0.0:
+                return T, k, False
+            values, vectors = np.linalg.eigh(H * units[:, None] * units)
+            shifted = np.maximum(np.abs(values), 1e-6 * np.abs(values).max())
+            step = -units * (vectors @ ((vectors.T @ (g * units)) / shifted))
+            length = float(np.linalg.norm(step / units))
+            # Farther than a cell the quadratic says nothing.
+            step *= min(1.0, cells.size / max(length, 1e-300))
+            for _ in range(_HALVINGS):
+                moved = se3.orthonormalise(T @ to @ se3.exp(step) @ back)
+                found = _score(arm, cells, moved @ to)
+                if found[0] < value:
+                    break
+                step = step / 2
+            else:
+                return T, k + 1, True
+            T, (value, g, H) = moved, found
+            if np.linalg.norm(step / units) < 1e-3 * self.resolution:
+                return T, k + 1, True
+        return T, self.max_iterations, False
+
+
+def _cells(points: Float64, size: float) -> _Cells:
+    """Cells of a grid with six points or more each."""
+    grid = np.floor((points - points.min(0)) / size).astype(np.int64)
+    _, cell = np.unique(grid, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    count = np.bincount(cell)
+    mean = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], 1) / count[:, None]
+    away = points - mean[cell]
+    C = np.empty((len(count), 3, 3))
+    for a in range(3):
+        for b in range(3):
+            C[:, a, b] = np.bincount(cell, away[:, a] * away[:, b]) / np.maximum(count - 1, 1)
+    full = count >= _FEWEST
+    if not full.any():
+        raise RegistrationError(f"no cell of {size:.3g} m has {_FEWEST} points of the target")
+    values, vectors = np.linalg.eigh(C[full])
+    values = np.maximum(values, np.maximum(_FLATTEST * values[:, 2:], 1e-18))
+    inverse = np.einsum("nij,nj,nkj->nik", vectors, 1 / values, vectors)
+    return _Cells(size, KdTree(mean[full]), mean[full], inverse)
+
+
+def _placed(p: Float64, cells: _Cells, T: Float64) -> tuple[Int64, Float64, Float64, Float64]:
+    """Points (n, 3) in cells: which, squared Mahalanobis distances, residuals, inverses."""
+    x = transform_points(T, p)
+    near, _ = cells.tree.nearest(x, cells.size)
+    point = np.flatnonzero(near >= 0)
+    r = x[point] - cells.mean[near[point]]
+    inverse = cells.inverse[near[point]]
+    return point, np.einsum("ni,nij,nj->n", r, inverse, r), r, inverse
+
+
+def _score(p: Float64, cells: _Cells, T: Float64) -> tuple[float, Float64, Float64]:
+    """Negative score, its gradient (6,) and Hessian (6, 6) of the right perturbation."""
+    point, square, r, inverse = _placed(p, cells, T)
+    d1, d2 = cells.constants
+    e = np.exp(-d2 / 2 * square)
+    J = _jacobian(p[point], T)
+    a = np.einsum("nki,nkl,nl->ni", J, inverse, r)  # derivative of half the square
+    c = d1 * d2 * e
+    value = float(d1 * e.sum())
+    g = -(c[:, None] * a).sum(0)
+    # Eq 6.13, with the second derivative of exp(hat w) p at zero: (w w^T - |w|^2) p, symmetric.
+    H = -np.einsum("n,nki,nkl,nlj->ij", c, J, inverse, J) + d2 * np.einsum("n,ni,nj->ij", c, a, a)
+    s = np.einsum("nij,nj->ni", inverse, r) @ T[:3, :3]
+    outer = np.einsum("n,ni,nj->ij", c, s, p[point])
+    H[3:, 3:] -= (outer + outer.T) / 2 - np.trace(outer) * np.eye(3)
+    return value, g, H
+
+
+def _jacobian(p: Float64, T: Float64) -> Float64:
+    """Derivative (n, 3, 6) of T exp(xi) p at zero."""
+    hat = np.zeros((len(p), 3, 3))
+    hat[:, 0, 1], hat[:, 0, 2], hat[:, 1, 2] = -p[:, 2], p[:, 1], -p[:, 0]
+    hat -= np.swapaxes(hat, 1, 2)
+    R = T[:3, :3]
+    return np.concatenate([np.broadcast_to(R, (len(p), 3, 3)), -R @ hat], axis=2)

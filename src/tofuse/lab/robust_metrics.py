@@ -1,0 +1,157 @@
+"""Robust least squares for pairs many of which are wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from tofuse.kernels.cloud_sums import plane_sums
+from tofuse.kernels.icp import transform_points
+from tofuse.parts import part
+from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
+from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs, variance_of
+from tofuse.registration.surface_metrics import SurfaceMetric
+
+# Each round makes the surrogate less convex by this factor (Yang et al. 2020, remark 5).
+_FACTOR = 1.4
+_ROUNDS = 100
+# Standard deviations from the median absolute residual.
+_MAD = 1.4826
+_SMALLEST_SIGMA = 1e-3
+# Where the general loss is cut off to have a distribution (Chebrolu et al. 2021), in scales.
+_CUT = 10.0
+
+
+@part("metric", "gnc", label="validated")
+@dataclass(frozen=True)
+class Graduated(Metric):
+    """Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas, Carlone 2020).
+
+    Pairs whose distance is above c count c^2, whatever it is. That sum has many minima; so a
+    convex surrogate is minimised first (mu small), and made less convex round by round, each time
+    from the last solution: point-to-point with the weights of eq 14, ::
+
+        w = 0                                   if r^2 >= (mu + 1) / mu c^2
+            c / r sqrt(mu (mu + 1)) - mu        between
+            1                                   if r^2 <= mu / (mu + 1) c^2
+
+    No guess of which pairs are wrong is needed, and 70 to 80 % of them may be.
+
+    Attributes
+    ----------
+    inlier
+        c: largest distance of a true pair, in resolutions.
+    """
+
+    inlier: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.inlier > 0:
+            raise ValueError(f"inlier is {self.inlier}, not above 0")
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`."""
+        return self._solved(matches, alignment)[0]
+
+    def information(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.information`: that of the pairs that are taken for true."""
+        _, weighted = self._solved(matches, alignment)
+        return PointToPoint().information(weighted.keep(weighted.weights() > 0), alignment)
+
+    def _solved(self, matches: Matches, alignment: Alignment) -> tuple[Float64, Matches]:
+        c2 = (self.inlier * alignment.resolution) ** 2
+        p = alignment.moved[matches.source]
+        q = alignment.target.points[matches.target]
+        given = matches.weights()
+        weighted = replace(matches, weight=given)
+        motion = PointToPoint().motion(weighted, alignment)
+        mu = 0.0
+        for _ in range(_ROUNDS):
+            r2 = ((transform_points(motion, p) - q) ** 2).sum(1)
+            if mu == 0:
+                largest = float(r2.max())
+                if largest <= c2:
+                    break  # no pair is beyond c: least squares it is
+                mu = c2 / (2 * largest - c2)
+            w = np.sqrt(c2 / np.maximum(r2, 1e-300) * mu * (mu + 1)) - mu
+            w = np.where(r2 >= (mu + 1) / mu * c2, 0.0, np.clip(w, 0.0, 1.0))
+            weighted = replace(matches, weight=given * w)
+            motion = PointToPoint().motion(weighted, alignment)
+            if np.all((w == 0) | (w == 1)):
+                break
+            mu *= _FACTOR
+        return motion, weighted
+
+
+@part("metric", "adaptive", label="validated")
+@dataclass(frozen=True)
+class Adaptive(SurfaceMetric):
+    """Point-to-plane with a loss that takes its shape from the residuals.
+
+    The general loss of Barron (2019), ::
+
+        rho(r) = |a - 2| / a ((r^2 / |a - 2| + 1)^(a / 2) - 1),    r in scales
+
+    is that of least squares for a = 2, Cauchy for 0, Geman-McClure for -2, Welsch for minus
+    infinity. Of its shapes the one is taken under which the residuals are most probable, with the
+    distribution cut off at ten scales so that shapes below zero have one (Chebrolu et al. 2021).
+    The scale is 1.4826 times the median absolute residual.
+    """
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`."""
+        pairs = surface_pairs(matches, alignment)
+        n = pairs.target_normals
+        r = (pairs.residual * n).sum(1)
+        H, g, _ = plane_sums(pairs.points, n, n, r, pairs.weight * self._weights(r, pairs))
+        return pairs.motion(solve(H, g, pairs.size))
+
+    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+        """See `SurfaceMetric.fit`."""
+        n = pairs.target_normals
+        r = (pairs.residual * n).sum(1)
+        weight = pairs.weight * self._weights(r, pairs)
+        H, _, square = plane_sums(pairs.points, n, n, r, weight)
+        variance = variance_of(square, weight, pairs.resolution)
+        return H / variance, variance
+
+    def _weights(self, residual: Float64, pairs: SurfacePairs) -> Float64:
+        size = np.abs(residual)
+        x = size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * pairs.resolution)
+        a = shape_of(x)
+        return np.asarray((x * x / abs(a - 2) + 1) ** (a / 2 - 1)) if a < 2 else np.ones(len(x))
+
+
+def general_loss(x: Float64, shape: float) -> Float64:
+    """rho of Barron (2019), eq 8, for residuals in scales."""
+    if shape == 2:
+        return x * x / 2
+    if shape == 0:
+        return np.log1p(x * x / 2)
+    b = abs(shape - 2)
+    return np.asarray(b / shape * ((x * x / b + 1) ** (shape / 2) - 1))
+
+
+def shape_of(x: Float64) -> float:
+    """Return the shape under which residuals x (in scales) are most probable."""
+    shapes, normalisers = _distributions()
+    inside = np.minimum(np.abs(x), _CUT)
+    cost = [
+        float(general_loss(inside, float(a)).mean()) + float(z)
+        for a, z in zip(shapes, normalisers, strict=True)
+    ]
+    return float(shapes[int(np.argmin(cost))])
+
+
+@cache
+def _distributions() -> tuple[Float64, Float64]:
+    """Shapes, and the logarithm of the integral of exp(-rho) up to the cut for each."""
+    shapes = np.r_[np.arange(-10, -2, 1.0), np.arange(-2, 2.01, 0.25)]
+    x = np.linspace(-_CUT, _CUT, 4001)
+    step = x[1] - x[0]
+    return shapes, np.array(
+        [np.log(np.exp(-general_loss(x, float(a))).sum() * step) for a in shapes]
+    )

@@ -1,0 +1,96 @@
+"""KISS-ICP: the adaptive threshold and the odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from registration_scenes import box_walls, rng
+from tofuse.geometry import se3
+from tofuse.kernels.icp import transform_points
+from tofuse.lab.kiss import AdaptiveThreshold, Kiss, first_of_voxels
+from tofuse.recordings.frames import CloudFrame
+
+
+def room(n, seed):
+    """A room of 2 by 2 by 4 m with a block in a corner."""
+    walls = box_walls(n, seed, walls="xyz", depth=(-1.0, 3.0))
+    block = rng(seed, 2).uniform([0.3, 0.2, 1.5], [0.9, 0.9, 2.4], (n // 4, 3))
+    side = rng(seed, 3).integers(0, 3, len(block))
+    low = np.array([0.3, 0.2, 1.5])
+    for axis in range(3):
+        block[side == axis, axis] = low[axis]
+    return np.vstack([walls, block])
+
+
+def frames(poses, noise=0.003):
+    out = []
+    for k, T in enumerate(poses):
+        p = transform_points(se3.inverse(T), room(4000, k)) + rng(k, 8).normal(0, noise, (5000, 3))
+        out.append(CloudFrame(k, float(k), p.astype(np.float32)))
+    return out
+
+
+def path(n):
+    step = se3.exp([0.03, 0.01, 0.02, 0.01, 0.04, 0.0])
+    out = [np.eye(4)]
+    for _ in range(n - 1):
+        out.append(out[-1] @ step)
+    return np.array(out)
+
+
+def test_a_path_is_followed_with_nothing_tuned():
+    poses = path(12)
+    tracker = Kiss().start(0)
+    steps = [tracker.push(f) for f in frames(poses)]
+    assert [s.status for s in steps] == ["tracked"] * 12
+    gap = se3.log(se3.inverse(poses) @ np.array([s.T_component_camera for s in steps]))
+    assert np.linalg.norm(gap[:, :3], axis=1).max() < 0.02
+    assert np.linalg.norm(gap[:, 3:], axis=1).max() < 0.02
+    last = steps[-1].registration
+    assert last is not None
+    np.testing.assert_allclose(
+        steps[-2].T_component_camera @ last.T_target_source, steps[-1].T_component_camera, atol=1e-9
+    )
+    assert np.linalg.eigvalsh(last.information).min() > 0
+
+
+def test_the_threshold_is_three_times_what_predictions_err():
+    """Eqs 3 to 5: the rms of the deviations that are large enough, and the first value before."""
+    threshold = AdaptiveThreshold(range_m=5.0, smallest=0.01, initial=0.2)
+    assert threshold.sigma == 0.2
+    threshold.learn(np.eye(4))
+    assert threshold.sigma == 0.2  # too small to say anything
+    theta, shift = 0.1, 0.05
+    threshold.learn(se3.exp([0, 0, 0, 0, theta, 0]) + np.pad([[shift]], ((0, 3), (3, 0))))
+    delta = 2 * 5 * np.sin(theta / 2) + shift
+    assert threshold.sigma == pytest.approx(delta)
+    threshold.learn(se3.exp([0.3, 0, 0, 0, 0, 0]))
+    assert threshold.sigma == pytest.approx(np.sqrt((delta**2 + 0.3**2) / 2))
+
+
+def test_frames_without_points_and_of_another_place_are_lost():
+    poses = path(4)
+    given = frames(poses)
+    empty = CloudFrame(2, 2.0, np.zeros((0, 3), np.float32))
+    far = CloudFrame(3, 3.0, given[3].points + np.float32(100))
+    tracker = Kiss().start(0)
+    steps = [tracker.push(f) for f in (given[0], given[1], empty, far, given[3])]
+    assert [s.status for s in steps] == ["tracked", "tracked", "lost", "lost", "tracked"]
+    assert "needed" in steps[2].reason
+    assert "registered" in steps[3].reason
+
+
+def test_one_point_stays_in_each_voxel():
+    p = rng(0).uniform(-1, 1, (9000, 3))
+    kept = first_of_voxels(p, 0.25)
+    cells = np.floor(kept / 0.25).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(kept) == 8**3
+    assert {tuple(x) for x in kept} <= {tuple(x) for x in p}
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="voxel"):
+        Kiss(voxel=0.0)
+    with pytest.raises(ValueError, match="minimum_points"):
+        Kiss(minimum_points=1)

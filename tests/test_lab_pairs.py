@@ -1,0 +1,330 @@
+"""Methods for two views that no configuration uses: what their papers claim."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from registration_scenes import bumpy_ball, directions, error, relief, rng, stone, turn, view
+from tofuse import parts
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.kernels.icp import transform_points
+from tofuse.lab.comprehensive import Cicp, Comprehensive
+from tofuse.lab.implicit import Implicit
+from tofuse.lab.least_squares_matching import LeastSquaresMatching
+from tofuse.lab.ndt import Ndt
+from tofuse.lab.neighbourhoods import neighbourhood
+from tofuse.lab.robust_metrics import Adaptive, Graduated, shape_of
+from tofuse.lab.squared_distance import SquaredDistance, approximant
+from tofuse.recordings.frames import CloudFrame
+from tofuse.registration.icp import Icp
+from tofuse.registration.interfaces import Alignment, Matches, Points
+from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.selectors import All
+from tofuse.registration.stopping import SmallStep
+from tofuse.registration.surface_metrics import PointToPlane
+
+EVERY = [Cicp(0.03), LeastSquaresMatching(0.03), Ndt(0.03)]
+
+
+def small(seed, degrees=6.0, shift=0.02):
+    T = turn(rng(seed).normal(size=3), degrees)
+    T[:3, 3] += rng(seed, 50).normal(0, shift, 3)
+    return T
+
+
+def points_of(cloud):
+    frame = CloudFrame(0, 0.0, cloud.astype(np.float32))
+    return Points(frame, np.arange(len(cloud)), cloud.astype(float))
+
+
+def alignment_of(source, target, resolution=0.03):
+    a, b = points_of(source), points_of(target)
+    return Alignment(a, b, resolution, np.eye(4), a.points)
+
+
+def icp(metric, reach=3.0, steps=100, resolution=0.03):
+    return Icp(
+        resolution,
+        source=All(),
+        target=All(),
+        rejectors=(MaxDistance(reach),),
+        metric=metric,
+        stopping=SmallStep(1e-3, steps),
+    )
+
+
+@pytest.mark.parametrize("method", EVERY, ids=parts.name_of)
+def test_a_small_motion_is_found(method):
+    for k in range(2):
+        T = small(k)
+        source, target = view(stone(3000, 1), T), view(stone(3000, 0))
+        found = method.register(source, target, np.eye(4), rng(k))
+        most = 2.5 if isinstance(method, Cicp) else 1.0  # points slide along a smooth surface
+        assert error(found, T)[0] < 0.02
+        assert error(found, T)[1] < most
+        assert np.linalg.eigvalsh(found.information).min() > 0
+
+
+@pytest.mark.parametrize("method", EVERY, ids=parts.name_of)
+def test_the_same_draw_gives_the_same_pose(method):
+    source, target = view(stone(2000, 1), small(0)), view(stone(2000, 0))
+    one, other = (method.register(source, target, np.eye(4), rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(one.T_target_source, other.T_target_source)
+
+
+@pytest.mark.parametrize("method", [LeastSquaresMatching(0.03), Ndt(0.03)], ids=parts.name_of)
+def test_views_that_are_far_apart_are_refused(method):
+    far = view(stone(2000, 1) + np.array([50, 0, 0]))
+    with pytest.raises(RegistrationError, match="points"):
+        method.register(far, view(stone(2000, 0)), np.eye(4), rng())
+
+
+def test_comprehensive_pairs_are_those_of_the_whole_lookup_matrix():
+    a, b = rng(0).uniform(size=(60, 3)), rng(1).uniform(size=(45, 3))
+    table = cdist(a, b)
+    expected = []
+    while np.isfinite(table).any():
+        i, j = np.unravel_index(np.argmin(table), table.shape)
+        expected.append((i, j))
+        table[i], table[:, j] = np.inf, np.inf
+    search = Comprehensive().prepare(points_of(b))
+    found = search.match(alignment_of(a, b), np.inf)
+    assert sorted(expected) == list(zip(found.source, found.target, strict=True))
+    near = search.match(alignment_of(a, b), 0.1)
+    assert 0 < len(near) < len(found)
+    assert near.distance.max() <= 0.1
+
+
+def test_cicp_is_nearer_among_noise_and_takes_fewer_steps():
+    """What the paper claims of pairs that no two points share: points seen twice, with noise."""
+    comprehensive, closest = [], []
+    for k in range(4):
+        T = small(k, 8)
+        cloud = bumpy_ball(500, k)
+        source, target = view(cloud + rng(k, 7).normal(0, 0.02, cloud.shape), T), view(cloud)
+        found = Cicp(0.03, points=500).register(source, target, np.eye(4), rng())
+        plain = replace(icp(PointToPoint()), rejectors=())
+        other = plain.register(source, target, np.eye(4), rng())
+        comprehensive.append([error(found, T)[1], found.iterations])
+        closest.append([error(other, T)[1], other.iterations])
+    assert (np.median(comprehensive, 0) < 0.7 * np.median(closest, 0)).all()
+
+
+def test_ls3d_finds_the_scale_where_it_is_free_and_says_how_well():
+    T = small(1, 4)
+    target = view(bumpy_ball(6000, 0))
+    for scale in (0.97, 1.02):
+        cloud = bumpy_ball(6000, 1, noise=0.001)
+        middle = cloud.mean(0)
+        source = view((cloud - middle) / scale + middle, T)
+        rigid = LeastSquaresMatching(0.02).register(source, target, np.eye(4), rng())
+        free = LeastSquaresMatching(0.02, scale_sigma=1.0).register(
+            source, target, np.eye(4), rng()
+        )
+        assert rigid.scale == 1
+        assert free.scale == pytest.approx(scale, abs=max(5 * free.precision[6], 0.002))
+        assert free.precision[6] < 0.002
+        assert free.rms_m < 0.5 * rigid.rms_m
+
+
+def test_ls3d_leaves_out_what_is_no_part_of_the_other_surface():
+    """Outliers of the template are refused by their residuals (section 2.3)."""
+    T = small(2, 4)
+    target = view(relief(4000, 0))
+    wrong = relief(400, 2) + np.array([0, 0, 0.08])  # a second sheet, all on one side
+    source = view(np.vstack([relief(4000, 1), wrong]), T)
+    kept = LeastSquaresMatching(0.02).register(source, target, np.eye(4), rng())
+    every = LeastSquaresMatching(0.02, outlier=1e6).register(source, target, np.eye(4), rng())
+    assert error(kept, T)[0] < 0.002
+    assert error(every, T)[0] > 2 * error(kept, T)[0]
+
+
+def test_ls3d_with_intensity_does_not_slide_along_a_wall():
+    """Akca 2007: the intensity is a second surface that holds what the first does not."""
+
+    def wall(seed, T):
+        p = np.column_stack([rng(seed).uniform(-0.6, 0.6, (5000, 2)), np.full(5000, 2.0)])
+        light = 100 + 40 * np.sin(9 * p[:, 0]) * np.cos(7 * p[:, 1])
+        return view(p, T, amplitude=light.astype(np.float32))
+
+    T = np.eye(4)
+    T[:3, 3] = [0.03, -0.02, 0.01]
+    plain, lit = (
+        LeastSquaresMatching(0.02, light=light).register(
+            wall(1, T), wall(0, np.eye(4)), np.eye(4), rng()
+        )
+        for light in (0.0, 0.1)
+    )
+    assert error(plain, T)[0] > 0.03
+    assert error(lit, T)[0] < 0.003
+
+
+def test_ndt_finds_motions_from_which_point_to_plane_does_not_return():
+    """Magnusson 2009: coarse cells reach further than closest points."""
+    target = view(relief(5000, 0))
+    good = {"ndt": 0, "plane": 0}
+    for k in range(8):
+        T = np.eye(4)
+        T[:2, 3] = 0.45 * np.array([np.cos(k), np.sin(k)])
+        source = view(relief(5000, 1), T)
+        ndt = Ndt(0.012).register(source, target, np.eye(4), rng(k))
+        plane = icp(PointToPlane(), 5.0, 50, 0.012).register(source, target, np.eye(4), rng(k))
+        good["ndt"] += error(ndt, T)[0] < 0.01
+        good["plane"] += error(plane, T)[0] < 0.01
+    assert good["ndt"] >= good["plane"] + 2
+
+
+def test_ndt_climbs_by_the_derivatives_of_its_score():
+    from tofuse.lab.ndt import _cells, _score
+
+    cells = _cells(stone(3000, 0), 0.2)
+    p = stone(300, 1)
+    T = small(0, 2, 0.005)
+    value, g, H = _score(p, cells, T)
+    step = 1e-6
+    for k in range(6):
+        xi = np.zeros(6)
+        xi[k] = step
+        up, down = (_score(p, cells, T @ se3.exp(s * xi)) for s in (1, -1))
+        assert (up[0] - down[0]) / (2 * step) == pytest.approx(g[k], rel=1e-4, abs=1e-6)
+        assert (up[1] - down[1]) / (2 * step) == pytest.approx(
+            H[k], rel=0.05, abs=0.02 * abs(H).max()
+        )
+    assert value < 0
+
+
+@pytest.mark.parametrize("away", [-0.05, 0.08])
+def test_squared_distance_is_right_to_second_order(away):
+    """The distance from a ball, about a point in front of it or behind its surface."""
+    ball = 0.5 * directions(6000, 0) + [0, 0, 2.0]
+    normals = (ball - [0, 0, 2.0]) / 0.5
+    target = CloudFrame(0, 0.0, ball.astype(np.float32), normals=normals.astype(np.float32))
+    model = Points.of(target, np.arange(len(ball)))
+    j = int(np.argmin(ball[:, 2]))
+    outward = (ball[j] - [0, 0, 2]) / 0.5
+    at = ball[j] + away * outward
+    data = points_of(at[None])
+    alignment = Alignment(data, model, 0.02, np.eye(4), data.points)
+    W = approximant(Matches(np.array([0]), np.array([j]), np.array([abs(away)])), alignment)[0]
+    d = rng(3).normal(size=(200, 3)) * 0.01
+    x = at + d
+    stated = np.einsum("ni,ij,nj->n", x - ball[j], W, x - ball[j])
+    true = (np.linalg.norm(x - [0, 0, 2.0], axis=1) - 0.5) ** 2
+    plane = ((x - ball[j]) @ outward) ** 2
+    if away > 0:
+        assert np.abs(stated - true).max() < 0.2 * np.abs(plane - true).max()
+    else:  # a negative coefficient is left out
+        np.testing.assert_allclose(stated, plane, atol=2e-6)
+
+
+def test_squared_distance_needs_fewer_steps_than_points_and_gets_as_near_as_planes():
+    target = view(stone(3000, 0))
+    for k in range(3):
+        T = small(k, 8)
+        source = view(stone(3000, 1), T)
+        here = icp(SquaredDistance(), 8.0).register(source, target, np.eye(4), rng())
+        point = icp(PointToPoint(), 8.0).register(source, target, np.eye(4), rng())
+        assert error(here, T)[0] < 0.003
+        assert 2 * here.iterations < point.iterations
+
+
+def test_curvatures_of_a_cylinder():
+    angle, z = rng(0).uniform(-1, 1, 4000), rng(1).uniform(-0.5, 0.5, 4000)
+    tube = np.column_stack([0.3 * np.sin(angle), z, 1.0 - 0.3 * np.cos(angle)])
+    frame = CloudFrame(0, 0.0, tube.astype(np.float32))
+    inner = np.flatnonzero((np.abs(angle) < 0.6) & (np.abs(z) < 0.3))
+    bending = neighbourhood(Points.of(frame, np.arange(4000))).bending
+    k = bending.curvature[inner]
+    assert np.median(k[:, 0]) == pytest.approx(-1 / 0.3, rel=0.05)
+    assert abs(np.median(k[:, 1])) < 0.15
+    along = np.abs(bending.directions[inner, 1, 1])
+    assert np.median(along) > 0.99
+
+
+def test_imls_is_nearer_to_the_surface_than_the_plane_of_one_point():
+    """Deschaud 2018: the noise of the target is averaged."""
+    target, true = points_of(relief(4000, 0, noise=0.006)), relief(500, 1, -0.4, 0.4, noise=0.0)
+    alignment = Alignment(points_of(true), target, 0.015, np.eye(4), true)
+    near, _ = neighbourhood(target).tree.nearest(true)
+    plane = ((true - target.points[near]) * target.normals[near]).sum(1)
+    implicit = Implicit().distance(true, alignment)
+    assert np.isfinite(implicit).all()
+    assert np.sqrt((implicit**2).mean()) < 0.6 * np.sqrt((plane**2).mean())
+    assert np.isnan(Implicit().distance(true + 5, alignment)).all()
+
+
+def test_imls_registers():
+    for k in range(3):
+        T = small(k, 3, 0.01)
+        source = view(relief(3000, 10 + k, noise=0.004), T)
+        target = view(relief(3000, 20 + k, noise=0.004))
+        found = icp(Implicit(), 5.0, 60, 0.015).register(source, target, np.eye(4), rng())
+        assert error(found, T)[0] < 0.004
+
+
+def test_gnc_finds_the_motion_though_three_of_four_pairs_are_wrong():
+    """Yang et al. 2020: 70 to 80 % of wrong correspondences, and no guess which they are."""
+    cloud = bumpy_ball(400, 0)
+    T = turn([1, 2, 3], 60)
+    moved = transform_points(se3.inverse(T), cloud) + rng(4).normal(0, 0.002, cloud.shape)
+    wrong = rng(2).permutation(400)[:300]
+    partner = np.arange(400)
+    partner[wrong] = rng(3).integers(0, 400, 300)
+    alignment = alignment_of(moved, cloud, 0.005)
+    matches = Matches(np.arange(400), partner, np.zeros(400))
+    robust = Graduated().motion(matches, alignment)
+    plain = PointToPoint().motion(matches, alignment)
+    assert se3.angle((se3.inverse(T) @ robust)[:3, :3]) < 0.01
+    assert se3.angle((se3.inverse(T) @ plain)[:3, :3]) > 0.05
+    information = Graduated().information(matches, alignment)
+    assert np.linalg.eigvalsh(information).min() > 0
+
+
+def test_without_wrong_pairs_gnc_is_least_squares():
+    cloud = bumpy_ball(300, 0)
+    alignment = alignment_of(cloud + rng(1).normal(0, 0.001, cloud.shape), cloud)
+    n = np.arange(300)
+    matches = Matches(n, n, np.zeros(300))
+    np.testing.assert_array_equal(
+        Graduated().motion(matches, alignment), PointToPoint().motion(matches, alignment)
+    )
+
+
+def test_the_adaptive_loss_takes_its_shape_from_the_residuals():
+    normal = rng(0).normal(size=20000)
+    cauchy = rng(1).standard_cauchy(20000)
+    spoilt = np.where(rng(2).uniform(size=20000) < 0.3, rng(3).uniform(-9, 9, 20000), normal)
+    assert shape_of(normal) == 2
+    assert -0.75 <= shape_of(cauchy * np.sqrt(2)) <= 0.75
+    assert shape_of(spoilt) < shape_of(normal)
+
+
+def test_the_adaptive_loss_is_as_good_as_squares_and_better_among_outliers():
+    T = small(1, 3, 0.01)
+    for outliers, factor in ((0, 1.3), (1500, 0.5)):
+        source = view(relief(3000, 1, outliers=outliers), T)
+        target = view(relief(3000, 0))
+        plain, adaptive = (
+            error(icp(m, 10.0, 60, 0.02).register(source, target, np.eye(4), rng()), T)[0]
+            for m in (PointToPlane(), Adaptive())
+        )
+        assert adaptive < max(factor * plain, 0.001)
+
+
+def test_options_are_checked():
+    for cls, options in (
+        (LeastSquaresMatching, {"outlier": 0.0}),
+        (LeastSquaresMatching, {"scale_sigma": -1.0}),
+        (LeastSquaresMatching, {"max_iterations": 0}),
+        (Ndt, {"finest": 0.0}),
+        (Implicit, {"width": 0.0}),
+        (Graduated, {"inlier": 0.0}),
+    ):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            replace(cls(), **options)

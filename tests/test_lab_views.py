@@ -1,0 +1,206 @@
+"""Methods for many views that no configuration uses: what their papers claim."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from registration_scenes import MIDDLE, directions, relief, rng, turn, view
+from tofuse import parts
+from tofuse.geometry import se3
+from tofuse.kernels.icp import transform_points
+from tofuse.lab.bergevin import Bergevin
+from tofuse.lab.multiview import Cloud, Pairs, relaxed, squared_error
+from tofuse.lab.pulli import Pulli, spread
+from tofuse.lab.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
+from tofuse.maps.surface_map import SurfaceMap
+from tofuse.posegraph.refinement import Refining
+from tofuse.posegraph.views import Spacing, ViewStore
+
+METHODS = [Bergevin(), Pulli(), WilliamsBennamoun(), SmallAngles()]
+VIEWS = 8
+
+
+def rock(n, seed):
+    """A body half a metre in radius that no turn brings into itself."""
+    d = directions(n, seed)
+    radius = 0.5 + 0.05 * np.sin(9 * d[:, 0] + 1) * np.cos(8 * d[:, 1]) * np.sin(7 * d[:, 2] + 2)
+    radius += 0.04 * np.sin(6 * d[:, 1] + 3 * d[:, 2]) + 0.06 * d[:, 0] * d[:, 2]
+    return d * radius[:, None] + MIDDLE
+
+
+def ring(noise=0.002):
+    """A rock seen from all round, in views of 140 degrees each; true poses, clouds."""
+    T, clouds = [], []
+    for k in range(VIEWS):
+        pose = turn([0, 1, 0], 360 * k / VIEWS)
+        p = rock(5000, k)
+        seen = transform_points(se3.inverse(pose), p)
+        p = p[seen[:, 2] < 1.85] + rng(k, 9).normal(0, noise, (int((seen[:, 2] < 1.85).sum()), 3))
+        T.append(pose)
+        clouds.append(view(p, pose, index=k))
+    return np.array(T), clouds
+
+
+def drifted(T, degrees=1.0, shift=0.004):
+    """Poses with an error that adds up along the chain."""
+    out = [T[0]]
+    for k in range(1, len(T)):
+        slip = turn([0, 1, 0], degrees)
+        slip[:3, 3] += shift * np.array([1.0, 0.5, -0.5])
+        out.append(out[-1] @ se3.inverse(T[k - 1]) @ T[k] @ slip)
+    return np.array(out)
+
+
+def errors_of(poses, T):
+    """Of the poses relative to the first, at the middle of the ball (m)."""
+    middle = MIDDLE[None]
+    gap = se3.inverse(T[0]) @ T
+    here = se3.inverse(poses[0]) @ poses
+    return np.array(
+        [
+            np.linalg.norm(transform_points(a, transform_points(se3.inverse(b), middle)) - middle)
+            + np.linalg.norm(se3.so3_log(a[:3, :3] @ b[:3, :3].T)) * 0.5
+            for a, b in zip(here, gap, strict=True)
+        ]
+    )
+
+
+def motions(n, seed):
+    """Poses of n views, the first at the origin, and exact correspondences of all with all."""
+    poses = np.array([np.eye(4)] + [se3.exp(rng(seed, k).normal(0, 0.5, 6)) for k in range(1, n)])
+    pairs = []
+    for i in range(n):
+        for j in range(i + 1, n):
+            x = rng(seed, i, j).normal(size=(30, 3))
+            p, q = (transform_points(se3.inverse(poses[k]), x) for k in (i, j))
+            pairs.append(Pairs(i, j, p, q, np.full((30, 3), np.nan)))
+    return poses, pairs
+
+
+@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
+def test_the_error_of_a_closed_chain_is_taken_out(method):
+    T, clouds = ring()
+    start = drifted(T)
+    after = relaxed(replace(method, points=2000), [Cloud.of(c) for c in clouds], start)
+    np.testing.assert_allclose(after[0], T[0], atol=1e-9)
+    before, left = errors_of(start, T), errors_of(after, T)
+    assert left.max() < 0.25 * before.max()
+
+
+@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
+def test_as_a_refinement_frames_in_between_follow(method):
+    T, clouds = ring()
+    start = drifted(T)
+    refiner = replace(method, points=2000).start(ViewStore[SurfaceMap](Spacing()))
+    for cloud, pose in zip(clouds, start, strict=True):
+        refiner.push(cloud, pose)
+    found = refiner.finish([c.index for c in clouds], start)
+    assert found.kept
+    assert found.views == VIEWS
+    assert found.support[1] > found.support[0]
+    assert errors_of(found.poses, T).max() < 0.25 * errors_of(start, T).max()
+
+
+@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
+def test_views_that_share_nothing_stay(method):
+    refiner = method.start(ViewStore[SurfaceMap](Spacing()))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 50.0
+    for k in range(2):
+        refiner.push(view(relief(500, k), index=k), poses[k])
+    found = refiner.finish([0, 1], poses)
+    assert not found.kept
+    np.testing.assert_array_equal(found.poses, poses)
+    alone = method.start(ViewStore[SurfaceMap](Spacing())).finish([0], poses[:1])
+    assert not alone.kept
+
+
+@pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
+def test_parts_are_registered_as_refinements(method):
+    assert parts.known("refinement")[parts.name_of(method)] is type(method)
+    assert parts.from_dict(Refining, parts.to_dict(method), where="test") == method
+
+
+def test_bergevin_prefers_no_order_of_the_views():
+    """All increments come from the same poses, so the views may be numbered in any way."""
+    T, clouds = ring()
+    start = drifted(T)
+    ready = [Cloud.of(c) for c in clouds]
+    method = Bergevin(points=2000, rounds=5)
+    order = np.array([0, 5, 2, 7, 4, 1, 6, 3])
+    plain = relaxed(method, ready, start)
+    shuffled = relaxed(method, [ready[k] for k in order], start[order])
+    np.testing.assert_allclose(shuffled, plain[order], atol=1e-6)
+
+
+def test_pulli_spreads_what_does_not_fit_evenly_over_the_ring():
+    """Section 4: a ring of pairwise alignments, each exact but for one, ends with equal gaps."""
+    n = 6
+    T = np.array([turn([0, 1, 0], 60 * k, centre=np.zeros(3)) for k in range(n)])
+    pairs = []
+    for i in range(n):
+        j = (i + 1) % n
+        relative = se3.inverse(T[j]) @ T[i]
+        if i == n - 1:
+            relative = turn([0, 1, 0], 6, centre=np.zeros(3)) @ relative
+        # Mates all round, so that each pair resists a turn alike.
+        p = rng(i).normal(size=(100, 3))
+        pairs.append(Pairs(i, j, p, transform_points(relative, p), np.full((100, 3), np.nan)))
+    chain = [np.eye(4)]
+    for p in pairs[:-1]:
+        A = np.linalg.lstsq(np.c_[p.p_j, np.ones(100)], np.c_[p.p_i, np.ones(100)], rcond=None)[0].T
+        chain.append(chain[-1] @ se3.orthonormalise(A))
+    poses = spread(np.array(chain), pairs, 1e-7)
+    gaps = [
+        np.rad2deg(
+            np.median(
+                np.linalg.norm(
+                    transform_points(poses[p.i], p.p_i) - transform_points(poses[p.j], p.p_j),
+                    axis=1,
+                )
+            )
+        )
+        for p in pairs
+    ]
+    assert max(gaps) < 1.5 * min(gaps)
+
+
+def test_williams_bennamoun_never_rises_and_ends_at_the_truth():
+    poses, pairs = motions(6, 0)
+    start = poses @ np.array([np.eye(4)] + [se3.exp(rng(9, k).normal(0, 0.3, 6)) for k in range(5)])
+    found, history = corresponding(start, pairs, 200)
+    assert (np.diff(history) <= 1e-9 * abs(history[-1])).all()
+    np.testing.assert_allclose(found, poses, atol=1e-5)
+    assert squared_error(found, pairs) < 1e-8
+
+
+def test_williams_bennamoun_takes_parts_that_nothing_connects_each_by_itself():
+    poses, pairs = motions(3, 0)
+    apart = [*pairs, *(replace(p, i=p.i + 3, j=p.j + 3) for p in pairs)]
+    both = np.concatenate([poses, poses])
+    both[3:] = turn([0, 0, 1], 90) @ both[3:]
+    start = both.copy()
+    start[[1, 2, 4, 5]] = start[[1, 2, 4, 5]] @ se3.exp([0.1, 0.2, 0, 0.1, 0, 0.2])
+    np.testing.assert_allclose(corresponding(start, apart, 200)[0], both, atol=1e-5)
+
+
+def test_small_angles_is_right_to_second_order():
+    """One linear system: an error ten times smaller leaves a hundredth."""
+    poses, pairs = motions(5, 1)
+    left = []
+    for size in (0.1, 0.01):
+        slips = [np.eye(4)] + [se3.exp(size * rng(5, k).normal(size=6)) for k in range(4)]
+        found = SmallAngles().relax(poses @ np.array(slips), pairs, [_cloud(p) for p in _points(5)])
+        left.append(np.abs(found - poses).max())
+    assert left[1] < 0.03 * left[0]
+
+
+def _points(n):
+    return [rng(k).normal(size=(50, 3)) for k in range(n)]
+
+
+def _cloud(p):
+    return Cloud.of(view(p))
