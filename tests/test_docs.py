@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
@@ -36,6 +37,19 @@ from tofuse.sensor.models import CAMERAS
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
+CITED = (
+    *("Arun et al. 1987", "Besl and McKay 1992", "Chen and Medioni 1992", "Godin et al. 1994"),
+    *("Rusinkiewicz and Levoy 2001", "Sharp et al. 2002", "Chetverikov et al. 2005"),
+    *("Almhdie et al. 2007", "Bergevin et al. 1996", "Lu and Milios 1997", "Pulli 1999"),
+    *("Williams and Bennamoun 2001", "Castellani et al. 2002", "Fusiello et al. 2002"),
+    *("Thrun and Montemerlo 2005", "Borrmann et al. 2008", "Sprickerhof et al. 2009"),
+    *("Olson 2008", "Nüchter et al. 2007", "May et al. 2009", "Prusak et al. 2008", "Artner 2009"),
+    *("Mure-Dubois and Hügli 2008", "Fuchs and Hirzinger 2008", "Gruen and Akca 2005"),
+    *("Akca 2007", "Akca and Gruen 2007", "Pottmann et al. 2004", "Magnusson 2006"),
+    *("Smith et al. 2008", "Barnea and Filin 2008", "Bae and Lichti 2008"),
+    *("Fischler and Bolles 1981", "Lowe 1999, 2004", "Wheeler and Ikeuchi 1995"),
+    *("Söderkvist and Wedin 1994", "Moore 1991", "Hartley and Zisserman 2003"),
+)
 PART_ROOMS = (
     "tofuse.filters",  # corrections too
     "tofuse.registration",
@@ -298,6 +312,20 @@ def test_every_part_is_listed_with_its_label() -> None:
     }
     assert registered - listed == set(), "not in docs/methods.md"
     assert listed - registered == set(), "only in docs/methods.md"
+
+
+def test_tables_of_the_thesis_are_those_of_the_script() -> None:
+    """It also fails where a row names a module, a part or a test that is not there."""
+    script = [sys.executable, str(ROOT / "website" / "thesis.py"), "--check"]
+    done = subprocess.run(script, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr or "run python website/thesis.py"
+
+
+def test_every_work_that_the_thesis_cites_is_listed() -> None:
+    text = sections("docs/thesis.md")["Works that it cites"]
+    missing = [name for name in CITED if name not in text]
+    assert not missing
+    assert "not there" not in text_of("docs/thesis.md")
 
 
 def test_every_option_of_a_part_is_listed() -> None:

@@ -98,7 +98,7 @@ class Config:
         return dict(parts.to_dict(self))
 
 
-_ROOMS = (
+ROOMS = (
     "tofuse.filters",
     "tofuse.registration",
     "tofuse.odometry",
@@ -138,7 +138,7 @@ def changed(config: Config, changes: Mapping[str, Any], *, where: str) -> Config
     InputError
         For an option or part that does not exist, or a value of the wrong type.
     """
-    for room in _ROOMS:
+    for room in ROOMS:
         parts.discover(room)
     merged = _merge(config.to_dict(), changes)
     result: Config = parts.from_dict(Config, merged, where=where)

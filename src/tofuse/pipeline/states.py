@@ -36,6 +36,7 @@ _ROOMS = (
     "filters",
     "fusion",
     "geometry",
+    "lab",
     "maps",
     "odometry",
     "pipeline.backend",

@@ -1,0 +1,89 @@
+"""Stochastic gradient descent over a pose graph: what Olson claims of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.lab.stochastic import Stochastic
+from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+
+
+def grid(side: int, noise: float, seed: int) -> PoseGraph:
+    """A camera that walks to and fro over a square, tied to the lane before at every step."""
+    rng = np.random.default_rng(seed)
+    truth = []
+    for row in range(side):
+        lane = range(side) if row % 2 == 0 else range(side - 1, -1, -1)
+        for column in lane:
+            T = np.eye(4)
+            T[:3, :3] = se3.so3_exp([0.0, 0.0 if row % 2 == 0 else np.pi - 0.01, 0.0])
+            T[:3, 3] = [column, 0.1 * np.sin(column), row]
+            truth.append(T)
+    n = side * side
+    place = {(round(T[0, 3]), round(T[2, 3])): k for k, T in enumerate(truth)}
+
+    def edge(i: int, j: int) -> Measured:
+        T = se3.inverse(truth[i]) @ truth[j] @ se3.exp(rng.normal(size=6) * noise)
+        return Measured(i, j, T, np.eye(6) / noise**2)
+
+    steps = [edge(k, k + 1) for k in range(n - 1)]
+    loops = [
+        edge(place[c, r], place[c, r + 1])
+        for r in range(side - 1)
+        for c in range(side)
+        if abs(place[c, r] - place[c, r + 1]) > 1
+    ]
+    poses = [np.eye(4)]
+    for step in steps:
+        poses.append(poses[-1] @ step.T_i_j)
+    return build_graph(range(n), np.array(poses), steps, loops)
+
+
+def test_it_comes_near_the_least_squares_from_a_chain():
+    graph = grid(6, 0.03, 0)
+    least = LevenbergMarquardt().optimise(graph).graph.chi2()
+    found = Stochastic().optimise(graph)
+    assert found.graph.chi2() < 0.15 * graph.chi2()
+    assert found.graph.chi2() < 1.5 * least
+    np.testing.assert_array_equal(found.graph.poses[0], graph.poses[0])
+
+
+def test_it_comes_near_from_poses_that_say_nothing():
+    """A few rounds take out nearly all of the error, and least squares goes on from there."""
+    for seed in range(3):
+        graph = grid(5, 0.05, seed)
+        rng = np.random.default_rng(100 + seed)
+        lost = se3.exp(np.concatenate([rng.normal(0, 5, (25, 3)), rng.normal(0, 1.5, (25, 3))], 1))
+        lost[0] = graph.poses[0]
+        bad = graph.with_poses(lost)
+        least = LevenbergMarquardt().optimise(graph).graph.chi2()
+        near = Stochastic(30).optimise(bad).graph
+        assert near.chi2() < 0.02 * bad.chi2()
+        assert LevenbergMarquardt().optimise(near).graph.chi2() < 1.05 * least
+
+
+def test_exact_edges_are_satisfied_whatever_the_order_of_their_ends():
+    graph = grid(4, 1e-9, 1)
+    edges = graph.edges[:, ::-1].copy()
+    turned = replace(graph, edges=edges, measurements=se3.inverse(graph.measurements))
+    slips = se3.exp(np.random.default_rng(0).normal(0, 0.2, (16, 6)))
+    slips[0] = np.eye(4)
+    found = Stochastic().optimise(turned.with_poses(turned.poses @ slips))
+    np.testing.assert_allclose(found.graph.poses, graph.poses, atol=0.1)
+
+
+def test_graphs_with_nothing_to_do_and_bad_ones():
+    assert Stochastic().optimise(PoseGraph.empty()).converged
+    graph = grid(3, 0.05, 0)
+    broken = graph.with_poses(graph.poses * np.nan)
+    with pytest.raises(InputError):
+        Stochastic().optimise(broken)
+    with pytest.raises(ValueError, match="rounds"):
+        Stochastic(0)
