@@ -1,0 +1,169 @@
+"""Every method on the same views, graphs and recordings: a page of tables, by merit.
+
+A part that is registered anywhere in the package is a row by itself. What a method makes of a case
+is kept in benchmarks/out/leaderboard, one file each, so that the same command goes on where it was
+stopped; `--fresh` forgets it. Cases are spread over processes of this machine, or over the workers
+of a Dask cluster (which see the same files). Peers take part as far as they are installed.
+
+    python benchmarks/leaderboard.py [--boards pairs graphs sequences] [--seeds 4] [--workers 2]
+    python benchmarks/leaderboard.py --scheduler tcp://host:8786
+    python benchmarks/leaderboard.py --page docs/leaderboard.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from leaders import Board, Score
+from leaders.graphs import Graphs
+from leaders.sequences_board import Sequences
+from leaders.statements import statements
+from leaders.two_views import TwoViews
+from sequences import DATA, OUT
+from tofuse.files.atomic import write_text
+from tofuse.kernels.threads import threads
+
+BOARDS: dict[str, Board] = {board.name: board for board in (TwoViews(), Graphs(), Sequences())}
+KEPT = OUT / "leaderboard"
+_BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
+
+
+def kept(board: str, method: str, case: str) -> Path:
+    """Return the file with what a method made of a case."""
+    plain = re.sub(r"[^\w.-]+", "_", f"{method} {case}")
+    mark = hashlib.sha256(f"{method}\0{case}".encode()).hexdigest()[:8]
+    return KEPT / board / f"{plain}-{mark}.json"
+
+
+def done(board: str, method: str, case: str, data: Path) -> None:
+    """Let a method do a case, on one thread, and keep what it gives."""
+    with threads(1):
+        score = BOARDS[board].run(method, case, data)
+    file = kept(board, method, case)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_text(file, json.dumps(None if score is None else dict(score)))
+
+
+def run_missing(
+    names: Sequence[str], seeds: int, data: Path, executor: Executor, methods: Sequence[str]
+) -> None:
+    """Do what has not been done yet."""
+    todo = [
+        (board, method, case)
+        for board in names
+        for case in BOARDS[board].cases(seeds)
+        for method in BOARDS[board].methods()
+        if (not methods or method in methods) and not kept(board, method, case).exists()
+    ]
+    futures = {executor.submit(done, *task, data): task for task in todo}
+    for count, future in enumerate(as_completed(futures), 1):
+        board, method, case = futures[future]
+        error = future.exception()
+        if error is not None:
+            print(f"{board}, {method}, {case}: {error!r}", file=sys.stderr)
+        if count % 50 == 0 or count == len(todo):
+            print(f"{count} of {len(todo)}", file=sys.stderr, flush=True)
+
+
+def scores_of(board: Board, seeds: int) -> dict[str, dict[str, list[Score]]]:
+    """What there is, by method and group of cases."""
+    out: dict[str, dict[str, list[Score]]] = {}
+    for method in board.methods():
+        for case in board.cases(seeds):
+            file = kept(board.name, method, case)
+            score = json.loads(file.read_text("utf-8")) if file.exists() else None
+            if score is not None:
+                out.setdefault(method, {}).setdefault(case.split("/")[0], []).append(score)
+    return out
+
+
+def table(board: Board, scores: Mapping[str, Mapping[str, Sequence[Score]]]) -> str:
+    """The rows of a board, the best first."""
+    lines = [
+        f"| Method | {' | '.join(board.columns.values())} | CPU ms |",
+        "|" + "---|" * (len(board.columns) + 2),
+    ]
+
+    def every(method: str) -> list[Score]:
+        return [s for some in scores[method].values() for s in some]
+
+    # A mean over groups: one that a method does not take counts for nothing.
+    order = sorted(
+        scores,
+        key=lambda m: (
+            -np.mean([board.merit(scores[m][g]) if g in scores[m] else 0 for g in board.columns]),
+            m,
+        ),
+    )
+    for method in order:
+        cells = [
+            board.cell(scores[method][g]) if g in scores[method] else "" for g in board.columns
+        ]
+        ms = 1000 * np.median([s["seconds"] for s in every(method)])
+        lines.append(f"| {method} | {' | '.join(cells)} | {ms:.0f} |")
+    return "\n".join(lines)
+
+
+def page(names: Sequence[str], seeds: int) -> str:
+    """All tables and statements, as Markdown."""
+    found = {name: scores_of(BOARDS[name], seeds) for name in names}
+    out = []
+    for name in names:
+        out += [f"## {BOARDS[name].title}", "", table(BOARDS[name], found[name]), ""]
+    out += ["## What the papers say", "", "| Paper | It says | Here |", "|---|---|---|"]
+    out += [f"| {paper} | {claim} | {here} |" for paper, claim, here in statements(found)]
+    return "\n".join(out) + "\n"
+
+
+def executor_of(scheduler: str | None, workers: int) -> Executor:
+    """Processes of this machine, or a cluster's workers."""
+    if scheduler is None:
+        return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    from distributed import Client
+
+    executor: Any = Client(scheduler).get_executor()
+    return executor  # type: ignore[no-any-return]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--boards", nargs="+", choices=[*BOARDS], default=[*BOARDS])
+    parser.add_argument("--methods", nargs="+", default=[], help="only these rows are run")
+    parser.add_argument("--seeds", type=int, default=4, help="of each case")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--scheduler")
+    parser.add_argument("--fresh", action="store_true")
+    parser.add_argument("--page", type=Path, help="a page whose tables are written anew")
+    parser.add_argument("--data", type=Path, default=DATA)
+    options = parser.parse_args(arguments)
+    if options.fresh:
+        shutil.rmtree(KEPT, ignore_errors=True)
+    with executor_of(options.scheduler, options.workers) as executor:
+        run_missing(options.boards, options.seeds, options.data, executor, options.methods)
+    text = page(options.boards, options.seeds)
+    if options.page is None:
+        print(text)
+        return
+    before = options.page.read_text("utf-8")
+    head, tail = before.split(_BEGIN)[0], before.split(_END)[1]
+    write_text(options.page, f"{head}{_BEGIN}\n\n{text}\n{_END}{tail}")
+
+
+if __name__ == "__main__":
+    main()
