@@ -16,10 +16,10 @@ from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
-from tofuse.registration.agreement import AgreementOptions, agreement
+from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.floor import FloorOptions, find_floor, find_floors
 from tofuse.registration.rough import with_rough_planes
-from tofuse.registration.search import SearchOptions, search
+from tofuse.registration.search import Candidate, SearchOptions, _distinct, search
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate_recording
 
@@ -340,6 +340,36 @@ def test_floor_is_found_in_a_camera_that_lies_on_its_side():
     # Who knows better what is down is believed.
     wrong = np.array([0.0, 0.0, 1.0])
     assert find_floors(views, gravity=(wrong, wrong)) is None
+
+
+def test_the_lowest_plane_is_the_one_with_most_points_and_few_below():
+    rng = np.random.default_rng(3)
+    p = rng.normal(size=(300, 3)) * [1, 0.4, 1] + [0, 0, 3]
+    n = rng.normal(size=(300, 3)) * 0.2 + [0, 1, 0]
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    band, tried = 0.02 + 0.01 * p[:, 2], np.arange(0, 300, 3)
+    for most, cosine in ((60.0, 0.97), (30.0, 0.9), (-1.0, 0.9)):
+        r = p @ n[tried].T - (p[tried] * n[tried]).sum(1)
+        on = ((np.abs(r) < band[:, None]) & (n @ n[tried].T > cosine)).sum(0)
+        on[(r > 3 * band[:, None]).sum(0) > most] = 0
+        assert kernels.lowest_plane(p, n, band, tried, cosine, most, 3.0) == tried[on.argmax()]
+
+
+def test_of_poses_that_differ_the_best_stay():
+    options = SearchOptions()
+    rng = np.random.default_rng(1)
+    said = Agreement(1.0, 1.0, 0.0, 0.0, 0.0, 1, 0.0)
+    poses = [se3.exp(rng.normal(size=6) * ([0.07] * 3 + [0.06] * 3)) for _ in range(60)]
+    found = [
+        Candidate(T, replace(said, score=s)) for T, s in zip(poses, rng.random(60), strict=True)
+    ]
+    kept = []
+    for one in sorted(found, key=lambda c: -c.score):
+        if all(options.differ(one.T_target_source, c.T_target_source) for c in kept):
+            kept.append(one)
+    assert 3 < len(kept) < 50
+    assert _distinct(found, options) == tuple(kept)
+    assert _distinct([], options) == ()
 
 
 def test_no_floor_where_the_camera_looks_at_a_wall():

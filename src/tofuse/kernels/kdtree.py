@@ -376,7 +376,7 @@ class KdTree:
 
 
 def _spread(work: Callable[[int, int], None], size: int) -> None:
-    run_chunks(work, size, chunks=16 if size > _SMALL_WORK else 1)
+    run_chunks(work, size, chunks=min(16, 2 * size // _SMALL_WORK) if size > _SMALL_WORK else 1)
 
 
 def _rows(points: ArrayLike, what: str) -> Float64:

@@ -22,6 +22,8 @@ Float64 = NDArray[np.float64]
 _NEAREST = 0.05
 # Points whose albedo disagrees speak against a pose for at most so many that support it.
 _MOST_AGAINST = 2.0
+# A pose that moves by less than this share of the reach is settled.
+_STILL = 0.001
 # Layout of what `agree` returns.
 LANDED = 0
 COMPARED = 1
@@ -383,7 +385,8 @@ def settle(
     g = np.empty(6)
     for c in range(start, stop):
         T = poses[c].copy()
-        for reach in reaches:
+        for k in range(len(reaches)):
+            reach = reaches[k]
             H[:] = 0
             g[:] = 0
             _pull(
@@ -414,7 +417,13 @@ def settle(
             for p in range(3):
                 H[p, p] += damping
                 H[p + 3, p + 3] += damping * unit_m * unit_m
-            T = moved(T, _solve(H, g))
+            step = _solve(H, g)
+            T = moved(T, step)
+            along = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
+            turned = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
+            # From here on nothing changes any more.
+            if along + unit_m * unit_m * turned < (_STILL * reach) ** 2 and reach == reaches[-1]:
+                break
         poses[c] = T
 
 
@@ -510,3 +519,48 @@ def agree(
             out[SQUARES_M] += r * r
             differences[k] = photo[i, j, 0] - light[k]
     return out
+
+
+@kernel
+def lowest_plane(
+    points: Float64,
+    normals: Float64,
+    band: Float64,
+    tried: NDArray[np.int64],
+    cosine: float,
+    most_below: float,
+    far: float,
+) -> int:
+    """Return which of the points `tried` has most points on its plane, of those with few below.
+
+    Parameters
+    ----------
+    points, normals
+        (n, 3) m, unit.
+    band
+        (n,) how near to a plane a point on it is, m; so many times `far` is below it.
+    cosine
+        Least cosine between the normals of a plane and of a point on it.
+    most_below
+        Planes with more points below them are out; without any other the first is returned.
+    """
+    best = tried[0]
+    most = 0
+    for k in tried:
+        nx, ny, nz = normals[k]
+        height = points[k, 0] * nx + points[k, 1] * ny + points[k, 2] * nz
+        on = 0
+        below = 0
+        for i in range(len(points)):
+            r = points[i, 0] * nx + points[i, 1] * ny + points[i, 2] * nz - height
+            if r > far * band[i]:
+                below += 1
+                if below > most_below:
+                    break
+            elif abs(r) < band[i]:
+                turned = normals[i, 0] * nx + normals[i, 1] * ny + normals[i, 2] * nz
+                on += turned > cosine
+        if below <= most_below and on > most:
+            most = on
+            best = k
+    return best

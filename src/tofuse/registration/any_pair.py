@@ -29,8 +29,8 @@ FEWEST_POINTS = 10
 # Views as they were recorded, far apart: multipath is in them, and bends each
 # of them otherwise. See docs/uncertainty.md for how these were found.
 _AS_RECORDED = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
-# Poses that shapes propose, at most.
-PROPOSALS = 8
+# Poses that shapes propose, at most, and points of a view whose shapes are described for it.
+_PROPOSALS, _DESCRIBED = 8, 1500
 
 
 @part("registration", "any-pair")
@@ -79,10 +79,10 @@ class AnyPair(Registrar):
 def _alike(source: Frame, target: Frame, rng: np.random.Generator) -> Float64:
     """Poses (N, 4, 4), under any rotation, that shapes which are alike propose."""
     try:
-        found = Fpfh(signed=True).candidates(source, target, rng)
+        found = Fpfh(points=_DESCRIBED, signed=True).candidates(source, target, rng)
     except RegistrationError:
         return np.zeros((0, 4, 4))
-    return np.stack([pose.T_target_source for pose in found.poses[:PROPOSALS]])
+    return np.stack([pose.T_target_source for pose in found.poses[:_PROPOSALS]])
 
 
 def _registered_as_images(

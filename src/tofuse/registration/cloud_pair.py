@@ -47,6 +47,8 @@ _LEAD = 0.02
 _LEAST_SUPPORT = 1 / 3
 # Score that may be lost by noise alone when a pose is aligned once more.
 _GIVEN_UP = 0.02
+# Points that show whether a rival ends where the best pose does.
+_RIVAL_POINTS = 2500
 # Finest resolution in spacings of so many points.
 _FINER, _SPACED = 0.5, 5000
 
@@ -309,7 +311,7 @@ def _rival(views: _Views, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _P
         if not views.differ(start, best.T_target_source):
             continue
         try:
-            end = CoarseToFine().at(views.size, *averaged, start, start).T_target_source
+            end = CoarseToFine().roughly(views.size, *averaged, start, _RIVAL_POINTS)
         except RegistrationError:
             end = start
         if views.differ(end, T):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -21,7 +21,7 @@ from tofuse.registration.interfaces import Metric
 from tofuse.registration.pairs import FEWEST_PAIRS
 from tofuse.registration.reduce import averaged, extent, reduced
 from tofuse.registration.rejectors import MaxDistance
-from tofuse.registration.selectors import All
+from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.shape import shape_at
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PlaneToPlane
@@ -173,6 +173,20 @@ class CoarseToFine(Registrar):
         """
         icp, rng = self._icp(resolution, 1e-3), np.random.default_rng(0)  # nothing is drawn
         return _kept(icp.register(data, model, T_start, rng), icp, data, model, guess, rng)
+
+    def roughly(
+        self, resolution: float, data: CloudFrame, model: CloudFrame, T_start: Float64, points: int
+    ) -> Float64:
+        """Where about so many points lead to, as `at`, from a start (4, 4): a pose (4, 4).
+
+        Raises
+        ------
+        RegistrationError
+            If too few points correspond.
+        """
+        icp, rng = self._icp(resolution, 1e-2), np.random.default_rng(0)
+        icp = replace(icp, source=Uniform(points))
+        return icp.register(data, model, T_start, rng).T_target_source
 
     def _icp(self, resolution: float, epsilon: float) -> Icp:
         return Icp(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.kernels import search as kernels
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.view_points import ViewPoints
 
@@ -53,6 +54,8 @@ class Floor:
 
 # Points that take part, and of them the planes that are tried.
 _POINTS, _TRIED = 1200, 200
+# Bands below a plane from which on a point counts as below it.
+_BELOW = 3.0
 
 
 # Where down may be in an image of an unknown camera: below, or at a side of one mounted upright.
@@ -97,30 +100,27 @@ def find_floor(view: SurfaceMap, down: Float64, options: FloorOptions) -> Floor 
         return None
     tried = facing[:: max(1, len(facing) // _TRIED)]
     band = options.band_m + options.band_share * p[:, 2]
-    heights = (p[tried] * n[tried]).sum(1)
-    on = _on(p, n, band, n[tried], heights, options.angle)
     # A table is larger than what is seen of the floor, but there is something below it.
-    lowest = (n[tried] @ p.T > heights[:, None] + 3 * band).mean(1) <= options.below
-    best = int(np.argmax(on.sum(1) * lowest))
+    cosine, most = float(np.cos(options.angle)), options.below * len(p)
+    best = kernels.lowest_plane(p, n, band, tried, cosine, most, _BELOW)
+    normal, height = n[best], float(p[best] @ n[best])
+    mine = _on(p, n, band, normal, height, cosine)
     for _ in range(3):  # the mean of what lies on it is better than one pixel
-        mine = on[best]
         normal, height = _fit(p[mine], seen.sigma[mine])
-        on = _on(p, n, band, normal[None], np.array([height]), options.angle)
-        best = 0
-        if on[0].sum() < max(20, options.min_share * len(p)):
+        mine = _on(p, n, band, normal, height, cosine)
+        if mine.sum() < max(20, options.min_share * len(p)):
             return None
-    below = np.count_nonzero(p @ normal > height + 3 * band)
+    below = np.count_nonzero(p @ normal > height + _BELOW * band)
     if below > options.below * len(p) or normal @ down < least or height <= 0:
         return None
-    return Floor(normal, height, float(on[0].mean()))
+    return Floor(normal, height, float(mine.mean()))
 
 
 def _on(
-    p: Float64, n: Float64, band: Float64, normals: Float64, heights: Float64, angle: float
+    p: Float64, n: Float64, band: Float64, normal: Float64, height: float, cosine: float
 ) -> NDArray[np.bool_]:
-    """(K, N) which points lie on each of K planes."""
-    near = np.abs(normals @ p.T - heights[:, None]) < band
-    return near & (normals @ n.T > np.cos(angle))
+    """(N,) which points lie on a plane."""
+    return np.asarray((np.abs(p @ normal - height) < band) & (n @ normal > cosine))
 
 
 def _fit(p: Float64, sigma: NDArray[np.float32]) -> tuple[Float64, float]:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.kernels.blas import one_blas_thread
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.any_pair import FEWEST_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
@@ -81,9 +82,10 @@ def _registered(
     method: Registrar | None,
     rng: np.random.Generator,
 ) -> Registration:
-    if method is None:
-        return AnyPair().register(source, target, guess, rng)
-    return method.register(source, target, np.eye(4) if guess is None else guess, rng)
+    with one_blas_thread():
+        if method is None:
+            return AnyPair().register(source, target, guess, rng)
+        return method.register(source, target, np.eye(4) if guess is None else guess, rng)
 
 
 def _register_arrays(

@@ -525,15 +525,20 @@ def _settle(
     )
 
 
-def _distinct(found: list[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:
+def _distinct(found: Sequence[Candidate], options: SearchOptions) -> tuple[Candidate, ...]:
     """Order candidates, the best first, and leave out those that are nearly a better one."""
-    distinct: list[Candidate] = []
-    for candidate in sorted(found, key=lambda candidate: -candidate.score):
-        if all(
-            options.differ(candidate.T_target_source, other.T_target_source) for other in distinct
-        ):
-            distinct.append(candidate)
-    return tuple(distinct)
+    found = sorted(found, key=lambda candidate: -candidate.score)
+    poses = np.array([candidate.T_target_source for candidate in found]).reshape(-1, 4, 4)
+    # Of a turn by less than that the cosine is more, and so is the trace.
+    least = 1 + 2 * np.cos(min(options.distinct_rad, np.pi))
+    kept: list[int] = []
+    for k, T in enumerate(poses):
+        better = poses[kept]
+        far = np.linalg.norm(better[:, :3, 3] - T[:3, 3], axis=1) > options.distinct_m
+        turned = (better[:, :3, :3] * T[:3, :3]).sum((1, 2)) < least
+        if (far | turned).all():
+            kept.append(k)
+    return tuple(found[k] for k in kept)
 
 
 def _upright(down: Float64) -> Float64:

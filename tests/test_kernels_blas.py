@@ -1,0 +1,34 @@
+"""BLAS keeps to one thread inside the block, and is as before after it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import ThreadpoolController, threadpool_limits
+
+import tofuse
+from tofuse.kernels.blas import one_blas_thread
+
+
+def counts() -> set[int]:
+    found = ThreadpoolController().select(user_api="blas").info()
+    return {library["num_threads"] for library in found}
+
+
+def test_one_inside_and_as_before_after() -> None:
+    with threadpool_limits(2):
+        before = counts()
+        with one_blas_thread():
+            assert counts() == {1}
+            with one_blas_thread():
+                assert counts() == {1}
+            assert counts() == {1}
+        assert counts() == before
+
+
+def test_an_error_restores() -> None:
+    with threadpool_limits(2):
+        before = counts()
+        with pytest.raises(tofuse.RegistrationError):
+            tofuse.register(np.ones((20, 3)), np.ones((20, 3)))
+        assert counts() == before
