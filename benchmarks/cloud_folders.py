@@ -1,0 +1,111 @@
+"""Folders of bare clouds through `tofuse run`: how many views are placed, how well, and marked.
+
+Each case is a folder of PLY files without poses, camera or time. What counts as wrong and as marked
+is said in `scoring.py`, but that views of clouds are wrong by more than 0.1 m or 4 degrees, as
+`cloud_pairs.py` has it; scans are those of `cloud_pairs.py`, with more points.
+
+    python benchmarks/cloud_folders.py [--data ../shared/data] [--cases kitchen scans]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import cloud_pairs
+import pairs
+import scoring
+import tofuse
+from sequences import DATA
+from tofuse.files.ply import write_ply
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+# Poses (4, 4) in one frame, and points (n, 3) of each view.
+Views = Iterator[tuple[Float64, Float32]]
+
+
+def every(name: str, step: int) -> Callable[[Path], Views]:
+    """Every so manieth view of a scene of `pairs.py`."""
+
+    def views(data: Path) -> Views:
+        recording = pairs.opened(name, data)
+        assert recording.reference is not None
+        for k in range(0, len(recording), step):
+            yield recording.reference[k], recording[k].points
+
+    return views
+
+
+def spheres(name: str, count: int, points: int, seed: int) -> Callable[[Path], Views]:
+    """Spherical scans through a simulated scene, with any heading."""
+    return lambda _data: cloud_pairs.scanned(name, count, points, seed)
+
+
+CASES: dict[str, tuple[str, Callable[[Path], Views]]] = {
+    "kitchen": ("7-Scenes kitchen, every 20th frame", every("kitchen", 10)),
+    "flat": ("Tour of four rooms, every 12th frame", every("flat", 1)),
+    "room": ("Turn in a furnished room, every 24th frame (22 degrees)", every("room", 3)),
+    "scans": (
+        "Six scans of 1.4 million points through four rooms",
+        spheres("flat", 6, 1_400_000, 0),
+    ),
+    "scans-2": ("The same in another flat", spheres("flat", 6, 1_400_000, 3)),
+}
+
+
+def row(title: str, views: Views) -> str:
+    """Reconstruct one folder, and tell what became of it."""
+    poses = []
+    with tempfile.TemporaryDirectory() as folder:
+        for k, (T, points) in enumerate(views):
+            write_ply(Path(folder) / f"{k:04d}.ply", points)
+            poses.append(T)
+        start = time.perf_counter()
+        result = tofuse.reconstruct(tofuse.open(folder))
+        seconds = time.perf_counter() - start
+    allowed = scoring.Tolerance(cloud_pairs.RIGHT_M, float(np.radians(cloud_pairs.RIGHT_DEG)))
+    truth = scoring.Truth(np.stack(poses), np.zeros(len(poses), np.intp), allowed)
+    score = scoring.score(scoring.parts_of(result, range(len(poses))), truth)
+    told = result.diagnostics
+    cells = [
+        title,
+        f"{score.main} of {score.frames}",
+        f"{1000 * score.ate_m:.0f}",
+        score.wrong,
+        score.unmarked,
+        sum(loop.accepted for loop in told.loops),
+        told.verdict,
+        f"{seconds:.0f}",
+    ]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
+    given = parser.parse_args()
+    print(
+        "| Folder | in the main model | rms error, mm | wrong | of these unmarked | loops | verdict"
+        " | s |\n|---|---|---|---|---|---|---|---|"
+    )
+    for name in given.cases:
+        title, made = CASES[name]
+        try:
+            print(row(title, made(given.data)), flush=True)
+        except FileNotFoundError:
+            print(f"| {title}: no data |")
+
+
+if __name__ == "__main__":
+    main()
