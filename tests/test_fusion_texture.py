@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
 from tofuse.fusion import atlas as atlas_module
 from tofuse.fusion.atlas import MARGIN, plain_atlas, unwrap
+from tofuse.fusion.colors import UNSEEN
 from tofuse.fusion.mesh import Mesh
-from tofuse.fusion.texture import LitView, exposures, textured
+from tofuse.fusion.texture import LitView, baked, exposures, textured
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.atlas import NOBODY, draw_triangles
@@ -197,6 +199,35 @@ def test_what_is_hidden_is_not_painted_by_what_hides_it() -> None:
 
 def test_frames_without_light_give_no_view() -> None:
     assert LitView.of(RangeFrame(0, 0.0, CAMERA, np.ones((60, 80), np.float32))) is None
+
+
+def test_what_has_no_colour_darkens_nothing() -> None:
+    wall = sheet(40, 40, 0.05)
+    dark = wall.vertices[:, 0] > 0
+    wall = replace(wall, color=np.where(dark[:, None], 0, [180, 180, 180]).astype(np.uint8))
+    small = wall.decimated(400)
+    assert set(np.unique(small.color).tolist()) == {0, 180}
+    shown = baked(wall, 400, 256).image
+    assert set(np.unique(shown).tolist()) == {UNSEEN[0], 180}
+    turned = small.shape().turned(np.eye(3))["color"]
+    assert set(np.unique(turned).tolist()) == {UNSEEN[0], 180}
+    assert set(np.unique(small.shape().color).tolist()) == {0, 180}  # a file of data keeps it
+
+
+def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:
+    pytest.importorskip("xatlas")
+    monkeypatch.setattr(atlas_module, "_AT_ONCE", 100)
+    wall = sheet(20, 20, 0.05)
+    atlas = unwrap(wall, 512)
+    np.testing.assert_array_equal(atlas.vertices[atlas.faces], wall.faces)
+    assert len(np.unique(atlas.vertices)) == len(wall)
+    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    draw_triangles(atlas.places[atlas.faces], 0.0, owner, np.zeros((*owner.shape, 2), np.float32))
+    p = atlas.places[atlas.faces].astype(float)
+    b, c = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    area = 0.5 * np.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
+    own = np.bincount(owner[owner != NOBODY], minlength=len(p))
+    assert own.sum() == pytest.approx(area.sum(), rel=0.1)  # nothing lies on anything else
 
 
 def test_textures_come_back_from_files(tmp_path: Path) -> None:

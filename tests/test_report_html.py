@@ -15,7 +15,8 @@ import pytest
 
 from tofuse.errors import OutputError
 from tofuse.fusion.cloud import Cloud, CloudBuilder, empty_cloud
-from tofuse.fusion.mesh import UNSEEN, Mesh, seen_colors
+from tofuse.fusion.colors import UNSEEN, seen_colors
+from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.geometry import se3

@@ -324,6 +324,26 @@ def test_a_large_result_has_tiles_an_overview_and_all_else(tmp_path, small_limit
         OutputFolder(out, overwrite=True)
 
 
+def test_a_glb_is_small_and_a_ply_is_whole(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(tiles, "OVERVIEW_BYTES", 600_000)
+    result, _ = make_room()
+    result = replace(result, mesh=waves())
+    out = tmp_path / "out"
+    write_result(result, OutputFolder(out))
+    assert json.loads((out / "run.json").read_text())["tiles"] is None
+    assert 400_000 < (out / "mesh.glb").stat().st_size <= 600_000
+    assert len(read_ply(out / "mesh.ply").faces) == len(waves().faces)
+
+
+def test_tiles_are_grey_where_no_image_showed_a_colour(tmp_path) -> None:
+    colors = np.full((len(waves()), 3), 200, np.uint8)
+    colors[::2] = 0
+    write_tiles(replace(waves(), color=colors), np.eye(3), tmp_path)
+    for path in tmp_path.glob("*.glb"):
+        shown = read_glb(path).color
+        assert set(shown[:, 0].tolist()) <= {142, 200}
+
+
 def test_a_component_may_be_tiled_as_well(tmp_path, small_limits) -> None:
     result, _ = make_room()
     own = replace(result, mesh=waves())

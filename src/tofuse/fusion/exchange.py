@@ -21,6 +21,7 @@ from tofuse.files.pcd import write_pcd
 from tofuse.files.ply import write_ply
 from tofuse.files.stl import write_stl
 from tofuse.files.usdz import write_usdz
+from tofuse.fusion.colors import seen_colors
 
 Float64 = NDArray[np.float64]
 
@@ -104,13 +105,14 @@ class Shape:
         return out
 
     def turned(self, R: Float64) -> dict[str, Any]:
-        """Arrays of the mesh in other axes, as writers of meshes take them."""
+        """Arrays of the mesh in other axes, as writers of meshes that are looked at take them."""
         painted = {"uv": self.uv, "texture": self.texture}
+        color = None if self.color is None else seen_colors(self.color)
         return {
             "points": self.points @ R.T,
             "faces": self.faces,
             "normals": None if self.normals is None else self.normals @ R.T,
-            **({"color": self.color} if self.texture is None else painted),
+            **({"color": color} if self.texture is None else painted),
         }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
+from tofuse.fusion.colors import has_color
 from tofuse.fusion.exchange import Shape
 from tofuse.kernels.clustering import connect, number_keys, plane_sums, settle
 
@@ -24,8 +25,6 @@ _HELD = 0.02
 _MEASURED = 100_000
 # Two vertices of which one faces away from the other are on different sides of something.
 _BEHIND = -0.3
-# Where no image showed a colour, for who looks at it.
-UNSEEN = (142, 142, 142)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,12 +231,21 @@ class Mesh:
             self._near_planes(group, mean(self.vertices), cell_m).astype(np.float32),
             faces,
             normals.astype(np.float32),
-            None if self.color is None else np.round(mean(self.color)).astype(np.uint8),
+            self._mean_color(group, len(count)),
             np.sqrt(mean(self.sigma.astype(float) ** 2)).astype(np.float32),
             most,
             self.offset,
         )
         return merged.rows(np.ones(len(faces), bool))
+
+    def _mean_color(self, group: NDArray[np.intp], groups: int) -> UInt8 | None:
+        """Mean (G, 3) of the colours that images showed; black where none of a group has one."""
+        if self.color is None:
+            return None
+        known = has_color(self.color)
+        count = np.maximum(np.bincount(group[known], minlength=groups), 1)
+        sums = [np.bincount(group[known], c[known].astype(float), groups) for c in self.color.T]
+        return np.round(np.stack(sums, -1) / count[:, None]).astype(np.uint8)
 
     def _near_planes(self, group: NDArray[np.intp], middles: Float64, cell_m: float) -> Float64:
         """Where each group's place (G, 3) is nearest to the planes of its triangles.
@@ -276,11 +284,3 @@ def _loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
                 place[following] = len(path)
                 path.append(following)
     return [loop for loop in found if len(loop) > 2]
-
-
-def seen_colors(colors: UInt8) -> UInt8:
-    """Return colours (N, 3) with a neutral grey where no image showed one, which are black."""
-    unseen = ~colors.any(1)
-    out = colors.copy()
-    out[unseen] = UNSEEN
-    return out

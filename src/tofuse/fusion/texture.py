@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tofuse.fusion.atlas import MARGIN, Atlas, unwrap
 from tofuse.fusion.cloud import grey_of
+from tofuse.fusion.colors import UNSEEN, has_color, seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
@@ -31,6 +32,7 @@ _BORDER = 0.08  # of the image's height
 _POWER = 4.0
 _CHUNKS = 16
 _SAMPLED = 20_000  # vertices at which exposures are compared
+_TEXELS_AT_ONCE = 1 << 14
 _ROBUST, _ROUNDS = 0.15, 4  # of the logarithm of light
 _MOST_GAIN = 1.0
 # A tenth of what is seen at least, so that black does not weigh without limit.
@@ -132,10 +134,12 @@ def textured(mesh: Mesh, views: Sequence[LitView], poses: Float64, size: int) ->
         rgb = np.round(light.clip(0, 255)).astype(np.uint8)
     else:
         rgb = grey_of(light[:, 0].astype(float))
-    colors = np.full((len(points), 3), 128, np.uint8)
-    if mesh.color is not None:
-        colors = np.round(sheet.at_texels(mesh.color).clip(0, 255)).astype(np.uint8)
+    colors = np.empty((len(points), 3), np.uint8)
     colors[seen] = rgb
+    colors[~seen] = UNSEEN
+    if mesh.color is not None:
+        own = sheet.at_texels(seen_colors(mesh.color), ~seen)
+        colors[~seen] = np.round(own.clip(0, 255)).astype(np.uint8)
     share = float(seen.mean()) if len(seen) else 0.0
     return Textured(mesh, sheet.atlas, sheet.filled(colors), gains, share)
 
@@ -161,14 +165,17 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
     size = int(np.clip(np.ceil(np.sqrt(_TEXELS_A_VERTEX * len(mesh))), _LEAST_SIZE, size))
     sheet = _Sheet.of(small, size)
     if small is mesh:
-        colors = sheet.at_texels(mesh.color)
+        colors = sheet.at_texels(seen_colors(mesh.color))
     else:
         near, distance2 = KdTree(mesh.vertices).neighbours(sheet.points, _NEAR)
         facing = np.einsum("nki,ni->nk", mesh.normals[near], sheet.normals) > 0
         facing |= ~facing.any(1, keepdims=True)
         closest = distance2.min(1, keepdims=True)
         weights = np.where((near >= 0) & facing, 1 / (distance2 + closest + 1e-12), 0)
-        colors = np.einsum("nk,nki->ni", weights, mesh.color[near].astype(float))
+        known = has_color(mesh.color)
+        lit = weights * known[near]
+        weights = np.where(lit.any(1, keepdims=True), lit, weights)
+        colors = np.einsum("nk,nki->ni", weights, seen_colors(mesh.color)[near].astype(float))
         colors /= weights.sum(1, keepdims=True)
     image = sheet.filled(np.round(colors.clip(0, 255)).astype(np.uint8))
     return Textured(small, sheet.atlas, image, np.zeros((0, 3)), 0.0)
@@ -207,9 +214,13 @@ class _Sheet:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
         return cls(atlas, painted, corners, shares, points, normals)
 
-    def at_texels(self, values: NDArray[np.generic]) -> Float32:
-        """Values (K, C) between those of the vertices (N, C)."""
-        return _between(values, self.corners, self.shares)
+    def at_texels(
+        self, values: NDArray[np.generic], where: NDArray[np.bool_] | None = None
+    ) -> Float32:
+        """Values (K, C) between those of the vertices (N, C); of some of the texels (K,)."""
+        if where is None:
+            return _between(values, self.corners, self.shares)
+        return _between(values, self.corners[where], self.shares[where])
 
     def filled(self, colors: UInt8) -> UInt8:
         """Image (size, size, 3) of the colours (K, 3), nothing left open."""
@@ -219,9 +230,14 @@ class _Sheet:
 
 
 def _between(values: NDArray[np.generic], corners: NDArray[np.int32], shares: Float32) -> Float32:
-    b, c = shares.T[:, :, None]
-    of = values[corners].astype(np.float32)
-    return of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
+    out = np.empty((len(corners), values.shape[1]), np.float32)
+    # Piece by piece: what the system has to find memory for anew takes longer than the sums.
+    for start in range(0, len(out), _TEXELS_AT_ONCE):
+        rows = slice(start, start + _TEXELS_AT_ONCE)
+        b, c = shares[rows].T[:, :, None]
+        of = values[corners[rows]].astype(np.float32)
+        out[rows] = of[:, 0] * (1 - b - c) + of[:, 1] * b + of[:, 2] * c
+    return out
 
 
 def exposures(mesh: Mesh, views: Sequence[LitView], poses: Float64) -> Float64:

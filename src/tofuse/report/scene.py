@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.fusion.cloud import Cloud
-from tofuse.fusion.mesh import Mesh, seen_colors
+from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.report import images
 from tofuse.report.packing import normal_bytes, squeezed, steps_of

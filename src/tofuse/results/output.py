@@ -20,7 +20,8 @@ from tofuse.files.obj import write_obj
 from tofuse.files.ply import write_ply
 from tofuse.files.reading import parsed, read_text
 from tofuse.files.trajectory import read_tum, write_tum
-from tofuse.fusion.mesh import Mesh, seen_colors
+from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.kernels.threads import side_threads
 from tofuse.posegraph.accuracy import Accuracy
@@ -121,7 +122,8 @@ def _write_mesh(
 ) -> tiles.Tiled | None:
     """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node turns it upright.
 
-    Large surfaces are written as tiles as well, and `mesh.glb` is an overview of them.
+    Of large surfaces `mesh.glb` is an overview, small enough to be sent and shown anywhere; of very
+    large ones there are tiles as well.
     """
     write_ply(
         folder / "mesh.ply",
@@ -137,7 +139,7 @@ def _write_mesh(
     if len(mesh.faces) > tiles.MOST_FACES:
         tiled = tiles.write_tiles(mesh, result.T_up_world[:3, :3], folder / TILES)
     if texture is None:
-        shown = mesh if tiled is None else tiled.overview
+        shown = tiles.overview(mesh) if tiled is None else tiled.overview
         write_glb(
             folder / "mesh.glb",
             shown.vertices,

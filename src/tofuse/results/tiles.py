@@ -1,4 +1,4 @@
-"""Surfaces that are too large for one file of a browser: 3D Tiles, and an overview."""
+"""Surfaces that are too large for one file of a browser: an overview, and 3D Tiles."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tofuse._version import __version__
 from tofuse.files.atomic import make_folder
 from tofuse.files.glb import write_glb
 from tofuse.files.tileset import Tile, write_tileset
+from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.levels import Level, Place, levels
 from tofuse.fusion.mesh import Mesh
 from tofuse.results.folder import RESULT, TILESET
@@ -63,14 +64,14 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
     """
     make_folder(folder)
     below: dict[Place, Tile] = {}
-    overview = mesh
+    coarse = mesh
     number = tiles = 0
     for level in levels(mesh):
         number = level.number
         tiles += len(level.places)
         below = _tree(_written(level, R_up_world, folder), below, level.error_m)
         if not _fits(level.mesh):
-            overview = level.mesh
+            coarse = level.mesh
         error = level.error_m
     while len(below) > 1:  # what was put together to nothing has tiles below it all the same
         number, error = number + 1, 2 * error
@@ -84,7 +85,7 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
         generator=f"tofuse {__version__}",
         extras={"T_up_world": T.tolist()},
     )
-    return Tiled(number + 1, tiles, len(mesh.faces), _fitting(overview))
+    return Tiled(number + 1, tiles, len(mesh.faces), overview(coarse))
 
 
 def is_tiles(folder: Path) -> bool:
@@ -92,8 +93,8 @@ def is_tiles(folder: Path) -> bool:
     return RESULT.names.is_whole(folder)
 
 
-def _fitting(mesh: Mesh) -> Mesh:
-    """As many triangles as fit into the overview."""
+def overview(mesh: Mesh) -> Mesh:
+    """Return the surface with as many triangles as fit into `OVERVIEW_BYTES` of glTF."""
     faces = float(OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2))
     fitting = mesh
     while not _fits(fitting):
@@ -118,7 +119,7 @@ def _written(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Til
             points,
             mesh.faces,
             normals=mesh.normals @ R_up_world.T,
-            color=mesh.color,
+            color=None if mesh.color is None else seen_colors(mesh.color),
             scalars={"sigma": mesh.sigma, "views": mesh.views},
             generator=f"tofuse {__version__}",
         )

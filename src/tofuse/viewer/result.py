@@ -14,7 +14,8 @@ from tofuse.errors import InputError
 from tofuse.files.glb import read_glb
 from tofuse.files.ply import Ply, read_ply
 from tofuse.files.tileset import Tile, read_tileset
-from tofuse.fusion.mesh import Mesh, seen_colors
+from tofuse.fusion.colors import seen_colors
+from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
