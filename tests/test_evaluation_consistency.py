@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,11 @@ from tofuse.evaluation.consistency import (
     map_consistency,
     poses_of_frames,
 )
+from tofuse.files.trajectory import write_tum
 from tofuse.geometry import quaternion, se3
 from tofuse.geometry.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.kernels.threads import threads
+from tofuse.pipeline.evaluating import evaluate
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.native import NativeSource
 from tofuse.recordings.recording import ArraySource, Recording, evenly
@@ -67,6 +70,32 @@ def look(camera: Camera, poses: Float64, noise: float = 0.004) -> list[RangeFram
 
 
 PINHOLE = Pinhole(80, 60, 70.0, 71.0, 39.2, 30.1)
+
+
+def test_images_are_compared_with_the_camera_that_a_result_was_made_with(tmp_path: Path) -> None:
+    """Frames state a focal length 5 % too large, as the result has found."""
+    poses = path(12)
+    wrong = replace(PINHOLE, fx=PINHOLE.fx * 1.05, fy=PINHOLE.fy * 1.05)
+    frames = [replace(frame, camera=wrong) for frame in look(PINHOLE, poses, 0.0)]
+    recording = Recording.of(ArraySource(frames), "room", "test")
+    times = np.arange(12) / 10
+    write_tum(tmp_path / "trajectory.txt", times, poses)
+    write_tum(tmp_path / "true.txt", times, poses)
+    run = {"schema": 1, "version": "0", "verdict": "good"}
+    run["frames"] = [{"index": k, "timestamp": t} for k, t in enumerate(times.tolist())]
+    found = []
+    for focal in (0.0, 0.05):
+        config = {"corrections": [{"part": "camera-errors", "focal": focal, "offset_m": 0.0}]}
+        (tmp_path / "run.json").write_text(json.dumps(run | {"config": config}))
+        for estimate in (tmp_path, tmp_path / "trajectory.txt"):
+            score = evaluate(estimate, tmp_path / "true.txt", recording=recording).consistency
+            found.append(score.rms_m)
+        alone = evaluate(poses, tmp_path / "true.txt", recording=recording, config=config)
+        assert alone.consistency.rms_m == pytest.approx(found[-1])
+    assert found[0] == found[1] > 3 * found[2] == 3 * found[3]
+    (tmp_path / "run.json").write_text(json.dumps(run | {"config": {"corrections": [7]}}))
+    with pytest.raises(InputError, match="holds no config"):
+        evaluate(tmp_path, tmp_path / "true.txt", recording=recording)
 
 
 # The definition, once more, slowly -------------------------------------------------------------

@@ -128,7 +128,11 @@ class Result(Reconstruction):
             )
         given = known if isinstance(known, str | Path) else np.asarray(known, float)
         return evaluate(
-            self.trajectory, given, recording=self.source, reference_error_m=reference_error_m
+            self.trajectory,
+            given,
+            recording=self.source,
+            reference_error_m=reference_error_m,
+            config=self.config,
         )
 
     def view(

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.filters.correction import Corrector
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
 from tofuse.kernels.consistency import agreement_sums, move_points, project_by_lens
@@ -251,7 +252,12 @@ def agreement(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
     return Consistency.of(agreements, len(images))
 
 
-def map_consistency(recording: Recording, poses: ArrayLike, frames: int = FRAMES) -> Consistency:
+def map_consistency(
+    recording: Recording,
+    poses: ArrayLike,
+    frames: int = FRAMES,
+    correctors: Sequence[Corrector] = (),
+) -> Consistency:
     """Map consistency of a recording under poses of its frames.
 
     Parameters
@@ -261,6 +267,8 @@ def map_consistency(recording: Recording, poses: ArrayLike, frames: int = FRAMES
         `poses_of_frames` for a trajectory with its own times.
     frames
         How many frames to look at, at most.
+    correctors
+        What puts frames right before.
 
     Frames that can't be read are left out.
 
@@ -292,6 +300,9 @@ def map_consistency(recording: Recording, poses: ArrayLike, frames: int = FRAMES
                 where=recording.path,
                 remedy="leave --recording out",
             )
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        assert isinstance(frame, RangeFrame)
         images.append(SurfaceImage.of(frame, unit))
         used.append(int(k))
     return agreement(images, T[used])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,18 @@ class CameraErrors(Correction):
         """Return what is wrong with the camera if this is, and `other` with what is left."""
         focal = self.focal + other.focal + self.focal * other.focal
         return CameraErrors(focal, self.offset_m + other.offset_m)
+
+    @classmethod
+    def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:
+        """Return what put the camera of a result right, by its configuration as plain data.
+
+        Of all that is corrected it alone moves pixels over the surface.
+        """
+        return tuple(
+            cls(item["focal"], item["offset_m"]).start()
+            for item in config.get("corrections", ())
+            if item["part"] == "camera-errors"
+        )
 
     def camera(self, stated: Camera) -> Camera:
         """Return the true camera."""

@@ -13,8 +13,7 @@ UNSEEN = (142, 142, 142)
 
 def has_color(colors: UInt8) -> NDArray[np.bool_]:
     """Say which colours (N, 3) an image showed."""
-    known: NDArray[np.bool_] = colors.any(1)
-    return known
+    return np.asarray(colors.any(1), np.bool_)
 
 
 def seen_colors(colors: UInt8) -> UInt8:

@@ -101,7 +101,7 @@ def _directions() -> Float64:
 
 def _camera_score(R_world_camera: Float64, ups: Float64) -> Float64:
     """Logarithm (N,) of how probable directions (N, 3) are, by how cameras (K, 3, 3) are held."""
-    # Cameras that are held alike are one piece of evidence: by how many the mean is better than one.
+    # Cameras that are held alike are one piece of evidence: this counts the pieces.
     cos = 0.5 * (np.einsum("aij,bij->ab", R_world_camera, R_world_camera) - 1)
     apart = np.arccos(cos.clip(-1, 1))
     independent = 1 / np.exp(-0.5 * (apart / _ALIKE) ** 2).mean()
@@ -145,7 +145,7 @@ def _refined(normals: Float64, up: Float64) -> Float64:
         )
         if len(level) < _LEAST_SHARE * len(normals) or not len(level):
             return up
-        values, vectors = np.linalg.eigh(plumb.T @ plumb - level.T @ level)
+        _, vectors = np.linalg.eigh(plumb.T @ plumb - level.T @ level)
         found = vectors[:, 0]
         up = found if found @ up > 0 else -found
     return up

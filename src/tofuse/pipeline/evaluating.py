@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,17 @@ from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency, poses_of_frames
 from tofuse.evaluation.trajectory import TrajectoryError, evaluate_trajectory
 from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
+from tofuse.filters.camera_errors import CameraErrors
+from tofuse.filters.correction import Corrector
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
-from tofuse.results.output import clock_of
+from tofuse.results.folder import is_result
+from tofuse.results.output import clock_of, read_run_json
 
 Float64 = NDArray[np.float64]
 Poses = str | Path | Float64
+
+_TRAJECTORY = "trajectory.txt"  # of a result
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +68,7 @@ def evaluate(
     *,
     recording: Recording | str | Path | None = None,
     reference_error_m: float | None = None,
+    config: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Compare a trajectory with a reference.
 
@@ -75,6 +82,9 @@ def evaluate(
         measured as well.
     reference_error_m
         By how much the reference may be off, rms.
+    config
+        That of the result which the poses are of: its images are compared with the camera that it
+        was made with, if that was calibrated. Unless given, that of an estimate that is a result.
 
     Raises
     ------
@@ -108,8 +118,25 @@ def evaluate(
     consistency = None
     if recording is not None:
         here = poses_of_frames(recording.timestamps, times, poses)
-        consistency = map_consistency(recording, here)
+        consistency = map_consistency(recording, here, correctors=_correctors(estimate, config))
     return Evaluation(error, interval, consistency)
+
+
+def _correctors(estimate: Poses, config: Mapping[str, Any] | None) -> tuple[Corrector, ...]:
+    """What puts frames right as the result did that the poses are of, if they are of one."""
+    if config is not None:
+        return CameraErrors.made_with(config)
+    if not isinstance(estimate, str | Path):
+        return ()
+    folder = Path(estimate)
+    folder = folder.parent if folder.name == _TRAJECTORY else folder
+    if not is_result(folder):
+        return ()
+    path = folder / "run.json"
+    try:
+        return CameraErrors.made_with(read_run_json(path)["config"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError("holds no config", where=path, remedy="copy it again") from error
 
 
 def _poses(given: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

@@ -10,7 +10,6 @@ from tofuse.filters.camera_errors import CameraErrors
 from tofuse.fusion.texture import LitView, Textured, textured
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
-from tofuse.parts import name_of
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
@@ -43,12 +42,7 @@ def paint(
     if mesh is None or not len(mesh.faces):
         return None
     chosen = steady(result)
-    # Of what is corrected, the errors of the camera alone move pixels over the surface.
-    correctors = [
-        CameraErrors(item["focal"], item["offset_m"]).start()
-        for item in result.config["corrections"]
-        if item["part"] == name_of(CameraErrors())
-    ]
+    correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
     progress.stage("painting", len(chosen))
     views: list[LitView] = []

@@ -364,7 +364,7 @@ def write_report_files(
     extras = ReportExtras(
         title=title,
         headline=device_sentence(recording, result) if component is None else "",
-        filter_steps=_filter_steps(config, recording, result),
+        filter_steps=_filter_steps(_used(config, result), recording, result),
         reference=reference_in_world(recording, result),
         truth_points=truth,
         pictures=pictures,
@@ -383,6 +383,12 @@ def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
 def _title(path: Path) -> str:
     """What a recording is called: by its folder, where its own name says nothing."""
     return (path.parent.name if path.name == RECORDING else "") or path.name
+
+
+def _used(config: Config, result: Reconstruction) -> Config:
+    """The configuration with the corrections that the result was made with, its camera's too."""
+    made = {"corrections": result.config["corrections"]}
+    return changed(config, made, where="the result's config")
 
 
 def _filter_steps(

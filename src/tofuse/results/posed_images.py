@@ -15,10 +15,8 @@ from tofuse.files.atomic import make_folder
 from tofuse.files.images import write_png
 from tofuse.files.ply import read_ply
 from tofuse.filters.camera_errors import CameraErrors
-from tofuse.filters.correction import Corrector
 from tofuse.fusion.texture import LitView
 from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths, scaled
-from tofuse.parts import name_of
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
@@ -147,7 +145,7 @@ def _frames(
 ) -> Iterator[RangeFrame]:
     """The chosen frames of a recording that can be read, with the camera as it was found to be."""
     wanted = [k + part.first in chosen for k in recording.indices.tolist()]
-    correctors = _correctors(part)
+    correctors = CameraErrors.made_with(part.config)
     recording = replace(recording, indices=recording.indices[wanted])
     for item in recording.read_all():
         if isinstance(item, UnreadableFrameError):
@@ -177,15 +175,6 @@ def _whole_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
     except InputError:
         return None
     return None if whole is None or len(whole) <= len(frame.color_image) else whole
-
-
-def _correctors(part: RecordedPart) -> list[Corrector]:
-    """Of what is corrected, the errors of the camera alone move points."""
-    return [
-        CameraErrors(item["focal"], item["offset_m"]).start()
-        for item in part.config.get("corrections", ())
-        if item["part"] == name_of(CameraErrors())
-    ]
 
 
 class _Lighting:
