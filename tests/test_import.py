@@ -79,3 +79,9 @@ def test_all_extras_go_together() -> None:
         requirement = Requirement(line)
         versions = pins[canonicalize_name(requirement.name)]
         assert all(version in requirement.specifier for version in versions), line
+
+
+def test_the_reference_shows_every_public_name() -> None:
+    page = (Path(__file__).resolve().parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^::: tofuse\.(\S+)$", page, re.MULTILINE)
+    assert sorted(shown) == sorted(set(tofuse.__all__) - {"__version__"})

@@ -672,6 +672,15 @@ def test_a_long_recording_stays_readable(tmp_path):
     assert "150 more are not shown" in got.sections["loops"]
 
 
+def test_ten_thousand_frames_are_told_in_a_page_that_opens(tmp_path):
+    got = page(tmp_path, many(10_000), ReportExtras("very long"))
+    assert (tmp_path / "report.html").stat().st_size < 4e6
+    titles = [t for t in got.titles if t.startswith("Frame ")]
+    assert 500 <= len(titles) < 600
+    assert "more are not shown" in got.sections["frames"]
+    assert list(got.sections) == [s for s in ORDER if s != "recording"]
+
+
 def cloud_frame():
     return CloudFrame.of(np.random.default_rng(0).normal(0, 1, (500, 3)), index=4)
 

@@ -20,6 +20,7 @@ from tofuse._version import __version__
 if TYPE_CHECKING:
     from tofuse.api.result import Result, load, merge, reconstruct
     from tofuse.errors import InputError, OutputError, RegistrationError, TofuseError
+    from tofuse.evaluation.changes import Change
     from tofuse.fusion.cloud import Cloud
     from tofuse.fusion.mesh import Mesh
     from tofuse.geometry.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
@@ -29,36 +30,58 @@ if TYPE_CHECKING:
     from tofuse.pipeline.evaluating import Evaluation, evaluate
     from tofuse.pipeline.judging import Judgement, judge
     from tofuse.pipeline.mapper import Mapper
+    from tofuse.posegraph.accuracy import Accuracy
+    from tofuse.posegraph.graph import LoopRecord, PoseGraph
     from tofuse.recordings.arrays import from_arrays
     from tofuse.recordings.frames import CloudFrame, RangeFrame
     from tofuse.recordings.open import open_recording as open  # noqa: A004
     from tofuse.recordings.recording import Recording
     from tofuse.registration.base import Registration
     from tofuse.registration.register import register
-    from tofuse.results.types import Reconstruction
+    from tofuse.results.types import (
+        Component,
+        Diagnostics,
+        FrameRecord,
+        Reason,
+        Reconstruction,
+        SessionChange,
+        SessionPair,
+        SessionRecord,
+    )
 
 _HOMES = {
+    "Accuracy": "tofuse.posegraph.accuracy",
     "BrownConrady": "tofuse.geometry.cameras",
+    "Change": "tofuse.evaluation.changes",
     "Cloud": "tofuse.fusion.cloud",
     "CloudFrame": "tofuse.recordings.frames",
+    "Component": "tofuse.results.types",
     "Config": "tofuse.pipeline.config",
+    "Diagnostics": "tofuse.results.types",
     "Evaluation": "tofuse.pipeline.evaluating",
     "Fisheye": "tofuse.geometry.cameras",
+    "FrameRecord": "tofuse.results.types",
     "InputError": "tofuse.errors",
     "Judgement": "tofuse.pipeline.judging",
+    "LoopRecord": "tofuse.posegraph.graph",
     "Mapper": "tofuse.pipeline.mapper",
     "Mesh": "tofuse.fusion.mesh",
     "OutputError": "tofuse.errors",
     "Pinhole": "tofuse.geometry.cameras",
     "Player": "tofuse.live.player",
+    "PoseGraph": "tofuse.posegraph.graph",
     "RangeFrame": "tofuse.recordings.frames",
     "Rational": "tofuse.geometry.cameras",
     "RayTable": "tofuse.geometry.cameras",
+    "Reason": "tofuse.results.types",
     "Reconstruction": "tofuse.results.types",
     "Recording": "tofuse.recordings.recording",
     "Registration": "tofuse.registration.base",
     "RegistrationError": "tofuse.errors",
     "Result": "tofuse.api.result",
+    "SessionChange": "tofuse.results.types",
+    "SessionPair": "tofuse.results.types",
+    "SessionRecord": "tofuse.results.types",
     "TofuseError": "tofuse.errors",
     "evaluate": "tofuse.pipeline.evaluating",
     "from_arrays": "tofuse.recordings.arrays",
@@ -72,27 +95,38 @@ _HOMES = {
 }
 
 __all__ = [
+    "Accuracy",
     "BrownConrady",
+    "Change",
     "Cloud",
     "CloudFrame",
+    "Component",
     "Config",
+    "Diagnostics",
     "Evaluation",
     "Fisheye",
+    "FrameRecord",
     "InputError",
     "Judgement",
+    "LoopRecord",
     "Mapper",
     "Mesh",
     "OutputError",
     "Pinhole",
     "Player",
+    "PoseGraph",
     "RangeFrame",
     "Rational",
     "RayTable",
+    "Reason",
     "Reconstruction",
     "Recording",
     "Registration",
     "RegistrationError",
     "Result",
+    "SessionChange",
+    "SessionPair",
+    "SessionRecord",
     "TofuseError",
     "__version__",
     "evaluate",
