@@ -1,11 +1,13 @@
 """From recordings to a rig: still cameras, bad input, the commands, one model from all cameras."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import tofuse
 from test_rigs_joint import CAMERA, looked_at
 from tofuse.cli import main
 from tofuse.errors import InputError
@@ -16,9 +18,11 @@ from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig import Rig, RigCamera, read_rig, write_rig
+from tofuse.report.scene import CAMERA_COLORS
 from tofuse.rigs.calibrate import calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
 from tofuse.simulation.rig import around, relative
+from tofuse.viewer.result import read_result
 
 # A room: floor, three walls, and boards in front of these.
 ROOM = (
@@ -123,6 +127,19 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, of_images = read_tum(tmp_path / "model" / "trajectory.txt")
     stated = read_rig(out).cameras
     assert np.allclose(of_images[1], stated[1].T_rig_camera, atol=1e-9)
+
+    # Each frame is known by its camera: in the file, in the report and in the viewer.
+    told = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
+    assert told == {"cameras": ["cam0", "cam1", "cam2"], "of_frames": [0, 1, 2, 0, 1, 2]}
+    assert tofuse.load(tmp_path / "model").recording["rig"] == told
+    page = (tmp_path / "model" / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r'background:(rgb\(.*?\))"></i>(cam\d)', page) == [
+        (f"rgb{color}".replace(" ", ""), f"cam{k}") for k, color in enumerate(CAMERA_COLORS[:3])
+    ]
+    shown = read_result(tmp_path / "model").rig
+    assert shown is not None
+    assert shown.names == ("cam0", "cam1", "cam2")
+    assert shown.of_frames.tolist() == told["of_frames"]
 
 
 def test_a_knocked_camera_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.report.fields import OF_95_PERCENT, accuracy_shares
 from tofuse.report.packing import squeezed
+from tofuse.report.scene import RigCameras
 from tofuse.report.subject import Subject
 from tofuse.report.words import STATUSES
 from tofuse.results.types import FrameRecord
@@ -31,13 +32,22 @@ def packed(s: Subject) -> dict[str, Any]:
     before = s.result.diagnostics.sequential
     if before.shape != s.result.trajectory.shape:
         before = np.full_like(s.result.trajectory, np.nan)
+    rig = rig_of(s)
     return {
+        "rig": None
+        if rig is None
+        else {"colors": rig.colors, "of": squeezed(rig.of_frames.astype("u1"))},
         "index": squeezed(index.astype("<u4")),
         "status": "".join(str(STATUSES.index(r.status)) if r else "0" for r in known),
         "errors": squeezed(shares) if np.isfinite(errors).any() else None,
         "after": _poses(s.result.trajectory, s.straight),
         "before": _poses(before, s.straight),
     }
+
+
+def rig_of(s: Subject) -> RigCameras | None:
+    """Return the cameras of a rig; None where there is one camera."""
+    return RigCameras.of(s.result.recording.get("rig"), len(s.index))
 
 
 def position_errors(s: Subject) -> Float64:

@@ -28,6 +28,11 @@ MAX_CAMERAS = 72
 _FAR = 1.8  # times the size of the model: then it is framed without the cameras
 _SAMPLED, _CLEARLY = 5000, 1.05  # normals that tell what is seen, and how much more is clear
 _DIRECTIONS = 100  # in which the outermost points are framed
+# Of the cameras of a rig, in their order; the first is that of any camera.
+CAMERA_COLORS = (
+    (90, 176, 245), (243, 122, 160), (95, 208, 138), (226, 200, 84),
+    (178, 144, 245), (240, 140, 84), (84, 214, 214), (205, 208, 214),
+)  # fmt: skip
 YAW, PITCH = -0.5, 0.75  # rad, the view that the report opens with
 
 
@@ -128,6 +133,42 @@ class Scene:
                 normals=(self.mesh.normals @ R.T).astype(np.float32),
             ),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class RigCameras:
+    """Which camera of a rig took each frame.
+
+    Attributes
+    ----------
+    names
+        Of the cameras.
+    colors
+        RGB of each.
+    of_frames
+        (N,) number of the camera of each frame, in the order of the frames.
+    """
+
+    names: tuple[str, ...]
+    colors: tuple[tuple[int, int, int], ...]
+    of_frames: Integers
+
+    @classmethod
+    def of(cls, told: Any, frames: int) -> RigCameras | None:
+        """Take what `run.json` says of a rig; None where it says nothing that fits the frames."""
+        if not isinstance(told, dict):
+            return None
+        names = tuple(str(name) for name in told.get("cameras", ()))
+        try:
+            of_frames = np.array(told.get("of_frames", ()), np.intp)
+        except (TypeError, ValueError, OverflowError):
+            return None
+        if of_frames.shape != (frames,) or not frames or not names:
+            return None
+        if of_frames.min() < 0 or of_frames.max() >= len(names):
+            return None
+        colors = tuple(CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names)))
+        return cls(names, colors, of_frames)
 
 
 def finite(poses: Float64 | None) -> Float64:

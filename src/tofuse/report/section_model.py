@@ -18,7 +18,14 @@ def model(s: Subject) -> Values:
     """Return the data of the 3D view and its still."""
     scene = s.scene
     if len(scene.points) == 0 and len(scene.after) == 0:
-        return {"scene": None, "still": "", "toggles": [], "colorings": [], "thinned": ""}
+        return {
+            "scene": None,
+            "still": "",
+            "toggles": [],
+            "colorings": [],
+            "rig": [],
+            "thinned": "",
+        }
     laid = scene.turned(s.straight)
     by = (
         {field.name: field for field in fields(laid, cameras.position_errors(s))}
@@ -34,6 +41,7 @@ def model(s: Subject) -> Values:
         "scene": data,
         "still": images.data_uri(still(laid, yaw=opening_yaw(laid))),
         "toggles": _toggles(scene),
+        "rig": _rig(s),
         "colorings": ([("", own)] if own else [])
         + [(name, field.label) for name, field in by.items()],
         "thinned": _thinned(scene),
@@ -57,6 +65,17 @@ def _toggles(scene: Scene) -> list[tuple[str, str, str, bool]]:
     if len(scene.loops):
         out.append(("loops", "Loop closures", "#5fd08a", True))
     return out
+
+
+def _rig(s: Subject) -> list[tuple[str, str]]:
+    """Name and colour of each camera of a rig."""
+    rig = cameras.rig_of(s)
+    if rig is None:
+        return []
+    return [
+        (name, f"rgb{color}".replace(" ", ""))
+        for name, color in zip(rig.names, rig.colors, strict=True)
+    ]
 
 
 def _own_colors(s: Subject) -> str:

@@ -90,7 +90,12 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         _cloud(folder / "cloud.ply"),
         diagnostics,
         run["config"],
-        {**run["input"], "warnings": run["warnings"], "findings": run["findings"]},
+        {
+            **run["input"],
+            "warnings": run["warnings"],
+            "findings": run["findings"],
+            "rig": run.get("rig"),
+        },
         run["seed"],
         run["threads"],
         _mesh(folder / "mesh.ply"),

@@ -215,6 +215,7 @@ def run_json(result: Reconstruction, tiled: tiles.Tiled | None = None) -> dict[s
             ],
             "T_up_world": result.T_up_world,
             "tiles": _tiles(tiled),
+            "rig": result.recording.get("rig"),
             "components": [_component(c) for c in result.components],
             "sessions": [
                 {

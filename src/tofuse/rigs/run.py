@@ -149,6 +149,11 @@ def reconstruct_rig(
         self_calibration=False,
     )
     result = reconstruct(with_odometry(recording, of_frames), given, seed=seed, progress=progress)
+    told = {
+        "cameras": [camera.name for camera in rig.cameras],
+        "of_frames": source.camera[recording.indices].tolist(),
+    }
+    result = replace(result, recording={**result.recording, "rig": told})
     return RigResult(_marked(result, knocked), times, poses)
 
 

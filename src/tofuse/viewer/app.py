@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import threading
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from tofuse.geometry.quaternion import from_matrix
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import FATES, Pictures
-from tofuse.report.scene import MAX_CAMERAS, camera_lines
+from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines
 from tofuse.report.words import frame_range
 from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result
@@ -124,13 +125,11 @@ class ResultView:
         ):
             if not poses:
                 continue
-            stack = np.stack([poses[k] for k in sorted(poses)])
-            step = -(-len(stack) // MAX_CAMERAS)
-            ends = camera_lines(stack, edge, step).reshape(-1, 2, 3).astype(np.float32)
+            ends, colors = _drawn(poses, edge, color, result if name == "after" else None)
             self._lines[name] = scene.add_line_segments(
                 f"/cameras/{name}",
                 ends,
-                color,
+                colors,
                 thickness=1.6,
                 thickness_units="screen",
                 visible=name == "after",
@@ -166,6 +165,9 @@ class ResultView:
                     box = gui.add_checkbox(label, name == "after" or name == "loops")
                     box.on_update(self._toggle(name))
                     self._drawn[name] = box
+            rig = result.rig
+            if rig is not None:
+                gui.add_html(_cameras_of(rig))
             if len(choices) > 1:
                 self._choice = gui.add_dropdown("Colour by", choices, initial_value=self._by)
                 self._choice.on_update(self._recolor)
@@ -364,6 +366,39 @@ class ResultView:
             )
             scene.add_label("/distance/label", text, position=(a + b) / 2)
             self._measured.content = f"**{text}**"
+
+
+def _drawn(
+    poses: dict[int, Float64], edge: float, color: tuple[int, int, int], of: Result | None
+) -> tuple[NDArray[np.float32], Any]:
+    """Ends (L, 2, 3) of the lines of cameras, and their colours: of a rig one for each camera."""
+    rig = None if of is None else of.rig
+    if of is None or rig is None:
+        stack = np.stack([poses[k] for k in sorted(poses)])
+        step = -(-len(stack) // MAX_CAMERAS)
+        return camera_lines(stack, edge, step).reshape(-1, 2, 3).astype(np.float32), color
+    camera = dict(zip((f["index"] for f in of.frames), rig.of_frames.tolist(), strict=True))
+    ends, colors = [], []
+    for number, own in enumerate(rig.colors):
+        mine = [poses[k] for k in sorted(poses) if camera[k] == number]
+        if not mine:
+            continue
+        step = -(-len(mine) * len(rig.names) // MAX_CAMERAS)
+        lines = camera_lines(np.stack(mine), edge, step).reshape(-1, 2, 3)
+        ends.append(lines)
+        colors.append(np.broadcast_to(np.array(own, np.uint8), lines.shape))
+    return np.concatenate(ends).astype(np.float32), np.concatenate(colors)
+
+
+def _cameras_of(rig: RigCameras) -> str:
+    """The names of a rig's cameras beside their colours, as HTML."""
+    square = "display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px"
+    rows = (
+        f'<div style="overflow-wrap:anywhere"><i style="{square};background:rgb{color}"></i>'
+        f"{escape(name)}</div>"
+        for name, color in zip(rig.names, rig.colors, strict=True)
+    )
+    return f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{"".join(rows)}</div>'
 
 
 def _place_camera(server: ViserServer, result: Result) -> float:

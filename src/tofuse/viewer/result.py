@@ -20,6 +20,7 @@ from tofuse.fusion.upright import upright
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
+from tofuse.report.scene import RigCameras
 from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, is_result, settle
 from tofuse.results.output import main_poses, read_run_json
@@ -198,6 +199,11 @@ class Result:
         """What `run.json` says of each frame."""
         frames: list[dict[str, Any]] = self.run["frames"]
         return frames
+
+    @property
+    def rig(self) -> RigCameras | None:
+        """The cameras of a rig; None where there is one camera."""
+        return RigCameras.of(self.run.get("rig"), len(self.frames))
 
     @property
     def loops(self) -> Float64:

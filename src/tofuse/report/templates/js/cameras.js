@@ -4,7 +4,9 @@ const DIM = [0.3, 0.36, 0.43], MARKED = [1, 0.36, 0.42], BEFORE = [0.94, 0.63, 0
 const MOST = 240;  // pyramids that are drawn of a long recording
 
 function makeCameras(painter, size, frames) {
-  const { index, status, after, before, errors } = frames, n = index.length;
+  const { index, status, after, before, errors, rig } = frames, n = index.length;
+  const cameraOf = (row) => (rig ? rig.of[row] : 0);
+  const own = (row) => (rig && status[row] === "0" ? rig.colors[cameraOf(row)].map((value) => value / 255) : STATES[Number(status[row])]);
   const pose = (of, row) => {
     const T = of.subarray(12 * row, 12 * row + 12);
     return T.some((value) => value !== 0) ? T : null;
@@ -19,9 +21,10 @@ function makeCameras(painter, size, frames) {
 
   function drawn(of, inkOf, isMarked) {
     const places = [], colors = [], step = Math.ceil(n / MOST);
-    let last = null, first = true, markedDrawn = 0, shown = null;
-    // A camera that hardly moved since the last pyramid would only make a blot.
-    const moved = (T) => !shown || Math.hypot(...minus(at(T, 0, 0, 0), at(shown, 0, 0, 0))) > 0.007 * size
+    const paths = [];  // of each camera of a rig, where it was last and where its last pyramid is
+    let first = true, markedDrawn = 0;
+    // A camera that hardly moved since its last pyramid would only make a blot.
+    const moved = (T, shown) => !shown || Math.hypot(...minus(at(T, 0, 0, 0), at(shown, 0, 0, 0))) > 0.007 * size
       || T[2] * shown[2] + T[6] * shown[6] + T[10] * shown[10] < 0.93;
     const put = (lines, color) => {
       for (const value of lines) places.push(value);
@@ -30,12 +33,12 @@ function makeCameras(painter, size, frames) {
     for (let row = 0; row < n; row++) {
       const T = pose(of, row), marked = isMarked(row);
       if (!T) continue;
-      const color = bytesOf(inkOf(row)), here = at(T, 0, 0, 0);
-      if (last) put([...last, ...here], color);
-      last = here;
-      if ((row % step === 0 && moved(T)) || (marked && markedDrawn++ < MOST) || status[row] !== "0") {
+      const color = bytesOf(inkOf(row)), here = at(T, 0, 0, 0), path = (paths[cameraOf(row)] ||= {});
+      if (path.last) put([...path.last, ...here], color);
+      path.last = here;
+      if (((rig || row % step === 0) && moved(T, path.shown)) || (marked && markedDrawn++ < MOST) || status[row] !== "0") {
         put(pyramid(T, (marked ? 0.026 : 0.018) * size), color);
-        shown = T;
+        path.shown = T;
       }
       // The first camera is larger, as in the thesis.
       if (first) put(pyramid(T, 0.032 * size), color);
@@ -61,7 +64,7 @@ function makeCameras(painter, size, frames) {
     const any = Boolean(isMarked);
     now = drawn(after, (row) => {
       if (any) return isMarked(row) ? MARKED : DIM;
-      return ramp && errors ? ramp(errors[row]) : STATES[Number(status[row])];
+      return ramp && errors ? ramp(errors[row]) : own(row);
     }, any ? isMarked : () => false);
   }
   function choose(row) {

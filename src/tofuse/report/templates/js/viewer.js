@@ -49,10 +49,11 @@ async function startViewer(box, scene, bus) {
   }
   let cameras = null, frames = null;
   if (scene.frames) {
-    const { index, status, errors, after, before } = scene.frames;
+    const { index, status, errors, after, before, rig } = scene.frames;
     frames = {
       index: await unpack(index, Uint32Array, 1), status,
       errors: errors ? await unpack(errors, Uint8Array, 1) : null,
+      rig: rig && { colors: rig.colors, of: await unpack(rig.of, Uint8Array, 1) },
       after: await unpack(after, Float32Array, 12), before: await unpack(before, Float32Array, 12),
     };
     cameras = makeCameras(painter, scene.size, frames);
