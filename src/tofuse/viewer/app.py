@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.errors import InputError
-from tofuse.files.glb import unlit_glb
+from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
 from tofuse.report.fields import OF_95_PERCENT
 from tofuse.report.images import viridis
@@ -378,15 +378,17 @@ def _drawn(
         step = -(-len(stack) // MAX_CAMERAS)
         return camera_lines(stack, edge, step).reshape(-1, 2, 3).astype(np.float32), color
     camera = dict(zip((f["index"] for f in of.frames), rig.of_frames.tolist(), strict=True))
+    # Colours of ends are taken for light, and single ones for what is shown on a screen.
+    light = (linear(np.array(rig.colors, np.uint8))[:, :3] // 257).astype(np.uint8)
     ends, colors = [], []
-    for number, own in enumerate(rig.colors):
+    for number in range(len(rig.names)):
         mine = [poses[k] for k in sorted(poses) if camera[k] == number]
         if not mine:
             continue
         step = -(-len(mine) * len(rig.names) // MAX_CAMERAS)
         lines = camera_lines(np.stack(mine), edge, step).reshape(-1, 2, 3)
         ends.append(lines)
-        colors.append(np.broadcast_to(np.array(own, np.uint8), lines.shape))
+        colors.append(np.broadcast_to(light[number], lines.shape))
     return np.concatenate(ends).astype(np.float32), np.concatenate(colors)
 
 
