@@ -175,6 +175,7 @@ def test_run_json_is_what_the_contract_says(tmp_path) -> None:
         "frames",
         "T_up_world",
         "tiles",
+        "rig",
         "components",
         "sessions",
         "session_pairs",
