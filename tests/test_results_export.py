@@ -30,6 +30,7 @@ from tofuse.results.folder import LOCK, OutputFolder
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)
+T_UP_WORLD = se3.exp(np.array([0, 0, 0, 2.6, 0.4, -0.3]))
 
 
 @pytest.fixture
@@ -38,7 +39,8 @@ def result(tmp_path: Path) -> Path:
     folder = tmp_path / "result"
     folder.mkdir()
     frames = [{"index": k, "timestamp": t} for k, t in ((1, 0.1), (2, 0.2), (3, 0.3), (5, 0.5))]
-    text = json.dumps({"schema": 1, "version": "0", "verdict": "good", "frames": frames})
+    told = {"T_up_world": T_UP_WORLD.tolist(), "frames": frames}
+    text = json.dumps({"schema": 1, "version": "0", "verdict": "good"} | told)
     (folder / "run.json").write_text(text)
     write_tum(folder / "trajectory.txt", TIMES, POSES)
     rng = np.random.default_rng(0)
@@ -155,12 +157,8 @@ def test_e57(result: Path, expected) -> None:
 
 @pytest.fixture
 def upright(expected) -> SimpleNamespace:
-    """The surface as it should stand: up is the mean of the cameras' up."""
-    up = -POSES[:, :3, 1].mean(0)
-    y = up / np.linalg.norm(up)
-    x = np.cross(y, [0, 0, -1])  # the first camera looks along z, away from the viewer
-    x /= np.linalg.norm(x)
-    R = np.stack([x, y, np.cross(x, y)])
+    """The surface as it should stand, as `run.json` says."""
+    R = T_UP_WORLD[:3, :3]
     return SimpleNamespace(
         points=expected.points @ R.T,
         normals=expected.normals @ R.T,
@@ -316,10 +314,11 @@ def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
     weights = np.random.default_rng(3).dirichlet([1, 1, 1], (20, len(mesh.faces)))
     uv = np.einsum("kfi,fic->kfc", weights, mesh.visual.uv[mesh.faces]).reshape(-1, 2)
     p = np.einsum("kfi,fic->kfc", weights, mesh.vertices[mesh.faces]).reshape(-1, 3)
+    p = p @ T_UP_WORLD[:3, :3]
     found = sampled(image, uv * [1, -1] + [0, 1])
-    np.testing.assert_allclose(p[:, 2], -2, atol=1e-5)
+    np.testing.assert_allclose(p[:, 2], 2, atol=1e-5)
     assert np.abs(found[:, 0] - (127 + 120 * np.sin(6 * p[:, 0]))).max() < 20
-    assert np.abs(found[:, 1] - (127 + 120 * np.cos(-6 * p[:, 1]))).max() < 20
+    assert np.abs(found[:, 1] - (127 + 120 * np.cos(6 * p[:, 1]))).max() < 20
 
 
 def test_laz_has_the_same_bytes_again_in_parts(result: Path, monkeypatch) -> None:
