@@ -138,6 +138,7 @@ def test_run_json_follows_the_contract(plain_run, room_recording) -> None:
         "changes",
         "T_up_world",
         "tiles",
+        "rig",
     }
     assert data["schema"] == 1
     opening = data["input"].pop("opening")
