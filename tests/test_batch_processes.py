@@ -16,7 +16,7 @@ from types import ModuleType
 
 import pytest
 
-from tofuse.batch import cluster
+from tofuse.batch import client
 from tofuse.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of other systems")
@@ -199,7 +199,7 @@ def test_a_scheduler_that_is_not_there_is_told(
     listed: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
-    monkeypatch.setattr(cluster, "_ANSWERS_S", 1.0)
+    monkeypatch.setattr(client, "ANSWERS_S", 1.0)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
         words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
         assert main(words) == 2

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import os
 from concurrent.futures import Future
 from time import monotonic
 from typing import Any
 from uuid import uuid4
 
+from tofuse.batch.client import ANSWERS_S, connected, first_line, unknown_there
 from tofuse.batch.folder import Record
 from tofuse.batch.jobs import Job
 from tofuse.batch.work import Task, work
 from tofuse.batch.workers import Workers
 from tofuse.errors import InputError
-from tofuse.files.reading import read_text
 
-_ANSWERS_S = 10.0  # what a scheduler may take for its answer
 _LOOK_S = 1.0  # how often the workers are counted
 
 
@@ -35,7 +32,7 @@ class DaskWorkers(Workers):
             If Dask is not installed, or no scheduler answers.
         """
         self._address = address
-        self._client: Any = _connected(address)
+        self._client: Any = connected(address, "give --workers to stay on this machine")
         self._running: set[Future[Record]] = set()
         self._seen: list[dict[str, Any]] = []
         self._looked = -_LOOK_S
@@ -90,7 +87,7 @@ class DaskWorkers(Workers):
 
     def close(self) -> None:
         """See `Workers`. Jobs that workers have begun they end, and their records stay."""
-        self._client.close(timeout=_ANSWERS_S)
+        self._client.close(timeout=ANSWERS_S)
 
     def _workers(self) -> list[dict[str, Any]]:
         try:
@@ -115,10 +112,10 @@ class DaskWorkers(Workers):
             error = remote.exception()
             if isinstance(error, KilledWorker):
                 future.set_result(Record("", "killed", reason="its workers were killed"))
-            elif _unknown_there(error):
+            elif unknown_there(error):
                 future.set_exception(
                     InputError(
-                        f"does not know the jobs of this tofuse ({_first_line(error)})",
+                        f"does not know the jobs of this tofuse ({first_line(error)})",
                         where=self._address,
                         remedy="install this version of tofuse for its scheduler and its workers",
                     )
@@ -136,56 +133,3 @@ def _slots(worker: dict[str, Any], job: Job) -> int:
     if job.memory is None:
         return threads
     return min(threads, int(worker["resources"].get("memory", 0) // job.memory))
-
-
-def _unknown_there(error: BaseException) -> bool:
-    """Whether a scheduler or worker could not load what a task is made of."""
-    return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
-
-
-def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)
-
-
-def _connected(address: str) -> Any:
-    try:
-        import dask
-    except ImportError as error:
-        raise _not_installed() from error
-    # It would log what is told here in one line. Read when distributed is imported.
-    levels = {"distributed": "critical", "distributed.client": "critical"}
-    with dask.config.set({"logging": levels}):
-        try:
-            import distributed
-        except ImportError as error:
-            raise _not_installed() from error
-    client: Any = distributed.Client
-    wanted = _from_file(address) if os.path.isfile(address) else address
-    try:
-        return client(wanted, timeout=_ANSWERS_S, set_as_default=False, name="tofuse")
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(
-            "no Dask scheduler answers there",
-            where=address,
-            remedy="start one by `dask scheduler`, and give the address that it prints",
-        ) from error
-
-
-def _from_file(path: str) -> str:
-    """The address in a file that a scheduler wrote."""
-    try:
-        return str(json.loads(read_text(path))["address"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            "is no file that a Dask scheduler wrote",
-            where=path,
-            remedy="give the address that it prints",
-        ) from error
-
-
-def _not_installed() -> InputError:
-    return InputError(
-        "needs Dask distributed",
-        where="--scheduler",
-        remedy="pip install 'tofuse[dask]', or give --workers to stay on this machine",
-    )

@@ -7,14 +7,20 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
-from tofuse.cli.progress import emit, progress_for
+from tofuse.cli.progress import (
+    JsonProgress,
+    QuietProgress,
+    TerminalProgress,
+    emit,
+    progress_for,
+)
 from tofuse.results.types import Reason, Reconstruction
 
 if TYPE_CHECKING:
@@ -49,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
         if given:
             raise InputError("is only for --view", where=name, remedy="give --view as well")
-    with progress_for(as_json=arguments.json) as progress:
+    with _working(arguments) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     tell(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
@@ -88,6 +94,25 @@ def run_options(arguments: argparse.Namespace) -> Options:
     )
 
 
+@contextmanager
+def _working(
+    arguments: argparse.Namespace,
+) -> Iterator[TerminalProgress | JsonProgress | QuietProgress]:
+    """Progress of a run, whose pieces of work go to a cluster if one is named."""
+    with progress_for(as_json=arguments.json) as progress:
+        if arguments.scheduler is None:
+            yield progress
+            return
+        from tofuse.batch.pieces import DaskExecutor
+        from tofuse.kernels.spread import spread_over
+
+        with (
+            closing(DaskExecutor(arguments.scheduler, progress.note)) as cluster,
+            spread_over(cluster),
+        ):
+            yield progress
+
+
 def _run_into(arguments: argparse.Namespace, options: Options) -> int:
     """Run, then merge the result into an earlier one, which stays as it was if that fails."""
     from tofuse.errors import InputError
@@ -101,7 +126,7 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
     if into.resolve() == options.out.resolve():
         raise InputError("is --out as well", where="--into", remedy="give two folders")
     check_result(into)  # before hours of work
-    with progress_for(as_json=arguments.json) as progress:
+    with _working(arguments) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
     tell(result, options.out, as_json=arguments.json)
     map_options = MergeOptions(
@@ -114,7 +139,7 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
         threads=options.threads,
         only_joined=True,
     )
-    with progress_for(as_json=arguments.json) as progress:
+    with _working(arguments) as progress:
         merged = merge_files([into, options.out], map_options, progress)
     tell(merged, into, as_json=arguments.json)
     return exit_status(merged)
@@ -130,7 +155,7 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
             raise InputError("means nothing for a rig", where=option, remedy="leave it out")
-    with progress_for(as_json=arguments.json) as progress:
+    with _working(arguments) as progress:
         found = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
     tell(found.result, arguments.out, as_json=arguments.json)
     return exit_status(found.result)
@@ -145,7 +170,7 @@ def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
 
     with _page(arguments) as server:
         live = LiveView(server)
-        with progress_for(as_json=arguments.json) as progress:
+        with _working(arguments) as progress:
             result = run_pipeline(arguments.inputs, options, Both(progress, live))
         tell(result, arguments.out, as_json=arguments.json)
         live.finish(arguments.out)

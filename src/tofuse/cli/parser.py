@@ -225,6 +225,12 @@ def _run(commands: Any) -> None:
         help="a rig.json; each INPUT is one of its cameras, in the same order",
     )
     _processing(p)
+    p.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="spread loop search and refinement of a long recording over the workers of a Dask "
+        "scheduler: tcp://HOST:8786, or its scheduler file",
+    )
     g = p.add_argument_group("live view in the browser")
     g.add_argument(
         "--view", action="store_true", help="show the reconstruction live, and then the result"

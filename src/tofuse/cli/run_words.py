@@ -24,6 +24,7 @@ _NOT_HERE = {
     "port",
     "no-open",
     "threads",
+    "scheduler",
     "help",
 }
 _YES, _NO = {"true", "yes", "1", "x"}, {"false", "no", "0"}

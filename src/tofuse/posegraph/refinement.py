@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
@@ -229,16 +230,15 @@ def _in_submaps(
     store: ViewStore[SurfaceMap],
 ) -> tuple[Refined, Callable[[], Suspicion]]:
     """Refine views submap by submap; returns also what tells what they say of their camera."""
-    said: list[Suspicion] = []
     ids = [p.index for p in posed]
-    refined = refine_submaps(
+    refined, said = refine_submaps(
         [_Seen.of(_kept(p, options), store.outlines) for p in posed],
         poses,
         options.refine,
         options.submap,
         lambda some: [_kept(posed[k], options) for k in some],
         lambda some: _beside(ids if some is None else [ids[k] for k in some], told),
-        lambda one: said.append(_suspicion(one, options)),
+        partial(_suspicion, options=options),
         [_ERRORS[name] for name in options.calibrate],
     )
     return refined, lambda: of_submaps(said)

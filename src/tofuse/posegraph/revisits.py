@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
-from tofuse.kernels.threads import run_chunks
+from tofuse.kernels.spread import executor
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
@@ -243,9 +243,7 @@ class _RevisitLoops(Loops):
         at = np.array([poses[p.index] for p in posed]).reshape(-1, 4, 4)
         seen = self._views(posed)
         pairs = self._options.candidates(seen, at)
-        found = run_chunks(
-            lambda a, _: self._confirm(*(posed[k] for k in pairs[a])), len(pairs), len(pairs)
-        )
+        found = self._confirm_all([(posed[i], posed[j]) for i, j in pairs])
         closed = {pair: loop for pair, loop in self._closed.items() if poses.keys() >= set(pair)}
         closed |= {(loop.record.i, loop.record.j): loop for loop in found}
         by_index = {p.index: p for p in posed}
@@ -296,20 +294,35 @@ class _RevisitLoops(Loops):
         """Align the later view with the earlier one, and back; once for each pair."""
         pair = target.index, source.index
         if pair not in self._confirmed:
-            self._confirmed[pair] = self._followed(target, source)
+            self._confirmed[pair] = self._decided(
+                pair, register_near(*self._guessed(target, source))
+            )
         return self._confirmed[pair]
 
-    def _followed(self, target: View, source: View) -> ClosedLoop:
-        """Register two views from where the trajectory has them."""
+    def _confirm_all(self, pairs: Sequence[tuple[View, View]]) -> list[ClosedLoop]:
+        """As `_confirm`, of many pairs (target, source)."""
+        new = [(a, b) for a, b in pairs if (a.index, b.index) not in self._confirmed]
+        found = executor().map(register_near, len(new), lambda k: self._guessed(*new[k]))
+        for (a, b), made in zip(new, found, strict=True):
+            pair = a.index, b.index
+            self._confirmed[pair] = self._decided(pair, made)
+        return [self._confirmed[a.index, b.index] for a, b in pairs]
+
+    def _guessed(
+        self, target: View, source: View
+    ) -> tuple[SurfaceMap, SurfaceMap, Float64, UsualFit]:
+        """What `register_near` takes, from where the trajectory has two views."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Else all views would keep, until the end, what they are compared with here.
-        made = follow(source.view.bare(), target.view.bare(), guess, usual=self._usual)
+        return source.view.bare(), target.view.bare(), guess, self._usual
+
+    def _decided(self, pair: tuple[int, int], made: Registration | None) -> ClosedLoop:
+        """What becomes of frames (i, j) that were registered."""
         if made is None:
-            return ClosedLoop(LoopRecord(target.index, source.index, False, _UNLIKE))
+            return ClosedLoop(LoopRecord(*pair, False, _UNLIKE))
         objection = self._objection(made)
         record = LoopRecord(
-            target.index,
-            source.index,
+            *pair,
             not objection,
             objection or f"right with a probability of {made.probability:.0%}",
             overlap=made.overlap,
@@ -355,10 +368,17 @@ class _RevisitLoops(Loops):
         """
         found, margins = {}, {}
         refused = {p: "looks alike" if p in alike else closed[p].record.reason for p in pairs}
-        for i, j in pairs:
-            made = register_pair(
-                posed[j].view, posed[i].view, usual=self._usual, options=self._options.search
-            )
+        made_all = executor().map(
+            register_anywhere,
+            len(pairs),
+            lambda k: (
+                *(posed[n].view for n in reversed(pairs[k])),
+                self._usual,
+                self._options.search,
+            ),
+            large=True,
+        )
+        for (i, j), made in zip(pairs, made_all, strict=True):
             if made is None:
                 refused[i, j] += "; there are too few surfaces to search with"
                 continue
@@ -428,6 +448,20 @@ class _RevisitLoops(Loops):
         if len(made.unobservable) > self._options.weak:
             return f"{len(made.unobservable)} directions are degenerate"
         return "" if made.believed else made.reason
+
+
+def register_near(
+    source: SurfaceMap, target: SurfaceMap, guess: Float64, usual: UsualFit
+) -> Registration | None:
+    """Register two views from T_target_source as the trajectory has it."""
+    return follow(source, target, guess, usual=usual)
+
+
+def register_anywhere(
+    source: SurfaceMap, target: SurfaceMap, usual: UsualFit, options: SearchOptions
+) -> Registration | None:
+    """Search two views in each other without a guess."""
+    return register_pair(source, target, usual=usual, options=options)
 
 
 def _ways(poses: Mapping[int, Float64]) -> dict[int, Float64]:

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
+from tofuse.kernels.spread import executor
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.refine import (
@@ -33,6 +35,7 @@ from tofuse.posegraph.views import KeptView, Outlined, looked_at, overlaps
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
+A = TypeVar("A")
 
 # Views of its neighbours that a submap takes in, at most, as a share of its own.
 _BORDER = 0.25
@@ -119,10 +122,10 @@ def refine_submaps(
     most: int,
     load: Callable[[Integers], list[KeptView]],
     beside: Callable[[Integers | None], Beside],
-    seen: Callable[[InSubmap], None],
+    ask: Callable[[InSubmap], A],
     calibrate: Sequence[int] = (),
-) -> Refined:
-    """Refine all views, submap by submap; see `refine`.
+) -> tuple[Refined, list[A]]:
+    """Refine all views, submap by submap; see `refine`. Returns also what each one answered.
 
     Parameters
     ----------
@@ -136,30 +139,36 @@ def refine_submaps(
         Gives views by their positions. Those of one submap are asked for at a time.
     beside
         Gives what is known beside them of views by their positions, None for all.
-    seen
-        Is told of each submap once it was refined.
+    ask
+        Is asked about each submap once it was refined, maybe in another process.
     calibrate
         Errors of the camera that are estimated: in each submap by itself, and the median counts.
     """
     pairs = chosen(overlaps(outlines, poses, options.overlap)[0], options.neighbours)
     parts = [s for s in submaps(looked_at(outlines, poses), pairs, most) if len(s.pairs)]
 
-    def refined_alone(part: Submap) -> Refined:
+    def arguments(k: int) -> tuple[Any, ...]:
         # The views go before those of the next submap come.
-        views, here = load(part.views), beside(part.views)
-        local = np.searchsorted(part.views, part.pairs)
-        start = se3.inverse(poses[part.views[0]]) @ poses[part.views]
-        refined = refine(views, start, options, calibrate=calibrate, beside=here, pairs=local)
-        seen(InSubmap(views, part.views, refined, here))
-        return _believed(refined, start)
+        part = parts[k]
+        return (
+            load(part.views),
+            part,
+            poses[part.views],
+            options,
+            calibrate,
+            beside(part.views),
+            ask,
+        )
 
-    found = [(part, refined_alone(part)) for part in parts]
+    made = executor().map(_refined_alone, len(parts), arguments, large=True)
+    found = [(part, refined) for part, (refined, _) in zip(parts, made, strict=True)]
     if not found:
         none = np.zeros(0)
         nobody = Support(none.astype(np.intp), none.astype(np.intp), none, none)
         measured = np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
         errors = np.zeros(kernels.ERRORS)
-        return Refined(poses, errors, pairs, (), nobody, nobody, *measured, np.zeros((0, 3)))
+        still = Refined(poses, errors, pairs, (), nobody, nobody, *measured, np.zeros((0, 3)))
+        return still, []
     errors = np.median([r.errors for _, r in found], axis=0)
     asked = np.concatenate([part.pairs for part, _ in found])
     T_i_j = np.concatenate([r.measured for _, r in found])
@@ -169,7 +178,7 @@ def refine_submaps(
         support_of(load(part.views), solved[part.views], refined, options)
         for part, refined in found
     ]
-    return Refined(
+    whole = Refined(
         solved,
         errors,
         asked,
@@ -180,12 +189,30 @@ def refine_submaps(
         information,
         np.concatenate([r.scales for _, r in found]),
     )
+    return whole, [answer for _, answer in made]
 
 
 def fell(gained: Float64) -> bool:
     """Whether the support of views (N,) fell on average by more than chance explains."""
     error = float(gained.std(ddof=1)) / np.sqrt(len(gained))
     return float(gained.mean()) < -error
+
+
+def _refined_alone(
+    views: Sequence[KeptView],
+    part: Submap,
+    poses: Float64,
+    options: RefineOptions,
+    calibrate: Sequence[int],
+    beside: Beside,
+    ask: Callable[[InSubmap], A],
+) -> tuple[Refined, A]:
+    """One submap by itself, from its views' poses (N, 4, 4), and what it answers."""
+    local = np.searchsorted(part.views, part.pairs)
+    start = se3.inverse(poses[0]) @ poses
+    refined = refine(views, start, options, calibrate=calibrate, beside=beside, pairs=local)
+    answer = ask(InSubmap(views, part.views, refined, beside))
+    return _believed(refined, start), answer
 
 
 def _believed(refined: Refined, start: Float64) -> Refined:

@@ -1,0 +1,78 @@
+"""Finding a Dask cluster by its scheduler."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+from tofuse.errors import InputError
+from tofuse.files.reading import read_text
+
+ANSWERS_S = 10.0  # what a scheduler may take for its answer
+
+
+def connected(address: str, remedy: str) -> Any:
+    """Return a client of the scheduler at an address, or of the one that wrote a file.
+
+    Parameters
+    ----------
+    remedy
+        What to do instead of installing Dask.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, or no scheduler answers.
+    """
+    try:
+        import dask
+    except ImportError as error:
+        raise _not_installed(remedy) from error
+    # It would log what is told here in one line. Read when distributed is imported.
+    levels = {"distributed": "critical", "distributed.client": "critical"}
+    with dask.config.set({"logging": levels}):
+        try:
+            import distributed
+        except ImportError as error:
+            raise _not_installed(remedy) from error
+    client: Any = distributed.Client
+    wanted = _from_file(address) if os.path.isfile(address) else address
+    try:
+        return client(wanted, timeout=ANSWERS_S, set_as_default=False, name="tofuse")
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(
+            "no Dask scheduler answers there",
+            where=address,
+            remedy="start one by `dask scheduler`, and give the address that it prints",
+        ) from error
+
+
+def unknown_there(error: BaseException) -> bool:
+    """Whether a scheduler or worker could not load what a task is made of."""
+    return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)
+
+
+def first_line(error: BaseException) -> str:
+    """What an error says, in short."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _from_file(path: str) -> str:
+    """The address in a file that a scheduler wrote."""
+    try:
+        return str(json.loads(read_text(path))["address"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            "is no file that a Dask scheduler wrote",
+            where=path,
+            remedy="give the address that it prints",
+        ) from error
+
+
+def _not_installed(remedy: str) -> InputError:
+    return InputError(
+        "needs Dask distributed",
+        where="--scheduler",
+        remedy=f"pip install 'tofuse[dask]', or {remedy}",
+    )
