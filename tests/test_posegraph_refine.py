@@ -15,7 +15,7 @@ from tofuse.kernels.threads import threads
 from tofuse.maps.surface_map import surface_map
 from tofuse.posegraph.accuracy import Shown, accuracy_of
 from tofuse.posegraph.build import build_graph
-from tofuse.posegraph.refine import RefineOptions, chosen, refine
+from tofuse.posegraph.refine import Bodies, RefineOptions, chosen, refine
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 
@@ -261,3 +261,26 @@ def test_pairs_of_a_view_do_not_add_up_to_more_than_it_knows():
         known[neighbours] = len(found.edges), accuracy_of(graph, Shown(), 1.0).position_m
     assert known[10][0] > 2 * known[2][0]
     assert known[10][1] > 0.7 * known[2][1]
+
+
+def test_views_that_are_fixed_to_each_other_move_together():
+    """Two cameras back to back see the corner one after the other; each instant has one pose."""
+    instants = path(8)
+    mounted = se3.exp(np.array([[0.0] * 6, [0.05, 0.02, -0.03, 0.1, 0.25, -0.05]]))
+    truth = (instants[:, None] @ mounted[None]).reshape(-1, 4, 4)
+    views = [KeptView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
+    bodies = Bodies(np.repeat(np.arange(8), 2), np.tile(mounted, (8, 1, 1)))
+    start = bodies.views(drifted(instants))
+    found = refine(views, start, OPTIONS, bodies=bodies)
+    assert away(start, truth) > 0.03
+    assert away(found.poses, truth) < 0.005
+    # No pair is of one instant, and cameras are where the rig has them.
+    assert (found.pairs[:, 0] // 2 != found.pairs[:, 1] // 2).all()
+    assert {(i % 2, j % 2) for i, j in found.pairs.tolist()} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    between = se3.inverse(found.poses[::2]) @ found.poses[1::2]
+    np.testing.assert_allclose(between, np.tile(mounted[1], (8, 1, 1)), atol=1e-12)
+    np.testing.assert_array_equal(found.poses[0], start[0])
+    # Half as many unknowns: better than each view by itself.
+    free = refine(views, start, OPTIONS)
+    error = [np.linalg.norm((p - truth)[:, :3, 3], axis=1) for p in (found.poses, free.poses)]
+    assert np.sqrt((error[0] ** 2).mean()) < np.sqrt((error[1] ** 2).mean())

@@ -19,6 +19,7 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.rig import Rig, RigCamera, read_rig, write_rig
 from tofuse.report.scene import CAMERA_COLORS
+from tofuse.report.section_rig import upright
 from tofuse.rigs.calibrate import calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
 from tofuse.simulation.rig import around, relative
@@ -127,6 +128,15 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, of_images = read_tum(tmp_path / "model" / "trajectory.txt")
     stated = read_rig(out).cameras
     assert np.allclose(of_images[1], stated[1].T_rig_camera, atol=1e-9)
+    # Its accuracy is that of the rig, and not of one camera that jumps from place to place.
+    told = json.loads((tmp_path / "model" / "run.json").read_text())
+    assert told["verdict"] == "good"
+    assert told["accuracy"]["position_m"] < 0.004
+    assert not told["reasons"]
+    report = (tmp_path / "model" / "report.html").read_text()
+    assert '<section id="rig">' in report
+    assert "cam1, cam2</td>" in report
+    assert ">cam2</text>" in report or ">cam2<" in report
 
     # Each frame is known by its camera: in the file, in the report and in the viewer.
     told = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
@@ -181,3 +191,12 @@ def test_a_rig_folder_without_one_camera_is_refused(
     write_rig(folder / "rig.json", Rig(tuple(rows)))
     with pytest.raises(InputError, match="no recording of the camera 'top'"):
         open_recording(folder)
+
+
+def test_a_ring_is_drawn_upright() -> None:
+    poses = upright(np.stack(relative(around((0.4, 0, 0.5), 1.6, 0.5, 6))))
+    heights = poses[:, 1, 3]
+    assert np.ptp(heights) < 1e-9  # though the first camera looks down on the others
+    # The first still looks forward, and not to a side.
+    assert abs(poses[0, 0, 2]) < 1e-9
+    assert poses[0, 2, 2] > 0.7

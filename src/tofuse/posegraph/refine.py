@@ -197,6 +197,36 @@ class Beside:
         return cls(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
 
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Which views are fixed to each other, as those of a rig's cameras at one instant are.
+
+    Attributes
+    ----------
+    of
+        (N,) number of the body of each view; 0 is that of the first.
+    T_body_view
+        (N, 4, 4) how it is fixed there.
+    """
+
+    of: Integers
+    T_body_view: Float64
+
+    def poses(self, views: Float64) -> Float64:
+        """(M, 4, 4) T_world_body, by the poses (N, 4, 4) of their first views."""
+        _, first = np.unique(self.of, return_index=True)
+        return views[first] @ se3.inverse(self.T_body_view[first])
+
+    def views(self, bodies: Float64) -> Float64:
+        """(N, 4, 4) T_world_view, by the poses (M, 4, 4) of their bodies."""
+        return np.asarray(bodies[self.of] @ self.T_body_view, np.float64)
+
+    def apart(self, pairs: Integers) -> Integers:
+        """Those of the pairs (M, 2) of views that can move against each other."""
+        i, j = self.of[pairs].T
+        return pairs[i != j]
+
+
 @dataclass(eq=False)
 class _Pairs:
     """Directed pairs, what is known of each, and what was summed last."""
@@ -219,6 +249,7 @@ def refine(
     calibrate: Sequence[int] = (),
     beside: Beside | None = None,
     pairs: Integers | None = None,
+    bodies: Bodies | None = None,
 ) -> Refined:
     """Move all views until they agree with all that they overlap with.
 
@@ -233,8 +264,12 @@ def refine(
     pairs
         (M, 2) positions of the views i < j that are compared; unless given, those that overlap,
         found anew for each round before which something has moved.
+    bodies
+        Which views move together, if any do. What `beside` knows is then of them.
     """
     start = poses
+    if bodies is not None:
+        start = poses = bodies.views(bodies.poses(poses))
     beside = beside or Beside.nothing()
     errors = np.zeros(kernels.ERRORS)
     known = np.ones(kernels.ERRORS, np.int64)
@@ -246,16 +281,17 @@ def refine(
         if since >= _MOVED:
             near = pairs
             if near is None:
-                near = chosen(overlaps(views, poses, options.overlap)[0], options.neighbours)
-            state = _directed(views, near, options, state, beside)
+                near = overlaps(views, poses, options.overlap)[0]
+                near = near if bodies is None else bodies.apart(near)
+                near = chosen(near, options.neighbours)
+            state = _directed(views, near, options, state, beside, bodies)
             since = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
             if stage is options.rounds[-1] and not calibrate:
                 _allow_for_shared(views, poses, state, options)
-            step, change = _solve(poses, state, known, beside)
-            poses = se3.orthonormalise(poses @ se3.exp(step))
-            poses[0] = start[0]
+            step, change = _solve(poses, state, known, beside, bodies)
+            poses = _moved(poses, step, bodies)
             errors = errors + change
             _rescale(state, stage)
             moved.append(float(np.abs(step / UNITS).max()))
@@ -418,6 +454,14 @@ def chosen(pairs: Integers, neighbours: int) -> Integers:
     return pairs[np.concatenate(keep)]
 
 
+def _moved(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
+    """Poses after a step of the views, or of their bodies; the first stays."""
+    free = poses if bodies is None else bodies.poses(poses)
+    out = se3.orthonormalise(free @ se3.exp(step))
+    out[0] = free[0]
+    return out if bodies is None else bodies.views(out)
+
+
 def _no_pairs() -> _Pairs:
     none, nothing = np.zeros(0, np.intp), np.zeros(0)
     system = PairSystem(1, none.reshape(0, 2))
@@ -430,15 +474,19 @@ def _directed(
     options: RefineOptions,
     before: _Pairs,
     beside: Beside,
+    bodies: Bodies | None = None,
 ) -> _Pairs:
     """Both directions of each pair, with what was known of them before."""
     target = np.concatenate([pairs[:, 0], pairs[:, 1]])
     source = np.concatenate([pairs[:, 1], pairs[:, 0]])
     n = len(target)
     most = np.maximum(3.0, options.most_sigma_m / np.array([v.sigma for v in views]))
-    first = np.arange(len(views)) == 0
-    joined = np.concatenate([np.stack([target, source], 1), beside.pairs])
-    system = PairSystem(len(views), joined, fixed=first)
+    ends = np.stack([target, source], 1)
+    count = len(views)
+    if bodies is not None:
+        ends, count = bodies.of[ends], int(bodies.of.max()) + 1
+    first = np.arange(count) == 0
+    system = PairSystem(count, np.concatenate([ends, beside.pairs]), fixed=first)
     unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
     state = _Pairs(target, source, *unknown, most[source], system)
     lit = np.array([v.surface.has_photo for v in views]) & options.photometric
@@ -575,9 +623,21 @@ def _alone(poses: Float64, pairs: Integers, state: _Pairs) -> tuple[Float64, Flo
     return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
 
 
-def _solve(poses: Float64, state: _Pairs, known: Int64, beside: Beside) -> tuple[Float64, Float64]:
-    """One Gauss-Newton step: (N, 6) right perturbations of the poses, and that of the errors."""
+def _solve(
+    poses: Float64, state: _Pairs, known: Int64, beside: Beside, bodies: Bodies | None = None
+) -> tuple[Float64, Float64]:
+    """One Gauss-Newton step: (N, 6) right perturbations of the poses, and that of the errors.
+
+    Of bodies, if there are any.
+    """
     H, g = _without_exposure(state)
+    if bodies is not None:
+        # A source's view moves as its body does, seen from where it is fixed.
+        A = np.tile(np.eye(H.shape[1]), (len(H), 1, 1))
+        A[:, :6, :6] = se3.adjoint(se3.inverse(bodies.T_body_view[state.source]))
+        At = np.swapaxes(A, 1, 2)
+        H, g = At @ H @ A, (At @ g[..., None])[..., 0]
+        poses = bodies.poses(poses)
     free = 6 + np.flatnonzero(known == 0)
     n, m = len(poses), len(beside.pairs)
     system = state.system

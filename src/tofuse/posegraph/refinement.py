@@ -128,6 +128,34 @@ class _Idle(Refiner):
         return Refinement(poses)
 
 
+@dataclass(frozen=True, eq=False)
+class Known(Refining):
+    """Leaves the poses, which were refined elsewhere, and tells what was measured there.
+
+    Attributes
+    ----------
+    edges
+        In frame indices.
+    """
+
+    edges: tuple[Measured, ...]
+
+    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+        """See `Refining.start`."""
+        return _Known(self.edges)
+
+
+class _Known(_Idle):
+    def __init__(self, edges: tuple[Measured, ...]) -> None:
+        self._edges = edges
+
+    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+        """See `Refiner.finish`."""
+        known = set(ids)
+        edges = tuple(e for e in self._edges if {e.i, e.j} <= known)
+        return Refinement(poses, kept=True, edges=edges)
+
+
 @part("refinement", "joint")
 @dataclass(frozen=True)
 class Joint(Refining):
@@ -201,7 +229,7 @@ class _Joint(Refiner):
             moved_to(unchanged, at, after),
             suspicion=found(),
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
-            edges=_measured([p.index for p in posed], refined),
+            edges=measured_by([p.index for p in posed], refined),
         )
 
 
@@ -274,7 +302,7 @@ def _suspicion(one: InSubmap, options: Joint) -> Suspicion:
     return Suspicion(gap=gap)
 
 
-def _measured(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
+def measured_by(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
     """What pairs measure by themselves, with what all of them together can know.
 
     What is wrong with a view is wrong in all its pairs, so that many know little more than one.

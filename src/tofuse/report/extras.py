@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.recordings.rig import Rig
 from tofuse.report.pictures import Pictures
 
 Float32 = NDArray[np.float32]
@@ -35,6 +36,8 @@ class ReportExtras:
         About a dozen evenly spaced, unfiltered views, where views are clouds.
     headline
         Said above everything else; may be empty.
+    rig
+        The rig that recorded, with how far its cameras' surfaces are apart in this recording.
     """
 
     title: str
@@ -44,3 +47,4 @@ class ReportExtras:
     pictures: tuple[Pictures, ...] = ()
     clouds: tuple[CloudFrame, ...] = ()
     headline: str = ""
+    rig: Rig | None = None

@@ -20,6 +20,7 @@ Float64 = NDArray[np.float64]
 
 # Stand-ins that `svg` replaces by the page's variables of the same names.
 INK, MUTED, GRID = "#010101", "#020202", "#030303"
+PAGE = "#090909"
 BEFORE, AFTER, REFERENCE, LOOP, BAD = "#040404", "#050505", "#060606", "#070707", "#080808"
 _VARIABLES = {
     INK: "ink",
@@ -30,6 +31,7 @@ _VARIABLES = {
     REFERENCE: "reference",
     LOOP: "loop",
     BAD: "bad",
+    PAGE: "page",
 }
 _MODEL = (112, 138, 176)  # of the model's points: readable on white and on near-black
 _SMALL_M = 0.6
@@ -369,4 +371,62 @@ def cameras(
         flat = project(world.T, view)
         axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=1.8 if k == 0 else 0.9)
     axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
+    return svg(figure, label)
+
+
+def rig(
+    poses: Float64,
+    names: Sequence[str],
+    view: str,
+    *,
+    label: str,
+    pairs: Sequence[tuple[int, int, str]] = (),
+    width: int = 440,
+) -> str:
+    """Draw the cameras of a rig as pyramids of what they see, with their names.
+
+    Parameters
+    ----------
+    poses
+        (n, 4, 4) T_rig_camera; the first is drawn stronger.
+    pairs
+        Cameras a and b that are joined by a line, and what is said of them.
+    """
+    middles = poses[:, :3, 3]
+    apart = float(np.linalg.norm(middles - middles.mean(0), axis=1).max())
+    size = 0.35 * apart if apart > 0.01 else 0.1
+    corners = np.array([[-0.5, -0.4, 1], [0.5, -0.4, 1], [0.5, 0.4, 1], [-0.5, 0.4, 1]])
+    seen = np.einsum("nij,kj->nki", poses[:, :3, :3], size * corners) + middles[:, None]
+    box = limits(project(middles, view), project(seen.reshape(-1, 3), view), room=0.16)
+    figure, axes = _plan(box, view, width)
+    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
+    per_pixel = float(high[0] - low[0]) / (width - 58)
+    for a, b, said in pairs:
+        ends = project(middles[[a, b]], view)
+        axes.plot(*ends.T, color=MUTED, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
+        axes.annotate(
+            said,
+            ends.mean(0),
+            color=MUTED,
+            fontsize=10,
+            ha="center",
+            va="center",
+            bbox={"facecolor": PAGE, "edgecolor": "none", "pad": 1.5},
+        )
+    for k, name in enumerate(names):
+        eye, flat = project(middles[k : k + 1], view)[0], project(seen[k], view)
+        color, thick = (AFTER, 1.8) if k == 0 else (INK, 1.1)
+        axes.fill(*flat.T, color=color, alpha=0.12, linewidth=0)
+        axes.plot(*np.concatenate([flat, flat[:1]]).T, color=color, linewidth=thick)
+        for corner in flat:
+            axes.plot(*np.stack([eye, corner]).T, color=color, linewidth=thick)
+        axes.plot(*eye, "o", color=color, markersize=4)
+        # Behind the camera, where nothing of it is drawn.
+        behind = eye - flat.mean(0)
+        length = float(np.linalg.norm(behind))
+        behind = behind / length if length > 0.2 * size else np.array([0.0, -1.0])
+        at = eye + 10 * per_pixel * behind
+        side = "left" if behind[0] > 0.4 else "right" if behind[0] < -0.4 else "center"
+        rise = "bottom" if behind[1] > 0.4 else "top" if behind[1] < -0.4 else "center"
+        axes.text(*at, name, color=color, fontsize=11, ha=side, va=rise)
     return svg(figure, label)

@@ -15,6 +15,7 @@ from tofuse.report import (
     section_frames,
     section_model,
     section_path,
+    section_rig,
     section_sessions,
     section_views,
     words,
@@ -32,6 +33,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
     parts: tuple[Callable[[Subject], Values], ...] = (
         _verdict,
         section_sessions.sessions,
+        section_rig.rig,
         section_components.components,
         section_model.views,
         section_path.cameras,
@@ -59,6 +61,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         "model": "Model",
         "verdict": "Accuracy",
         "sessions": "Sessions",
+        "rig": "Rig",
         "components": "Components",
         "frames": "Frames",
         "views": "Dimensions",
@@ -76,6 +79,8 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         del names["recording"]
     if not out["sessions"]:
         del names["sessions"]
+    if not out["rig_views"]:
+        del names["rig"]
     if not out["components"]:
         del names["components"]
     out["contents"] = list(names.items())

@@ -143,6 +143,20 @@ def disagreements(
     return system.disagreement(system.compare())
 
 
+def disagreements_of(
+    views: Sequence[KeptView], camera: Integers, poses: Float64, pairs: Integers
+) -> dict[tuple[int, int], tuple[float, int]]:
+    """As `disagreements`, of pairs (M, 2) of views of any time, whose poses are (N, 4, 4)."""
+    found: dict[tuple[int, int], list[Float64]] = {}
+    for i, j in pairs:
+        a, b = sorted((int(camera[i]), int(camera[j])))
+        if a != b:
+            T = se3.inverse(poses[i]) @ poses[j]
+            found.setdefault((a, b), []).append(distances_between(views[i], views[j], T))
+    every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
+    return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
+
+
 def distances_between(target: KeptView, source: KeptView, T_target_source: Float64) -> Float64:
     """(N,) distances in m between the surfaces of two views, where both see the same."""
     rows = np.empty((len(source.points), kernels.ROW))

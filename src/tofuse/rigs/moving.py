@@ -22,7 +22,7 @@ from tofuse.posegraph.views import KeptView
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import distances_between
+from tofuse.rigs.joint import disagreements_of
 
 Float64 = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -242,11 +242,4 @@ class _Together:
     def disagreement(self) -> dict[tuple[int, int], tuple[float, int]]:
         """See `MovingRig`."""
         views = [v for k in sorted(self._kept) for v in self._kept[k].views]
-        found: dict[tuple[int, int], list[Float64]] = {}
-        for i, j in self._pairs:
-            a, b = sorted((int(self._camera[i]), int(self._camera[j])))
-            if a != b:
-                T = se3.inverse(self._poses[i]) @ self._poses[j]
-                found.setdefault((a, b), []).append(distances_between(views[i], views[j], T))
-        every = {ends: np.concatenate(some) for ends, some in sorted(found.items())}
-        return {ends: (float(np.median(d)), len(d)) for ends, d in every.items() if len(d)}
+        return disagreements_of(views, self._camera, self._poses, self._pairs)

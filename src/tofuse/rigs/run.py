@@ -20,12 +20,13 @@ from tofuse.pipeline.priors import with_odometry
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
+from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
-from tofuse.posegraph.refinement import NoRefinement
+from tofuse.posegraph.refinement import Known, NoRefinement
 from tofuse.posegraph.views import KeptView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.rig import Rig, read_rig
+from tofuse.recordings.rig import Disagreement, Rig, read_rig
 from tofuse.recordings.rig_source import RigSource
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
@@ -33,15 +34,20 @@ from tofuse.results.types import Reason, Reconstruction
 from tofuse.results.verdict import ranked, verdict_of
 from tofuse.rigs.calibrate import Motion, cameras_of, moves
 from tofuse.rigs.check import Moved, compare
-from tofuse.rigs.hand_eye import Track
 from tofuse.rigs.inputs import Camera
-from tofuse.rigs.joint import View, refine_together
+from tofuse.rigs.joint import View, disagreements, refine_together
+from tofuse.rigs.walked import walked
 
 Float64 = NDArray[np.float64]
+Integers = NDArray[np.intp]
 
 # No place is looked for again: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
 TRAJECTORY = "rig_trajectory.txt"
+# What the images of a single camera, one after the other, would say.
+_OF_TRACKING = frozenset({"jumped", "weak_registration", "not_converged", "repeated_images"})
+# No camera is known better than this: variances in m and rad, 0.1 mm and 0.005 degrees.
+_AT_LEAST = np.array([1e-4**2] * 3 + [np.radians(0.005) ** 2] * 3)
 # Of a view that tells whether its camera is where the rig says.
 _POINTS = 6000
 
@@ -56,11 +62,14 @@ class RigResult:
         The model of all cameras; its frames are instant by instant, camera by camera.
     times, poses
         (N,) of the instants, and (N, 4, 4) T_world_rig; NaN where no camera has a pose.
+    rig
+        The rig, with how far surfaces of its cameras are apart in these images.
     """
 
     result: Reconstruction
     times: Float64
     poses: Float64
+    rig: Rig
 
 
 def run_rig(
@@ -133,13 +142,17 @@ def reconstruct_rig(
     instants, first = np.unique(source.instant[recording.indices], return_index=True)
     times = recording.timestamps[first]
     poses = np.tile(np.eye(4), (len(instants), 1, 1))
+    T_rig_frame = source.T_rig_camera[recording.indices]
     knocked: list[Moved] = []
+    measured: tuple[Measured, ...] = ()
     if moves(cameras, motion):
-        poses = _walked(rig, cameras, times, progress)
+        found = walked(cameras, recording, progress)
+        poses, T_rig_frame, apart = found.poses, found.T_rig_frame, found.disagreement
+        measured = found.measured
     else:
-        knocked = _knocked(rig, cameras, recording)
+        knocked, apart = _checked(rig, cameras, recording)
     at = np.searchsorted(instants, source.instant[recording.indices])
-    of_frames = poses[at] @ source.T_rig_camera[recording.indices]
+    of_frames = poses[at] @ T_rig_frame
     given = replace(
         config,
         odometry=GivenPoses(),
@@ -148,17 +161,71 @@ def reconstruct_rig(
         outside=(),
         self_calibration=False,
     )
-    result = reconstruct(with_odometry(recording, of_frames), given, seed=seed, progress=progress)
-    told = {
-        "cameras": [camera.name for camera in rig.cameras],
-        "of_frames": source.camera[recording.indices].tolist(),
-    }
-    result = replace(result, recording={**result.recording, "rig": told})
-    return RigResult(_marked(result, knocked), times, poses)
+    fixed = _fixed(rig, source, recording, at, of_frames, follow=not measured)
+    sure = replace(given, refinement=Known((*measured, *fixed)))
+    result = reconstruct(with_odometry(recording, of_frames), sure, seed=seed, progress=progress)
+    names = [camera.name for camera in rig.cameras]
+    of_rig = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}
+    result = replace(
+        _as_rig(result), config=given.to_dict(), recording={**result.recording, "rig": of_rig}
+    )
+    between = tuple(
+        Disagreement(names[a], names[b], median, pixels)
+        for (a, b), (median, pixels) in sorted(apart.items())
+    )
+    return RigResult(_marked(result, knocked), times, poses, replace(rig, disagreement=between))
 
 
-def _knocked(rig: Rig, cameras: Sequence[Camera], recording: Recording) -> list[Moved]:
-    """Cameras that are not where the rig says, as far as their views can be aligned from there."""
+def _fixed(
+    rig: Rig,
+    source: RigSource,
+    recording: Recording,
+    instant: Integers,
+    T_world_frame: Float64,
+    *,
+    follow: bool,
+) -> list[Measured]:
+    """How sure the rig is where the frames of an instant are against that of its first camera.
+
+    Where a camera is wrong it is so at all instants: if the rig stands still, later frames `follow`
+    the first ones of their cameras.
+    """
+    covariances = [camera.covariance + np.diag(_AT_LEAST) for camera in rig.cameras]
+    covariances[0] = np.diag(_AT_LEAST)
+    known = np.flatnonzero(np.isfinite(T_world_frame[:, 0, 0]))
+    cameras = source.camera[recording.indices]
+    found: list[Measured] = []
+    first: dict[int, int] = {}
+    seen: dict[int, int] = {}
+    for k in known:
+        c = int(cameras[k])
+        i = first.setdefault(0 if follow else int(instant[k]), int(k))
+        C = covariances[c]
+        if follow and c in seen:
+            C, i = np.diag(_AT_LEAST), seen[c]
+        seen.setdefault(c, int(k))
+        if i != k:
+            T = se3.inverse(T_world_frame[i]) @ T_world_frame[k]
+            ends = int(recording.indices[i]), int(recording.indices[k])
+            found.append(Measured(*ends, T, np.asarray(np.linalg.inv(C), np.float64)))
+    return found
+
+
+def _as_rig(result: Reconstruction) -> Reconstruction:
+    """The result without what is only said of a single camera that is tracked."""
+    d = result.diagnostics
+    reasons = ranked([r for r in d.reasons if r.code not in _OF_TRACKING])
+    d = replace(d, reasons=reasons, verdict=verdict_of(reasons), refinement=None, cloud_before=None)
+    return replace(result, diagnostics=d)
+
+
+def _checked(
+    rig: Rig, cameras: Sequence[Camera], recording: Recording
+) -> tuple[list[Moved], dict[tuple[int, int], tuple[float, int]]]:
+    """Cameras that are not where the rig says, as far as their views can be aligned from there.
+
+    Also how far surfaces of each two are apart where the rig says that they are, see `Placed`.
+    """
     source = recording.source
     assert isinstance(source, RigSource)
     first = np.flatnonzero(source.instant == source.instant[recording.indices[0]])
@@ -174,7 +241,8 @@ def _knocked(rig: Rig, cameras: Sequence[Camera], recording: Recording) -> list[
         replace(camera, T_rig_camera=T, covariance=C[:6, :6])
         for camera, T, C in zip(rig.cameras, placed.poses, placed.covariance, strict=True)
     )
-    return [moved for moved in compare(rig, Rig(found)) if moved.moved]
+    knocked = [moved for moved in compare(rig, Rig(found)) if moved.moved]
+    return knocked, disagreements(views, stated)
 
 
 def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
@@ -193,54 +261,6 @@ def _marked(result: Reconstruction, knocked: Sequence[Moved]) -> Reconstruction:
     return replace(result, diagnostics=replace(d, reasons=reasons, verdict=verdict))
 
 
-def _walked(rig: Rig, cameras: Sequence[Camera], times: Float64, progress: Progress) -> Float64:
-    """T_world_rig (N, 4, 4) at some times, from what all cameras say of how the rig moved.
-
-    Each camera is tracked by itself. The rig's pose is the mean of what they say, once the world
-    of each is brought to that of the first.
-    """
-    said: list[Float64] = []
-    for stated, camera in zip(rig.cameras, cameras, strict=True):
-        progress.stage(f"tracking {camera.name}")
-        result = reconstruct(camera.recording, progress=Silent())
-        track = Track.of(result.timestamps + stated.time_offset_s, result.trajectory)
-        if len(track.times) < 2:
-            progress.note(f"{camera.name} has no trajectory")
-            continue
-        T, known = track.at(times)
-        T = T @ se3.inverse(stated.T_rig_camera)
-        said.append(np.where(known[:, None, None], T, np.nan))
-    if not said:
-        raise InputError("no camera has a trajectory", where="the rig")
-    stacked = [said[0]]
-    for other in said[1:]:
-        both = np.isfinite(said[0][:, 0, 0]) & np.isfinite(other[:, 0, 0])
-        if both.any():
-            stacked.append(_middle(said[0][both] @ se3.inverse(other[both])) @ other)
-    mean = _means(stacked)
-    rows = np.flatnonzero(np.isfinite(mean[:, 0, 0]))
-    return np.asarray(se3.inverse(mean[rows[0]]) @ mean, np.float64) if len(rows) else mean
-
-
-def _middle(poses: Float64) -> Float64:
-    """Mean of poses that are near each other, by medians."""
-    middle = poses[len(poses) // 2]
-    for _ in range(10):
-        middle = middle @ se3.exp(np.median(se3.log(se3.inverse(middle) @ poses), axis=0))
-    return np.asarray(se3.orthonormalise(middle), np.float64)
-
-
-def _means(said: Sequence[Float64]) -> Float64:
-    """(N, 4, 4) mean over cameras of the poses of each instant; NaN where there is none."""
-    out = np.full_like(said[0], np.nan)
-    for k in range(len(out)):
-        known = [T[k] for T in said if np.isfinite(T[k, 0, 0])]
-        if known:
-            away = [se3.log(se3.inverse(known[0]) @ T) for T in known]
-            out[k] = known[0] @ se3.exp(np.mean(away, axis=0))
-    return out
-
-
 def _write(found: RigResult, recording: Recording, folder: OutputFolder) -> None:
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
@@ -252,7 +272,7 @@ def _write(found: RigResult, recording: Recording, folder: OutputFolder) -> None
         source = recording.source
         assert isinstance(source, RigSource)
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
-        extras = ReportExtras(title=f"rig of {cameras}", pictures=pictures)
+        extras = ReportExtras(title=f"rig of {cameras}", pictures=pictures, rig=found.rig)
         write_report(result, here / "report.html", extras)
         write_kept(result, pictures, here / NAME)
         if result is found.result:

@@ -1,0 +1,88 @@
+"""The rig that recorded: where its cameras are, and how far their surfaces are apart."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofuse.geometry import se3
+from tofuse.recordings.rig import RigCamera
+from tofuse.report import plots, words
+from tofuse.report.subject import ROWS, Subject, Values
+
+Float64 = NDArray[np.float64]
+
+_SAID = 10  # pairs of cameras in the picture
+
+
+def rig(s: Subject) -> Values:
+    """Return the picture and the tables of the rig; empty where one camera recorded."""
+    found = s.extras.rig
+    if found is None:
+        return {"rig_views": [], "rig_cameras": [], "rig_pairs": [], "rig_unplaced": []}
+    poses = upright(np.stack([camera.T_rig_camera for camera in found.cameras]))
+    names = [camera.name for camera in found.cameras]
+    apart = [
+        (names.index(d.a), names.index(d.b), f"{1000 * d.median_m:.1f} mm")
+        for d in found.disagreement
+    ]
+    # Of many cameras the table is easier to read.
+    said = apart if len(apart) <= _SAID else []
+    views = [
+        {
+            "svg": plots.rig(poses, names, "above", label="The rig from above", pairs=said),
+            "caption": "From above, the first camera looks up."
+            + (" Broken lines: how far surfaces that two cameras see are apart." if said else ""),
+        },
+        {
+            "svg": plots.rig(poses, names, "side", label="The rig from the side"),
+            "caption": "From the side, the first camera looks right.",
+        },
+    ]
+    pairs = sorted(found.disagreement, key=lambda d: -d.median_m)
+    return {
+        "rig_views": views,
+        "rig_cameras": [_camera(c, k == 0) for k, c in enumerate(found.cameras)],
+        "rig_pairs": [
+            (f"{d.a}, {d.b}", f"{1000 * d.median_m:.1f} mm", f"{d.pixels:,}") for d in pairs[:ROWS]
+        ],
+        "rig_unplaced": [f"{name}: {why}" for name, why in found.unplaced.items()],
+    }
+
+
+def upright(T_rig_camera: Float64) -> Float64:
+    """Poses (K, 4, 4) turned so that what is down for all cameras together is down.
+
+    The cameras of a ring look down from all sides: the first one alone would show it slanted.
+    """
+    down = T_rig_camera[:, :3, 1].sum(0)
+    length = float(np.linalg.norm(down))
+    if length < 0.5 * len(T_rig_camera):  # they don't agree
+        return T_rig_camera
+    down = down / length
+    axis = np.cross(down, [0.0, 1.0, 0.0])
+    sine = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(sine, down[1]))
+    turn = np.zeros(6)
+    turn[3:] = axis / max(sine, 1e-12) * angle
+    return np.asarray(se3.exp(turn) @ T_rig_camera, np.float64)
+
+
+def _camera(camera: RigCamera, first: bool) -> tuple[str, ...]:
+    place = ", ".join(f"{x:.3f}" for x in camera.T_rig_camera[:3, 3]).replace("-", "−")
+    if first:
+        return (camera.name, place, "–", "–", "–", "–")
+    metres, radians = (
+        float(np.sqrt(max(np.linalg.eigvalsh(camera.covariance[part, part])[-1], 0)))
+        for part in (slice(3), slice(3, 6))
+    )
+    offsets = (camera.time_offset_s, camera.depth_offset_m)
+    signed = [f"{1000 * x:+.1f}".replace("-", "−") for x in offsets]
+    return (
+        camera.name,
+        place,
+        words.length(metres),
+        f"{np.degrees(radians):.2g}°",
+        f"{signed[0]} ms",
+        f"{signed[1]} mm",
+    )
