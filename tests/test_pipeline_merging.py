@@ -15,9 +15,10 @@ from made_sessions import HERE, THERE, made_result, made_result_of, quick
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.trajectory import read_tum
+from tofuse.fusion.texture import textured
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
-from tofuse.pipeline import merging
+from tofuse.pipeline import merging, paint
 from tofuse.pipeline import run as run_module
 from tofuse.pipeline.merging import merge_sessions, merged_config
 from tofuse.pipeline.progress import Silent
@@ -153,8 +154,17 @@ def test_the_command_writes_a_result(results, tmp_path, monkeypatch, capsys) -> 
     monkeypatch.setattr(merging, "merged_config", lambda s: quick(merged_config(s)))
     out = tmp_path / "all"
     words = ["merge", str(results["here"]), str(results["there"]), "--out", str(out)]
-    assert main([*words, "--threads", "2"]) == 0
+    painted = []
+
+    def painting(mesh, views, poses, size):
+        painted.append(len(views))
+        return textured(mesh, views, poses, size)
+
+    monkeypatch.setattr(paint, "textured", painting)
+    assert main([*words, "--threads", "2", "--texture"]) == 0
     assert "here and there overlap" in capsys.readouterr().out
+    assert painted == [24]  # views of both
+    assert (out / "mesh.obj").exists()
     times, poses = read_tum(out / "trajectory.txt")
     assert len(poses) == 24
     assert (np.diff(times) > 0).all()

@@ -137,6 +137,7 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
         faces=options.faces,
         seed=options.seed or 0,
         threads=options.threads,
+        texture=options.texture,
         only_joined=True,
     )
     with _working(arguments) as progress:
@@ -369,6 +370,7 @@ def merge(arguments: argparse.Namespace) -> int:
         faces=arguments.faces,
         seed=arguments.seed or 0,
         threads=arguments.threads,
+        texture=arguments.texture,
     )
     with progress_for(as_json=arguments.json) as progress:
         result = merge_files(arguments.results, options, progress)

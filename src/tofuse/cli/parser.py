@@ -430,6 +430,9 @@ def _merge(commands: Any) -> None:
         help='accuracy required of a "good" map, e.g. 30mm (default: as the first result)',
     )
     p.add_argument(
+        "--texture", action="store_true", help="texture the surface (default: as the first result)"
+    )
+    p.add_argument(
         "--faces",
         type=_count,
         metavar="N",

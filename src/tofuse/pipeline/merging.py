@@ -24,6 +24,7 @@ from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
 from tofuse.pipeline.checkpoint import NotKept
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
+from tofuse.pipeline.paint import TEXTURE, paint
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import Tracked, described, push_frames
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
@@ -68,6 +69,7 @@ class MergeOptions:
     faces: int | None = None
     seed: int = 0
     threads: int | None = None
+    texture: bool = False
     only_joined: bool = False
 
 
@@ -303,6 +305,8 @@ def _merge_into(
         fusion = replace(fusion, voxel_m=options.voxel)
     if options.faces is not None:
         fusion = replace(fusion, faces=options.faces)
+    if options.texture and not fusion.texture:
+        fusion = replace(fusion, texture=TEXTURE)
     config = replace(config, fusion=fusion)
     if options.tolerance is not None:
         config = replace(config, tolerance_m=options.tolerance)
@@ -312,9 +316,13 @@ def _merge_into(
     if options.only_joined and result.sessions[-1].T_main_session is None:
         progress.note(f"{options.out} is left as it was")
         return result
+    texture = None
+    if fusion.texture:
+        recording, _ = joined_recording(sessions)
+        texture = paint(recording, result, fusion.texture, options.threads, progress)
     progress.stage("writing")
     with threadpool_limits(1):
-        write_result(result, folder, _report)
+        write_result(result, folder, _report, texture)
     return result
 
 

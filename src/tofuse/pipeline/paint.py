@@ -20,6 +20,7 @@ from tofuse.results.types import Reconstruction
 _VIEWS, _FACES = 60, 60_000
 # One radian of motion blurs as much as so many metres.
 _METRES_A_RADIAN = 1.0
+TEXTURE = 2048  # texels, where no size is given
 
 
 def paint(

@@ -22,7 +22,7 @@ from tofuse.pipeline.checkpoint import Checkpoints, digest
 from tofuse.pipeline.config import Config, ViewKind, changed, from_method, read_changes
 from tofuse.pipeline.judging import device_sentence
 from tofuse.pipeline.learn import learnt
-from tofuse.pipeline.paint import paint
+from tofuse.pipeline.paint import TEXTURE, paint
 from tofuse.pipeline.priors import Prior, with_prior
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.pipeline.reconstruct import (
@@ -49,7 +49,6 @@ from tofuse.results.types import Reason, Reconstruction, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
 
 _CLOUDS = 12  # views drawn, where they are clouds
-_TEXTURE = 2048  # texels, where no size is given
 # What may come of a state that was changed.
 _STRANGE = (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError)
 _LOOKED_AT = 8  # frames, for what they hold
@@ -266,7 +265,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     if options.guess:
         config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
     if options.texture and not config.fusion.texture:
-        config = changed(config, {"fusion": {"texture": _TEXTURE}}, where="--texture")
+        config = changed(config, {"fusion": {"texture": TEXTURE}}, where="--texture")
     if options.faces is not None:
         config = changed(config, {"fusion": {"faces": options.faces}}, where="--faces")
     if options.voxel is not None:
