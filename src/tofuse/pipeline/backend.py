@@ -376,12 +376,12 @@ class BackEnd:
         if not self._kept.knows_errors:
             return Accuracy(), pose_covariances(closed.optimisation.graph)
         refinement = refined.refinement
-        graph = seen = self._measured(refined.graph)
+        graph = seen = self._measured(refined.graph, refinement)
         if closed.told:  # as the verdict, the accuracy stays with what was seen
             alone = closed.judged.optimisation.graph
             if refinement.kept:
                 alone = self.graph(closed.loops, refinement)
-            seen = self._measured(alone)
+            seen = self._measured(alone, refinement)
         moved = 0.0, 0.0
         if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
@@ -397,7 +397,7 @@ class BackEnd:
         frames, at = self._checked(graph)
         return with_pose_errors(model, frames, graph.poses[at], covariances[at])
 
-    def _measured(self, graph: PoseGraph) -> PoseGraph:
+    def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
         """The graph without what is only extrapolated from the motion."""
         bridges = {(j.link.i, j.link.j) for j in self._joins if j.how == "motion"}
         own = {
@@ -406,7 +406,9 @@ class BackEnd:
             if e.step is not None and e.step.reference is not None
         }
         views = {v.index: v for v in self._kept.views.of(self._poses)}
-        directions = degenerate_directions(graph, self._unobservable, own, views)
+        directions = degenerate_directions(
+            graph, self._unobservable, own, views, frozenset(refinement.stated)
+        )
         return without_degenerate(graph, directions, bridges)
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:

@@ -117,6 +117,7 @@ def degenerate_directions(
     unobservable: Mapping[int, Float64],
     own: Collection[tuple[int, int]],
     views: Mapping[int, PosedView[SurfaceMap]],
+    stated: Collection[tuple[int, int]] = (),
 ) -> list[Float64]:
     """For every edge the directions that it does not measure: (k, 6), right perturbations of j.
 
@@ -131,10 +132,15 @@ def degenerate_directions(
         Pairs (i, j) that are the registrations of j in tracking.
     views
         Prepared views by frame index.
+    stated
+        Pairs (i, j) that do not rest on what the two views see: nothing is degenerate there.
     """
     out = []
     for (a, b), T_i_j in zip(graph.edges, graph.measurements, strict=True):
         i, j = int(graph.ids[a]), int(graph.ids[b])
+        if (i, j) in stated:
+            out.append(_NONE)
+            continue
         # A motion of i moves j the other way, as seen from j.
         there = unobservable.get(i, _NONE) @ se3.adjoint(se3.inverse(T_i_j)).T
         known = np.concatenate([there, unobservable.get(j, _NONE)])

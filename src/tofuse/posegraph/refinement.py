@@ -60,6 +60,8 @@ class Refinement:
         What each pair measures by itself, in frame indices; none unless kept.
     suspicion
         What the views say of errors of the camera, where they were asked.
+    stated
+        Pairs (i, j) of edges that do not rest on what the two views see of each other.
     """
 
     poses: Float64
@@ -72,6 +74,7 @@ class Refinement:
     errors: dict[str, float] = field(default_factory=dict)
     edges: tuple[Measured, ...] = ()
     suspicion: Suspicion | None = None
+    stated: tuple[tuple[int, int], ...] = ()
 
 
 class Refiner(Protocol):
@@ -134,26 +137,32 @@ class Known(Refining):
 
     Attributes
     ----------
-    edges
-        In frame indices.
+    measured, stated
+        In frame indices: what pairs of views measured, and what is known otherwise.
     """
 
-    edges: tuple[Measured, ...]
+    measured: tuple[Measured, ...]
+    stated: tuple[Measured, ...]
 
     def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
         """See `Refining.start`."""
-        return _Known(self.edges)
+        return _Known(self)
 
 
 class _Known(_Idle):
-    def __init__(self, edges: tuple[Measured, ...]) -> None:
-        self._edges = edges
+    def __init__(self, known: Known) -> None:
+        self._known = known
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""
-        known = set(ids)
-        edges = tuple(e for e in self._edges if {e.i, e.j} <= known)
-        return Refinement(poses, kept=True, edges=edges)
+        there = set(ids)
+        edges = (*self._known.measured, *self._known.stated)
+        return Refinement(
+            poses,
+            kept=True,
+            edges=tuple(e for e in edges if {e.i, e.j} <= there),
+            stated=tuple((e.i, e.j) for e in self._known.stated),
+        )
 
 
 @part("refinement", "joint")

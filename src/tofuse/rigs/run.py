@@ -145,10 +145,11 @@ def reconstruct_rig(
     T_rig_frame = source.T_rig_camera[recording.indices]
     knocked: list[Moved] = []
     measured: tuple[Measured, ...] = ()
+    tracked: tuple[Measured, ...] = ()
     if moves(cameras, motion):
         found = walked(cameras, recording, progress)
         poses, T_rig_frame, apart = found.poses, found.T_rig_frame, found.disagreement
-        measured = found.measured
+        measured, tracked = found.measured, found.tracked
     else:
         knocked, apart = _checked(rig, cameras, recording)
     at = np.searchsorted(instants, source.instant[recording.indices])
@@ -161,8 +162,9 @@ def reconstruct_rig(
         outside=(),
         self_calibration=False,
     )
-    fixed = _fixed(rig, source, recording, at, of_frames, follow=not measured)
-    sure = replace(given, refinement=Known((*measured, *fixed)))
+    moved = bool(measured or tracked)
+    fixed = _fixed(rig, source, recording, at, of_frames, follow=not moved)
+    sure = replace(given, refinement=Known(measured, (*tracked, *fixed)))
     result = reconstruct(with_odometry(recording, of_frames), sure, seed=seed, progress=progress)
     names = [camera.name for camera in rig.cameras]
     of_rig = {"cameras": names, "of_frames": source.camera[recording.indices].tolist()}

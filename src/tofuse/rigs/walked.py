@@ -60,14 +60,16 @@ class Walked:
     disagreement
         See `MovingRig`.
     measured
-        How sure that is: between frames (by index), and from the first one to those at other
-        instants.
+        How sure that is: what pairs of views measured, by the index of their frames.
+    tracked
+        Of instants that took no part in that: what the cameras' own trajectories are sure of.
     """
 
     poses: Float64
     T_rig_frame: Float64
     disagreement: Apart
     measured: tuple[Measured, ...]
+    tracked: tuple[Measured, ...] = ()
 
 
 def walked(cameras: Sequence[Camera], recording: Recording, progress: Progress) -> Walked:
@@ -100,7 +102,7 @@ def walked(cameras: Sequence[Camera], recording: Recording, progress: Progress) 
     found = refined(cameras, recording, mean, T_rig_frame, at)
     used = {index for edge in found.measured for index in (edge.i, edge.j)}
     more = _of_tracking(source, recording, said, found.poses, at, used)
-    return replace(found, measured=(*found.measured, *more))
+    return replace(found, tracked=tuple(more))
 
 
 def _of_tracking(
