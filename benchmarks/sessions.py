@@ -5,7 +5,11 @@ one, which goes from room 0 into room 1. The truth is exact. `join error` is how
 session is off from the first in the merged map: each session's own frames are brought onto the
 truth, and what is left between the two is measured in the middle of the room that they share.
 
+`--row N` merges sessions one after the other into a growing map, each a walk of its own through a
+part of two rooms, and prints after each merge how far the map is off, and its worst session.
+
     python benchmarks/sessions.py [--cases shares-a-room,...] [--threads 2]
+    python benchmarks/sessions.py --row 10 [--frames 61]
 """
 
 from __future__ import annotations
@@ -200,7 +204,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", default="", help="names, separated by commas")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--row", type=int, help="so many sessions in a row, and nothing else")
+    parser.add_argument("--frames", type=int, default=61, help="of each session in a row")
     arguments = parser.parse_args()
+    if arguments.row:
+        in_a_row(arguments.row, arguments.frames, arguments.threads)
+        return
     wanted = {name.strip().replace("-", " ") for name in arguments.cases.split(",") if name}
     head = ("case", "joined", "join error", "ATE a", "ATE b", "ATE map", "stated", "how sure")
     head = (*head, "changed")
@@ -217,16 +226,53 @@ def main() -> None:
         print(row(case, result, truth), flush=True)
 
 
-def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
-    """One line of the table."""
+def in_a_row(count: int, frames: int, threads: int) -> None:
+    """Merge sessions one after the other, and print the error of the map after each."""
+    head = ("sessions", "in the map", "ATE map", "ATE worst session", "stated", "changed")
+    print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+    # Each begins elsewhere in the first two rooms, and every other one goes beside the path.
+    starts = [120 + 25 * (k % 5) + 8 * (k // 5) for k in range(count)]
+    tours = [
+        Tour(f"row-{start}-{frames}", start, frames, beside=k % 2 == 1)
+        for k, start in enumerate(starts)
+    ]
+    truth = [tour.recording()[1] for tour in tours]
+    whole = tours[0].result(threads)
+    for k in range(1, count):
+        out = RUNS / "merged" / f"row-{frames}-{k + 1}"
+        options = MergeOptions(out, overwrite=True, threads=threads)
+        result = merge_files([whole, tours[k].result(threads)], options)
+        whole = out
+        true, ates = against(result, truth)
+        posed = result.has_pose
+        joined = sum(session.T_main_session is not None for session in result.sessions)
+        cells = (
+            f"{k + 1}",
+            f"{joined}",
+            f"{1e3 * displacement(result.trajectory[posed], true[posed])[0]:.1f} mm",
+            f"{1e3 * np.nanmax(ates):.1f} mm",
+            f"{1e3 * result.diagnostics.accuracy.position_m:.0f} mm",
+            ", ".join(c.change.kind for c in result.changes) or "-",
+        )
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def against(result: Reconstruction, truth: Sequence[Float64]) -> tuple[Float64, list[float]]:
+    """(N, 4, 4) true poses of the frames, and the ATE of each session in m, NaN where apart."""
     index = np.array([f.index for f in result.diagnostics.frames])
     true = np.full((len(index), 4, 4), np.nan)
     ates = []
-    for session, known in zip(result.sessions, truth, strict=True):
+    for session, known in zip(result.sessions, truth, strict=False):
         mine = np.array([session.has(int(k)) for k in index])
         true[mine] = known[index[mine] - session.first]
         both = mine & result.has_pose
         ates.append(displacement(result.trajectory[both], true[both])[0] if both.any() else np.nan)
+    return true, ates
+
+
+def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
+    """One line of the table."""
+    true, ates = against(result, truth)
     posed = result.has_pose
     ate = displacement(result.trajectory[posed], true[posed])[0]
     metres, angle = join_error(result, truth)
