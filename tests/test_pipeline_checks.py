@@ -172,6 +172,13 @@ CASES = {
     "unchecked_drift": evidence(gaps=()),
     "uncertain_poses": evidence(gaps=(), sigma=(0.02, 0.001)),
     "calibration_alarm": evidence(gaps=((0, 8, [0.05, 0, 0, 0, 0, 0]),), sigma=(0.001, 0.001)),
+    "unchecked_calibration": evidence(
+        gaps=(),
+        sigma=(0.001, 0.001),
+        refinement=Refinement(
+            np.zeros((9, 4, 4)), True, 9, 20, suspicion=Suspicion(focal_sigma=0.05)
+        ),
+    ),
     "not_improved": evidence(parts=(GraphPart(0, 9, 9, 1.0, 1.0, True),)),
     "not_refined": evidence(refinement=Refinement(np.zeros((9, 4, 4)), views=9, pairs=20)),
     "loop_gap": evidence(gaps=((0, 8, [0.2, 0, 0, 0, 0, 0]),)),
@@ -508,6 +515,31 @@ def test_loops_given_by_hand_are_listed_once() -> None:
     assert reason.text.endswith("and 2 more.")
     (one,) = judge(CASES["loop_rejected"])[1]
     assert one.ranges == ((1, 1), (7, 7))
+
+
+def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
+    """A note: the verdict stays, as a camera's factory calibration is usually right."""
+    found = Suspicion(False, {"focal": -0.05}, {"focal": 0.003}, focal_sigma=0.003)
+    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, suspicion=found)
+
+    def said(suspicion: Suspicion) -> list[str]:
+        told = replace(refinement, suspicion=suspicion)
+        case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=told)
+        return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
+
+    (text,) = said(found)
+    assert "a focal length 5.3% larger, but no loop confirms it" in text
+    (text,) = said(Suspicion(focal_sigma=0.02))
+    assert "does not determine the camera's focal length" in text
+    gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02))
+    for quiet in (
+        Suspicion(focal_sigma=0.001),  # determined, and as stated
+        Suspicion(),  # not asked: too few views
+        replace(found, errors={"focal": -0.005}),  # within what a calibration is good to
+        replace(found, gap=gap),  # a loop speaks against it
+        replace(found, alarm=True, gap=gap),  # which is an alarm
+    ):
+        assert said(quiet) == []
 
 
 def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:

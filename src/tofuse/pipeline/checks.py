@@ -408,6 +408,7 @@ def _uncertainty(e: Evidence) -> Iterator[Reason]:
     """With known errors of the registrations, those of the path follow."""
     yield from _missed(e)
     yield from _suspected(e)
+    yield from _unchecked_calibration(e)
     yield from bounds(e.accuracy, e.tolerance, [r.index for r in e.records])
 
 
@@ -469,6 +470,27 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
         "check the calibration."
     )
     yield Reason("calibration_alarm", ((gap.i, gap.j),), text)
+
+
+def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
+    """The bound of the poses assumes a calibration that this recording may not be able to check."""
+    found = None if e.refinement is None else e.refinement.suspicion
+    if found is None or found.alarm:
+        return
+    if found.undetermined:
+        text = (
+            "The recording does not determine the camera's focal length: the stated accuracy "
+            "assumes that the calibration is right."
+        )
+    elif found.unconfirmed:
+        cure = " or ".join(camera_in_words(found.unconfirmed))
+        text = (
+            f"Views agree better with {cure}, but no loop confirms it: the stated accuracy assumes "
+            "that the calibration is right."
+        )
+    else:
+        return
+    yield Reason("unchecked_calibration", e.posed, text)
 
 
 def _gap(e: Evidence) -> Iterator[Reason]:

@@ -107,6 +107,9 @@ class Suspicion:
         Of the longest loop; None where there is none, or nothing was suspected.
     best
         Name of the error with which the views agree best; empty where nothing was suspected.
+    focal_sigma
+        Standard deviation with which the views determine the focal length, as a fraction; None
+        where there were too few to ask.
     """
 
     alarm: bool = False
@@ -115,6 +118,27 @@ class Suspicion:
     support: tuple[float, float] | None = None
     gap: Gap | None = None
     best: str = ""
+    focal_sigma: float | None = None
+
+    @property
+    def undetermined(self) -> bool:
+        """Whether a wrong focal length would not show in this recording."""
+        return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
+
+    @property
+    def unconfirmed(self) -> dict[str, float]:
+        """Errors of the camera with which views agree better, where no loop can confirm them."""
+        if self.alarm or self.gap is not None:
+            return {}
+        return {name: e for name, e in self.errors.items() if _large(name, e, self.sigmas[name])}
+
+
+def _determined(name: str, sigma: float) -> bool:
+    return sigma < _VAGUE * TOLERANCES[name]
+
+
+def _large(name: str, error: float, sigma: float) -> bool:
+    return abs(error) > max(TOLERANCES[name], _SURE * sigma)
 
 
 def suspicion(
@@ -126,7 +150,8 @@ def suspicion(
         return Suspicion()
     said = response(views, poses, pairs, options, beside=beside)
     estimate, sigma = said.estimate(), said.sigma(pairs, len(views))
-    held = [name for name, k in _NUMBERS.items() if sigma[k] < _VAGUE * TOLERANCES[name]]
+    held = [name for name, k in _NUMBERS.items() if _determined(name, sigma[k])]
+    focal_sigma = float(sigma[kernels.FOCAL])
     looked = [
         name
         for name in held
@@ -134,7 +159,7 @@ def suspicion(
         > max(_LIKELY * sigma[_NUMBERS[name]], _WORTH * TOLERANCES[name])
     ]
     if not looked:
-        return Suspicion()
+        return Suspicion(focal_sigma=focal_sigma)
     few, some = list(views), pairs
     if len(pairs) > _ENOUGH_PAIRS:
         few = [KeptView(v.surface, np.ascontiguousarray(v.points[::_EVERY])) for v in views]
@@ -150,7 +175,7 @@ def suspicion(
     name_of_best = max(found, key=lambda name: _gain(found[name], views))
     best = found[name_of_best]
     large = any(
-        abs(one.errors[_NUMBERS[name]]) > max(TOLERANCES[name], _SURE * sigma[_NUMBERS[name]])
+        _large(name, one.errors[_NUMBERS[name]], sigma[_NUMBERS[name]])
         for name, one in found.items()
     )
     gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
@@ -165,6 +190,7 @@ def suspicion(
         (support, support + _gain(best, views)),
         gap,
         name_of_best,
+        focal_sigma,
     )
 
 
@@ -178,7 +204,9 @@ def of_submaps(said: Sequence[Suspicion]) -> Suspicion:
     if 2 * len(alarms) > len(said):
         return alarms[len(alarms) // 2]
     quiet = [s for s in said if not s.alarm]
-    return next((s for s in quiet if s.gap is not None), quiet[0] if quiet else Suspicion())
+    # One submap that determines the camera speaks for all of them.
+    quiet.sort(key=lambda s: (s.gap is None, s.undetermined))
+    return quiet[0] if quiet else Suspicion()
 
 
 def _gain(found: Refined, views: Sequence[KeptView]) -> float:

@@ -388,6 +388,7 @@ def _suspicion(s: Suspicion | None) -> dict[str, Any] | None:
         "alarm": s.alarm,
         "camera": s.errors,
         "sigma": s.sigmas,
+        "focal_sigma": s.focal_sigma,
         "support": s.support,
         "loop": None
         if gap is None

@@ -34,6 +34,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "unchecked_drift": ("degraded", "No loop closure checks the accumulated drift."),
     "loop_gap": ("degraded", "Odometry drifted far before a loop was closed."),
     "optimiser_gave_up": ("degraded", "The optimiser stopped before it converged."),
+    "unchecked_calibration": ("note", "The recording can't check the camera's calibration."),
     "self_calibrated": ("note", "The calibration of the camera was corrected by its own views."),
     "correction_left_out": (
         "note",
@@ -67,6 +68,7 @@ ADVICE: dict[str, str] = {
     "not_converged": "More iterations or smaller steps between frames would help.",
     "uncertain_poses": "Come back to these places, or keep corners and texture in view there.",
     "calibration_alarm": "Check the camera's calibration: a known distance, a right angle.",
+    "unchecked_calibration": "Turn the camera more, and come back to where you started.",
     "self_calibrated": "Put the corrected values into camera.json, and check a known distance.",
     "unobserved_motion": "Keep corners, furniture or texture in view there.",
     "unchecked_drift": "Come back to where you started, so that a loop can check the path.",
