@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
+from tofuse.errors import RegistrationError
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
@@ -279,6 +280,19 @@ def test_other_units_are_named(scans, scale):
     assert found.believed is False
     assert f"{1 / scale:g} times as large" in found.reason
     assert "unit" in found.reason
+
+
+@pytest.mark.parametrize("scale", [0.001, 100.0])
+def test_other_units_are_named_where_nothing_is_certain(scale):
+    """A square room fits in four ways, so that no scale is believed."""
+    walls, other = (box_walls(4000, seed, 0.003, "xyz") for seed in (0, 1))
+    try:
+        said = tofuse.register(other * scale, walls).reason
+    except RegistrationError as error:
+        said = str(error)
+        assert f"{scale:g} times that of the target" in said
+        assert "unit" in said
+    assert said
 
 
 def test_a_guess_decides_between_poses_that_are_alike():

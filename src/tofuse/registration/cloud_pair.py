@@ -168,7 +168,16 @@ def register_clouds(
         if found is not None:
             reason = f"the views fit with the source {scale:g} times as large: check its unit"
             return replace(found, believed=False, reason=reason)
-    return _registered(source, target, guess, rng, seen, always_search=always_search)
+    try:
+        return _registered(source, target, guess, rng, seen, always_search=always_search)
+    except RegistrationError as error:
+        if not power:
+            raise
+        raise RegistrationError(
+            f"its extent is about {10.0**-power:g} times that of the target, and it does not fit",
+            where=f"frame {source.index}",
+            remedy="check the units of both clouds",
+        ) from error
 
 
 def _registered(
