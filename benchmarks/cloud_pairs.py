@@ -347,7 +347,7 @@ def print_fit(data: Path, most: int) -> None:
     fitted = [kind.name for kind in KINDS.values() if kind.fitted]
     others = [kind.name for kind in KINDS.values() if not kind.fitted]
     titles = (
-        "Searched: constant, root of margin, support, root of contradiction",
+        "Searched: constant, root of margin, support, contradiction, degenerate, unseen",
         "Followed: constant, support, contradiction, unseen",
     )
     mine, theirs = (samples(names, data, most) for names in (fitted, others))

@@ -35,9 +35,9 @@ _FOLLOWED = np.array([0.55, 7.01, -6.02])
 
 # Those of `CloudEvidence.searched` and `CloudEvidence.followed`, fitted to simulated poses by
 # ``benchmarks/cloud_pairs.py fit``. On scenes and cameras that took no part the area under the ROC
-# curve of searched poses is 0.98, and none of 36 that were believed was wrong; of the 36 believed
-# on those that did take part 2 were: rooms of one size behind each other.
-_CLOUDS_SEARCHED = np.array([-2.57, 6.77, 0.95, -2.84])
+# curve is 0.96 for both, and of 47 and 235 believed poses one each was wrong; of 228 on those that
+# did take part, 10 were: rooms of one size behind each other, and slides along bare walls.
+_CLOUDS_SEARCHED = np.array([-1.47, 4.33, 0.75, -1.03, -3.80, 0.63])
 _CLOUDS_FOLLOWED = np.array([-2.29, 9.96, -2.94, -0.62])
 
 
@@ -126,13 +126,12 @@ class CloudEvidence:
 
     @property
     def searched(self) -> Float64:
-        """(4,) regressors of a pose that was compared with others.
-
-        As in `Evidence`, without degenerate directions, along which there is no margin anyway, and
-        without whether free space is known: what is not known does not contradict.
-        """
-        lead = max(self.margin or 0.0, 0.0)
-        return np.array([1, np.sqrt(lead), self.support, np.sqrt(self.contradiction)])
+        """(6,) regressors of a pose that was compared with others."""
+        lead = np.sqrt(max(self.margin or 0.0, 0.0))
+        unknown = not self.knows_free_space
+        return np.array(
+            [1, lead, self.support, self.contradiction, self.degenerate > 0, unknown], float
+        )
 
     @property
     def followed(self) -> Float64:
