@@ -312,7 +312,7 @@ def test_a_run_with_a_texture(room_recording: Path, tmp_path: Path, capsys, monk
     monkeypatch.setattr(
         run_module, "write_report_files", lambda *a: (a[-1] / "report.html").write_text("report")
     )
-    monkeypatch.setattr(run_module, "_TEXTURE", 256)
+    monkeypatch.setattr(run_module, "TEXTURE", 256)
     monkeypatch.setattr(paint, "_FACES", 3000)
     words = ["run", str(room_recording), "--every", "7", "--out"]
     for threads, name in (("1", "a"), ("2", "b")):
