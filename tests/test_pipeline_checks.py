@@ -528,9 +528,11 @@ def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
     (text,) = said(found)
-    assert "a focal length 5.3% larger, but no loop confirms it" in text
+    assert "a focal length 5.3% larger, but no loop closure confirms it" in text
     (text,) = said(Suspicion(focal_sigma=0.02))
     assert "does not determine the camera's focal length" in text
+    small = Gap(2, 7, (0.006, 0.005), (0.006, 0.008))  # too small to tell
+    assert said(replace(found, gap=small)) == said(found)
     gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02))
     for quiet in (
         Suspicion(focal_sigma=0.001),  # determined, and as stated

@@ -485,8 +485,8 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     elif found.unconfirmed:
         cure = " or ".join(camera_in_words(found.unconfirmed))
         text = (
-            f"Views agree better with {cure}, but no loop confirms it: the stated accuracy assumes "
-            "that the calibration is right."
+            f"Views agree better with {cure}, but no loop closure confirms it: the stated accuracy "
+            "assumes that the calibration is right."
         )
     else:
         return

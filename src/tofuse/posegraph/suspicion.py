@@ -87,6 +87,12 @@ class Gap:
             return False
         return all(a < least for a, _, least in parts) or any(b < 0.5 * a for a, b, _ in parts)
 
+    @property
+    def contradicts(self) -> bool:
+        """Whether it is wide enough to tell, and the errors do not explain it."""
+        wide = any(a >= least for a, least in zip(self.before, _CLOSED, strict=True))
+        return wide and not self.closes
+
 
 @dataclass(frozen=True)
 class Suspicion:
@@ -127,10 +133,11 @@ class Suspicion:
 
     @property
     def unconfirmed(self) -> dict[str, float]:
-        """Errors of the camera with which views agree better, where no loop can confirm them."""
-        if self.alarm or self.gap is not None:
+        """Errors with which views agree better, that no loop confirms, and none contradicts."""
+        if self.alarm or (self.gap is not None and self.gap.contradicts):
             return {}
-        return {name: e for name, e in self.errors.items() if _large(name, e, self.sigmas[name])}
+        sigmas = self.sigmas
+        return {n: e for n, e in self.errors.items() if n in sigmas and _large(n, e, sigmas[n])}
 
 
 def _determined(name: str, sigma: float) -> bool:
