@@ -49,7 +49,7 @@ Float32 = NDArray[np.float32]
 POINTS = 20_000
 RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.1, 0.05, 4.0
 # What moves by itself stands before a background that does not.
-_OBJECT_M = 1.6
+OBJECT_M = 1.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def frames(
 def _object(frame: Frame, name: str) -> Frame:
     if name not in ("torso", "box"):
         return frame
-    near = np.linalg.norm(frame.points, axis=1) < _OBJECT_M
+    near = np.linalg.norm(frame.points, axis=1) < OBJECT_M
     return CloudFrame(frame.index, frame.timestamp, frame.points[near])
 
 

@@ -24,7 +24,7 @@ from tofuse import parts
 from tofuse.cli.parser import DEMO_SCENES, make_parser
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
-from tofuse.pipeline.config import Config, ViewKind, changed, from_method, methods
+from tofuse.pipeline.config import ROOMS, Config, ViewKind, changed, from_method, methods
 from tofuse.pipeline.pair import register_files
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.results.output import run_json
@@ -50,15 +50,7 @@ CITED = (
     *("Fischler and Bolles 1981", "Lowe 1999, 2004", "Wheeler and Ikeuchi 1995"),
     *("Söderkvist and Wedin 1994", "Moore 1991", "Hartley and Zisserman 2003"),
 )
-PART_ROOMS = (
-    "tofuse.filters",  # corrections too
-    "tofuse.registration",
-    "tofuse.odometry",
-    "tofuse.posegraph",
-    "tofuse.lab",
-    "tofuse.recordings.readers",
-    "tofuse.live.devices",
-)
+PART_ROOMS = (*ROOMS, "tofuse.recordings.readers", "tofuse.live.devices")
 
 
 @cache

@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pairs
+from cloud_pairs import OBJECT_M
 from leaders import Board, Score, default_made
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.base import Registrar
 from tofuse.registration.coarse_to_fine import spacing
@@ -38,7 +40,6 @@ SCENES = ("room", "flat", "rail", "torso", "kitchen")
 RIGHT_SHARE, RIGHT_DEG = 0.02, 1.5
 POINTS = 1000
 _SEED = 7  # of nothing else
-_OBJECT_M = 1.6  # objects are nearer, their background is not
 
 
 @dataclass(frozen=True)
@@ -210,9 +211,8 @@ def _about(middle: Float64, metres: float, degrees: float, rng: np.random.Genera
 
 def _object(view: RangeFrame) -> RangeFrame:
     """Without the background, which does not move with the object."""
-    near = np.linalg.norm(view.camera.rays(), axis=2) ** 2 + 1
-    distance = view.depth * (np.sqrt(near) if view.depth_kind == "z" else 1)
-    return replace(view, depth=np.where(distance < _OBJECT_M, view.depth, 0).astype(np.float32))
+    ranges = view.depth * (ray_lengths(view.camera.rays()) if view.depth_kind == "z" else 1)
+    return view.keep(ranges < OBJECT_M)
 
 
 def _noisy(view: RangeFrame, sigma: float, rng: np.random.Generator) -> RangeFrame:

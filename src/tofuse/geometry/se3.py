@@ -191,6 +191,19 @@ def transform(T: ArrayLike, points: ArrayLike) -> Array:
     return np.asarray(points) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
+def about(centre: ArrayLike, T: ArrayLike) -> Array:
+    """Return the motions (..., 4, 4) that move things about a centre (3,) as T does the origin."""
+    to, back = np.eye(4), np.eye(4)
+    to[:3, 3], back[:3, 3] = centre, -np.asarray(centre, float)
+    return np.asarray(to @ np.asarray(T, float) @ back)
+
+
+def point_jacobian(points: ArrayLike) -> Array:
+    """Return the derivatives (..., 3, 6) of ``exp(xi) p`` at zero, ``[I, -hat(p)]``."""
+    p = np.asarray(points, float)
+    return np.concatenate([np.broadcast_to(np.eye(3), (*p.shape, 3)), -hat(p)], axis=-1)
+
+
 def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: ArrayLike) -> Array:
     """Motion from T_a (share 0) to T_b (share 1) at constant body velocity (a screw)."""
     T_a = np.asarray(T_a, float)

@@ -25,17 +25,7 @@ class Bergevin(Relaxing):
     out from the same poses and applied together, so that no order of the views is preferred and
     the error is spread over all of them, not heaped up at the end of a chain. Chen and Medioni's
     distance to the tangent plane, small angles.
-
-    Attributes
-    ----------
-    points, reach, rounds, views
-        See `Relaxing`.
     """
-
-    points: int = 2000
-    reach: float = 5.0
-    rounds: int = 60
-    views: int = 60
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
         """See `Relaxing.relax`."""
@@ -55,8 +45,6 @@ class Bergevin(Relaxing):
         out = poses.copy()
         for k in range(1, n):
             if H[k].any():
-                to, back = np.eye(4), np.eye(4)
-                to[:3, 3], back[:3, 3] = middle[k], -middle[k]
                 step = -np.linalg.lstsq(H[k], g[k], rcond=_RANK)[0]
-                out[k] = to @ se3.exp(step) @ back @ poses[k]
+                out[k] = se3.about(middle[k], se3.exp(step)) @ poses[k]
         return out

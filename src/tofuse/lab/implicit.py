@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.kernels.cloud_sums import plane_sums
-from tofuse.lab.neighbourhoods import neighbourhood
+from tofuse.lab.neighbourhoods import neighbourhood, with_normals
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Float64, Matches
 from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
@@ -42,8 +42,7 @@ class Implicit(SurfaceMetric):
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = surface_pairs(matches, alignment)
-        known = np.isfinite(alignment.target.normals[matches.target]).all(1)
-        kept = matches.keep(known & (matches.weights() > 0))
+        kept = with_normals(matches, alignment)
         distance = self.distance(alignment.moved[kept.source], alignment)
         n = pairs.target_normals
         weight = np.where(np.isfinite(distance), pairs.weight, 0.0)

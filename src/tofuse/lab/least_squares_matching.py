@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.interfaces import Float64, Int64, Points
-from tofuse.registration.selectors import All, Random
+from tofuse.registration.selectors import All, at_most
 
 _FEWEST = 8
 # Triangles whose sides are longer than so many resolutions bridge a gap.
@@ -119,8 +119,7 @@ class LeastSquaresMatching(Registrar):
         RegistrationError
             If fewer than eight points have a foot on the target's surface.
         """
-        selector = All() if self.points is None else Random(self.points)
-        data = Points.of(source, selector.select(source, rng))
+        data = Points.of(source, at_most(self.points).select(source, rng))
         model = Points.of(target, All().select(target, rng))
         light = (data.amplitude, model.amplitude) if self.light else None
         middle = data.points.mean(0)
@@ -142,7 +141,7 @@ class LeastSquaresMatching(Registrar):
             step = np.zeros(7)
             free = 7 if self.scale_sigma else 6
             step[:free] = np.linalg.lstsq(N[:free, :free], g[:free], rcond=1e-12)[0]
-            T = se3.orthonormalise(_about(centre, step[:6]) @ T)
+            T = se3.orthonormalise(se3.about(centre, se3.exp(step[:6])) @ T)
             scale *= 1 + step[6]
             errors.append(float(np.abs(feet.distance).sum()) / (len(data) * self.resolution))
             converged = bool(np.abs(step * units).max() < _AT_REST * self.resolution)
@@ -236,13 +235,6 @@ class LeastSquaresMatching(Registrar):
                 np.cross(E2, n) * (B - A)[:, None] + np.cross(n, E1) * (C - A)[:, None]
             ) / twice
         return _Feet(point[row], d, n, value, gradient)
-
-
-def _about(centre: Float64, xi: Float64) -> Float64:
-    """The motion (4, 4) by xi (6,) about a centre (3,)."""
-    to, back = np.eye(4), np.eye(4)
-    to[:3, 3], back[:3, 3] = centre, -centre
-    return np.asarray(to @ se3.exp(xi) @ back)
 
 
 def _in_source(N: Float64, T_target_source: Float64, middle: Float64) -> Float64:

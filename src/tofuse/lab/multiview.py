@@ -6,9 +6,10 @@ methods differ in: each is a `Relaxing`, in a file of its own.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.outside import Told
+from tofuse.posegraph.planes import KeptPoints
 from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
@@ -83,7 +85,8 @@ class Pairs:
     n_j: Float64
 
 
-class Relaxing(Refining, Protocol):
+@dataclass(frozen=True)
+class Relaxing(Refining):
     """A refinement that moves all views by corresponding points.
 
     Attributes
@@ -98,28 +101,17 @@ class Relaxing(Refining, Protocol):
         That take part, at most, spaced by the motion of the camera; the others follow them.
     """
 
-    part_kind: ClassVar[str] = "refinement"
+    points: int = 2000
+    reach: float = 5.0
+    rounds: int = 60
+    views: int = 60
 
-    @property
-    def points(self) -> int:
-        """See above."""
-        ...
+    def __post_init__(self) -> None:
+        for name in ("points", "reach", "rounds", "views"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
 
-    @property
-    def reach(self) -> float:
-        """See above."""
-        ...
-
-    @property
-    def rounds(self) -> int:
-        """See above."""
-        ...
-
-    @property
-    def views(self) -> int:
-        """See above."""
-        ...
-
+    @abstractmethod
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
         """Return the poses (N, 4, 4) T_world_view that the pairs ask for; the first stays."""
         ...
@@ -129,37 +121,26 @@ class Relaxing(Refining, Protocol):
         return _Relaxation(self)
 
 
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    index: int
-    depth: float
-    view: CloudFrame
-
-
 class _Relaxation(Refiner):
     points: ClassVar[bool] = True
 
     def __init__(self, method: Relaxing) -> None:
         self._method = method
-        self._store: ViewStore[_Kept] = ViewStore(Spacing(most=method.views, loosest=1e6))
+        self._store: ViewStore[KeptPoints] = ViewStore(Spacing(most=method.views, loosest=1e6))
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        stride = max(1, -(-len(view) // self._method.points))
-        points = view.points[::stride]
-        depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-        kept = CloudFrame(view.index, view.timestamp, points, origin=np.asarray(view.origin))
-        self._store.push(_Kept(view.index, depth, kept), T_component_camera)
+        self._store.push(KeptPoints.of(view, self._method.points), T_component_camera)
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`; kept unless the views' points are less near than before."""
         row = {int(index): k for k, index in enumerate(ids)}
         kept = [posed.view for posed in self._store.of(row)]
-        kept = [k for k in kept if len(k.view) >= _FEWEST]
+        kept = [k for k in kept if len(k.points) >= _FEWEST]
         if len(kept) < 2:
             return Refinement(poses, views=len(kept))
         at = np.array([row[k.index] for k in kept], np.intp)
-        clouds = [Cloud.of(k.view) for k in kept]
+        clouds = [Cloud.of(CloudFrame.of(k.points, index=k.index)) for k in kept]
         after = relaxed(self._method, clouds, poses[at])
         reach = self._method.reach * resolution_of(clouds)
         pairs, again = (paired(clouds, some, reach) for some in (poses[at], after))

@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.interfaces import Float64, Int64, Points
-from tofuse.registration.selectors import All, Random
+from tofuse.registration.selectors import at_most
 
 # Points that a cell needs, and the smallest variance of it, relative to the largest.
 _FEWEST, _FLATTEST = 6, 1e-3
@@ -90,15 +90,14 @@ class Ndt(Registrar):
         RegistrationError
             If no point of the source lies in a cell of the target's.
         """
-        selector = All() if self.points is None else Random(self.points)
-        data = Points.of(source, selector.select(source, rng)).points
+        data = Points.of(source, at_most(self.points).select(source, rng)).points
         model = target.points.astype(np.float64)
-        T, size, levels = se3.orthonormalise(guess), self.coarsest * self.resolution, 0
+        T, size = se3.orthonormalise(guess), self.coarsest * self.resolution
         iterations = 0
         while True:
             cells = _cells(model, size)
             T, count, converged = self._level(data, cells, T)
-            iterations, levels = iterations + count, levels + 1
+            iterations += count
             if size <= self.finest * self.resolution:
                 break
             size = max(size / 2, self.finest * self.resolution)
@@ -123,8 +122,8 @@ class Ndt(Registrar):
 
     def _level(self, data: Float64, cells: _Cells, T: Float64) -> tuple[Float64, int, bool]:
         middle = data.mean(0)
-        to, back = np.eye(4), np.eye(4)
-        to[:3, 3], back[:3, 3] = middle, -middle
+        to = np.eye(4)
+        to[:3, 3] = middle
         arm = data - middle
         size = max(float(np.sqrt((arm**2).sum(1).mean())), self.resolution)
         units = np.array([1, 1, 1, 1 / size, 1 / size, 1 / size])
@@ -139,7 +138,7 @@ class Ndt(Registrar):
             # Farther than a cell the quadratic says nothing.
             step *= min(1.0, cells.size / max(length, 1e-300))
             for _ in range(_HALVINGS):
-                moved = se3.orthonormalise(T @ to @ se3.exp(step) @ back)
+                moved = se3.orthonormalise(T @ se3.about(middle, se3.exp(step)))
                 found = _score(arm, cells, moved @ to)
                 if found[0] < value:
                     break
@@ -203,8 +202,4 @@ def _score(p: Float64, cells: _Cells, T: Float64) -> tuple[float, Float64, Float
 
 def _jacobian(p: Float64, T: Float64) -> Float64:
     """Derivative (n, 3, 6) of T exp(xi) p at zero."""
-    hat = np.zeros((len(p), 3, 3))
-    hat[:, 0, 1], hat[:, 0, 2], hat[:, 1, 2] = -p[:, 2], p[:, 1], -p[:, 0]
-    hat -= np.swapaxes(hat, 1, 2)
-    R = T[:3, :3]
-    return np.concatenate([np.broadcast_to(R, (len(p), 3, 3)), -R @ hat], axis=2)
+    return np.asarray(T[:3, :3] @ se3.point_jacobian(p))

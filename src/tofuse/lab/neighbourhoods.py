@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.kernels.kdtree import KdTree
-from tofuse.registration.interfaces import Points
+from tofuse.registration.interfaces import Alignment, Matches, Points
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -104,3 +104,9 @@ def neighbourhood(points: Points) -> Neighbourhood:
     if points not in _known:
         _known[points] = Neighbourhood(points)
     return _known[points]
+
+
+def with_normals(matches: Matches, alignment: Alignment) -> Matches:
+    """Return the matches of which `surface_pairs` makes pairs: those with a normal that count."""
+    known = np.isfinite(alignment.target.normals[matches.target]).all(1)
+    return matches.keep(known & (matches.weights() > 0))

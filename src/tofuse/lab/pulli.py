@@ -44,16 +44,13 @@ class Pulli(Relaxing):
 
     Attributes
     ----------
-    points, reach, rounds, views
-        See `Relaxing`. One round: the pairs are what was registered.
+    rounds
+        One: the pairs are what was registered.
     tolerance
         Motion of a view that its neighbours hear of, in resolutions.
     """
 
-    points: int = 2000
-    reach: float = 5.0
     rounds: int = 1
-    views: int = 60
     tolerance: float = 1e-3
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:

@@ -7,20 +7,16 @@ from functools import cache
 
 import numpy as np
 
-from tofuse.kernels.cloud_sums import plane_sums
 from tofuse.kernels.icp import transform_points
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
 from tofuse.registration.metrics import PointToPoint
-from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs, variance_of
-from tofuse.registration.surface_metrics import SurfaceMetric
+from tofuse.registration.pairs import in_scales
+from tofuse.registration.surface_metrics import TangentPlanes
 
 # Each round makes the surrogate less convex by this factor (Yang et al. 2020, remark 5).
 _FACTOR = 1.4
 _ROUNDS = 100
-# Standard deviations from the median absolute residual.
-_MAD = 1.4826
-_SMALLEST_SIGMA = 1e-3
 # Where the general loss is cut off to have a distribution (Chebrolu et al. 2021), in scales.
 _CUT = 10.0
 
@@ -88,7 +84,7 @@ class Graduated(Metric):
 
 @part("metric", "adaptive", label="validated")
 @dataclass(frozen=True)
-class Adaptive(SurfaceMetric):
+class Adaptive(TangentPlanes):
     """Point-to-plane with a loss that takes its shape from the residuals.
 
     The general loss of Barron (2019), ::
@@ -98,29 +94,11 @@ class Adaptive(SurfaceMetric):
     is that of least squares for a = 2, Cauchy for 0, Geman-McClure for -2, Welsch for minus
     infinity. Of its shapes the one is taken under which the residuals are most probable, with the
     distribution cut off at ten scales so that shapes below zero have one (Chebrolu et al. 2021).
-    The scale is 1.4826 times the median absolute residual.
     """
 
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
-        """See `Metric.motion`."""
-        pairs = surface_pairs(matches, alignment)
-        n = pairs.target_normals
-        r = (pairs.residual * n).sum(1)
-        H, g, _ = plane_sums(pairs.points, n, n, r, pairs.weight * self._weights(r, pairs))
-        return pairs.motion(solve(H, g, pairs.size))
-
-    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
-        """See `SurfaceMetric.fit`."""
-        n = pairs.target_normals
-        r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * self._weights(r, pairs)
-        H, _, square = plane_sums(pairs.points, n, n, r, weight)
-        variance = variance_of(square, weight, pairs.resolution)
-        return H / variance, variance
-
-    def _weights(self, residual: Float64, pairs: SurfacePairs) -> Float64:
-        size = np.abs(residual)
-        x = size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * pairs.resolution)
+    def weights(self, residual: Float64, resolution: float) -> Float64:
+        """See `TangentPlanes.weights`."""
+        x = in_scales(residual, resolution)
         a = shape_of(x)
         return np.asarray((x * x / abs(a - 2) + 1) ** (a / 2 - 1)) if a < 2 else np.ones(len(x))
 

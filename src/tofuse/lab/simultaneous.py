@@ -32,16 +32,10 @@ class WilliamsBennamoun(Relaxing):
 
     Attributes
     ----------
-    points, reach, rounds, views
-        See `Relaxing`.
     sweeps
         Over all rotations, in each round.
     """
 
-    points: int = 2000
-    reach: float = 5.0
-    rounds: int = 60
-    views: int = 60
     sweeps: int = 20
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
@@ -105,17 +99,7 @@ class SmallAngles(Relaxing):
     the poses put them, is quadratic in the motions (v, w) of all views, which are solved for
     together; the pairs are then taken anew. It is one Gauss-Newton step of eq 2.8, the objective
     of GraphSLAM (Thrun and Montemerlo 2005).
-
-    Attributes
-    ----------
-    points, reach, rounds, views
-        See `Relaxing`.
     """
-
-    points: int = 2000
-    reach: float = 5.0
-    rounds: int = 60
-    views: int = 60
 
     def relax(self, poses: Float64, pairs: Sequence[Pairs], clouds: Sequence[Cloud]) -> Float64:
         """See `Relaxing.relax`."""
@@ -127,7 +111,7 @@ class SmallAngles(Relaxing):
         for p in pairs:
             a = transform_points(poses[p.i], p.p_i) - middle
             b = transform_points(poses[p.j], p.p_j) - middle
-            A, B, r = _moving(a), _moving(b), a - b
+            A, B, r = se3.point_jacobian(a), se3.point_jacobian(b), a - b
             H[p.i, :, p.i] += np.einsum("nki,nkj->ij", A, A)
             H[p.j, :, p.j] += np.einsum("nki,nkj->ij", B, B)
             mixed = np.einsum("nki,nkj->ij", A, B)
@@ -137,16 +121,4 @@ class SmallAngles(Relaxing):
             g[p.j] -= np.einsum("nki,nk->i", B, r)
         H[0, :, 0] += _FIXED * np.eye(6) * max(float(np.abs(H).max()), 1.0)
         step = -np.linalg.lstsq(H.reshape(6 * n, 6 * n), g.ravel(), rcond=1e-14)[0].reshape(n, 6)
-        to, back = np.eye(4), np.eye(4)
-        to[:3, 3], back[:3, 3] = middle, -middle
-        return np.asarray(to @ se3.exp(step) @ back @ poses)
-
-
-def _moving(x: Float64) -> Float64:
-    """Derivative (n, 3, 6) of x + v + w x x."""
-    out = np.zeros((len(x), 3, 6))
-    out[:, :, :3] = np.eye(3)
-    out[:, 0, 4], out[:, 0, 5] = x[:, 2], -x[:, 1]
-    out[:, 1, 3], out[:, 1, 5] = -x[:, 2], x[:, 0]
-    out[:, 2, 3], out[:, 2, 4] = x[:, 1], -x[:, 0]
-    return out
+        return np.asarray(se3.about(middle, se3.exp(step)) @ poses)

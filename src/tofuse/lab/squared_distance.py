@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.kernels.cloud_sums import matrix_sums
-from tofuse.lab.neighbourhoods import neighbourhood
+from tofuse.lab.neighbourhoods import neighbourhood, with_normals
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Float64, Matches
 from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
@@ -35,7 +35,7 @@ class SquaredDistance(SurfaceMetric):
     def motion(self, matches: Matches, alignment: Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = surface_pairs(matches, alignment)
-        kept = _finite(matches, alignment)
+        kept = with_normals(matches, alignment)
         W = approximant(kept, alignment)
         turn = alignment.T_target_source[:3, :3]
         H, g, _ = matrix_sums(
@@ -48,12 +48,6 @@ class SquaredDistance(SurfaceMetric):
     def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: at the end the sum is that of point-to-plane."""
         return PointToPlane().fit(pairs)
-
-
-def _finite(matches: Matches, alignment: Alignment) -> Matches:
-    """The matches of which `surface_pairs` makes pairs."""
-    known = np.isfinite(alignment.target.normals[matches.target]).all(1)
-    return matches.keep(known & (matches.weights() > 0))
 
 
 def approximant(matches: Matches, alignment: Alignment) -> Float64:

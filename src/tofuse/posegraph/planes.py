@@ -65,25 +65,29 @@ class Planes(Refining):
 
 
 @dataclass(frozen=True, eq=False)
-class _Kept:
-    """What is kept of a view."""
+class KeptPoints:
+    """What is kept of a view: some (n, 3) of its points in its frame, and their median range, m."""
 
     index: int
     depth: float
     points: Float64
 
+    @classmethod
+    def of(cls, view: Frame, most: int) -> KeptPoints:
+        """Keep at most so many points, at an even stride."""
+        points = view.points[:: max(1, -(-len(view) // most))].astype(np.float64)
+        depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+        return cls(view.index, depth, points)
+
 
 class _Planes(Refiner):
     def __init__(self, options: Planes) -> None:
         self._options = options
-        self._store: ViewStore[_Kept] = ViewStore(options.spacing)
+        self._store: ViewStore[KeptPoints] = ViewStore(options.spacing)
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        stride = max(1, -(-len(view) // self._options.points))
-        points = view.points[::stride].astype(np.float64)
-        depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-        self._store.push(_Kept(view.index, depth, points), T_component_camera)
+        self._store.push(KeptPoints.of(view, self._options.points), T_component_camera)
 
     def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
         """See `Refiner.finish`."""

@@ -46,11 +46,11 @@ class Hold:
         return self._project(T, along=False)
 
     def _project(self, T: Float64, *, along: bool) -> Float64:
-        to, back = np.eye(4), np.eye(4)
-        to[:3, 3], back[:3, 3] = self.centre, -self.centre
+        back = np.eye(4)
+        back[:3, 3] = -self.centre
         scale = np.array([1, 1, 1, self.size, self.size, self.size])
         held = (self.directions @ se3.adjoint(back).T) * scale
         basis = np.linalg.svd(held, full_matrices=False)[2]
-        xi = se3.log(back @ T @ to) * scale
+        xi = se3.log(se3.about(-self.centre, T)) * scale
         part = sum((b * float((b * xi).sum()) for b in basis), np.zeros(6))
-        return to @ se3.exp((part if along else xi - part) / scale) @ back
+        return se3.about(self.centre, se3.exp((part if along else xi - part) / scale))

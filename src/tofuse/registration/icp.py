@@ -28,7 +28,7 @@ from tofuse.registration.interfaces import (
 from tofuse.registration.matchers import ClosestPoint
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.rejectors import MaxDistance, Unique
-from tofuse.registration.selectors import All, Random
+from tofuse.registration.selectors import Random, at_most
 from tofuse.registration.shape import NEIGHBOURS
 from tofuse.registration.stopping import TwoLoops
 
@@ -186,7 +186,7 @@ def algorithm_1(
     max_iterations
         Of both loops together.
     """
-    selector: Selector = All() if points is None else Random(points)
+    selector = at_most(points)
     return Icp(
         resolution,
         source=selector,

@@ -152,16 +152,20 @@ def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
     return 2 / (1 + count[matches.target])
 
 
-def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
-    """Weights (m,), 0 to 1, of a robust loss for residuals (m,) in m.
+def in_scales(residual: Float64, resolution: float) -> Float64:
+    """Return sizes (m,) of residuals in m by their scale.
 
-    Their scale is 1.4826 times the median of the absolute residuals, and a thousandth of the
-    resolution at least.
+    That is 1.4826 times the median of the sizes, and a thousandth of the resolution at least.
     """
+    size = np.abs(residual)
+    return np.asarray(size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * resolution))
+
+
+def loss_weights(loss: Loss, residual: Float64, resolution: float) -> Float64:
+    """Weights (m,), 0 to 1, of a robust loss for residuals (m,) in m; see `in_scales`."""
     if loss == "square":
         return np.ones(len(residual))
-    size = np.abs(residual)
-    x = size / max(_MAD * float(np.median(size)), _SMALLEST_SIGMA * resolution)
+    x = in_scales(residual, resolution)
     if loss == "huber":
         return np.minimum(1.0, _HUBER / np.maximum(x, _HUBER))
     if loss == "cauchy":

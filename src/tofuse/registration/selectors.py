@@ -50,6 +50,11 @@ class Random(Selector):
         return np.sort(drawn.astype(np.int64))
 
 
+def at_most(points: int | None) -> Selector:
+    """Return what chooses so many random points, or all for None."""
+    return All() if points is None else Random(points)
+
+
 @part("selector", "random-each-iteration", label="validated")
 @dataclass(frozen=True)
 class RandomEachIteration(Random):

@@ -65,12 +65,43 @@ def _measurements(matches: Matches, alignment: Alignment) -> SurfacePairs:
     return surface_pairs(replace(matches, weight=weight), alignment, source=True)
 
 
+class TangentPlanes(SurfaceMetric, Protocol):
+    """Squared distances to the target's tangent planes, with weights of a metric's own.
+
+    One Gauss-Newton step on SE(3) is made for each matching.
+    """
+
+    def weights(self, residual: Float64, resolution: float) -> Float64:
+        """Return how much residuals (m,) in m count."""
+        ...
+
+    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
+        """See `Metric.motion`; no motion along directions that no plane holds."""
+        pairs = surface_pairs(matches, alignment)
+        r, weight = self._weigh(pairs)
+        n = pairs.target_normals
+        H, g, _ = plane_sums(pairs.points, n, n, r, weight)
+        return pairs.motion(solve(H, g, pairs.size))
+
+    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
+        """See `SurfaceMetric.fit`."""
+        n = pairs.target_normals
+        r, weight = self._weigh(pairs)
+        H, _, square = plane_sums(pairs.points, n, n, r, weight)
+        variance = variance_of(square, weight, pairs.resolution)
+        return H / variance, variance
+
+    def _weigh(self, pairs: SurfacePairs) -> tuple[Float64, Float64]:
+        r: Float64 = (pairs.residual * pairs.target_normals).sum(1)
+        return r, pairs.weight * self.weights(r, pairs.resolution)
+
+
 @part("metric", "point-to-plane", label="validated")
 @dataclass(frozen=True)
-class PointToPlane(SurfaceMetric):
+class PointToPlane(TangentPlanes):
     """Distances from the source's points to the target's tangent planes (Chen and Medioni 1992).
 
-    ``sum w_i ((T d_i - m_i) . n_i)^2``, with one Gauss-Newton step on SE(3) for each matching.
+    ``sum w_i ((T d_i - m_i) . n_i)^2``, see `TangentPlanes`.
 
     Attributes
     ----------
@@ -80,25 +111,9 @@ class PointToPlane(SurfaceMetric):
 
     loss: Loss = "square"
 
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
-        """See `Metric.motion`; no motion along directions that no plane holds."""
-        pairs = surface_pairs(matches, alignment)
-        r, weight = self._weigh(pairs, pairs.target_normals)
-        n = pairs.target_normals
-        H, g, _ = plane_sums(pairs.points, n, n, r, weight)
-        return pairs.motion(solve(H, g, pairs.size))
-
-    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
-        """See `SurfaceMetric.fit`."""
-        n = pairs.target_normals
-        r, weight = self._weigh(pairs, n)
-        H, _, square = plane_sums(pairs.points, n, n, r, weight)
-        variance = variance_of(square, weight, pairs.resolution)
-        return H / variance, variance
-
-    def _weigh(self, pairs: SurfacePairs, n: Float64) -> tuple[Float64, Float64]:
-        r: Float64 = (pairs.residual * n).sum(1)
-        return r, pairs.weight * loss_weights(self.loss, r, pairs.resolution)
+    def weights(self, residual: Float64, resolution: float) -> Float64:
+        """See `TangentPlanes.weights`."""
+        return loss_weights(self.loss, residual, resolution)
 
 
 @part("metric", "symmetric", label="validated")

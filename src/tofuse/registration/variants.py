@@ -13,11 +13,11 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import InTurn
 from tofuse.registration.icp import Icp
-from tofuse.registration.interfaces import Float64, Metric, Selector
+from tofuse.registration.interfaces import Float64, Metric
 from tofuse.registration.matchers import ClosestCompatible, ClosestInvariant, Invariant
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.rejectors import MaxDistance, Trimmed, Unique
-from tofuse.registration.selectors import All, Random
+from tofuse.registration.selectors import All, at_most
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PlaneToPlane, PointToPlane, Symmetric
 
@@ -43,16 +43,12 @@ class Variant(Registrar, Protocol):
         return self.parts().register(source, target, guess, rng)
 
 
-def _random(points: int | None) -> Selector:
-    return All() if points is None else Random(points)
-
-
 def _surface_icp(
     resolution: float, points: int | None, reach: float, max_iterations: int, metric: Metric
 ) -> Icp:
     return Icp(
         resolution,
-        source=_random(points),
+        source=at_most(points),
         target=All(),
         rejectors=(MaxDistance(reach),),
         metric=metric,
@@ -190,7 +186,7 @@ class Tricp(Registrar):
         """Return the trimmed ICP for one overlap."""
         return Icp(
             self.resolution,
-            source=_random(self.points),
+            source=at_most(self.points),
             target=All(),
             rejectors=(Trimmed(overlap),),
             metric=PointToPoint(),
@@ -261,7 +257,7 @@ class Iccp(Variant):
         """See `Variant.parts`."""
         return Icp(
             self.resolution,
-            source=_random(self.points),
+            source=at_most(self.points),
             target=All(),
             matcher=ClosestCompatible(self.ratio),
             rejectors=(MaxDistance(self.reach),),
@@ -304,7 +300,7 @@ class Icpif(Variant):
         """See `Variant.parts`."""
         plain = Icp(
             self.resolution,
-            source=_random(self.points),
+            source=at_most(self.points),
             target=All(),
             rejectors=(MaxDistance(self.reach),),
             metric=PointToPoint(),
