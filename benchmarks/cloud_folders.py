@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Float32, Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -28,8 +29,6 @@ import tofuse
 from sequences import DATA
 from tofuse.files.ply import write_ply
 
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 # Poses (4, 4) in one frame, and points (n, 3) of each view.
 Views = Iterator[tuple[Float64, Float32]]
 

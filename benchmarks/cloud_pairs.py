@@ -25,7 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Float32, Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -42,9 +43,6 @@ from tofuse.registration.cloud_pair import follow_clouds, register_clouds
 from tofuse.registration.confidence import CloudEvidence
 from tofuse.registration.viewpoint import viewpoint_of
 from tofuse.simulation import scene as scenes
-
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 POINTS = 20_000
 RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.1, 0.05, 4.0

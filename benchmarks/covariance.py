@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.filters.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
@@ -37,8 +37,6 @@ from tofuse.simulation import sensor
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
 from tofuse.simulation.scene import build
-
-Float64 = NDArray[np.float64]
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
 PAIRS = ((0, 1), (1, 2), (0, 2))

@@ -25,9 +25,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from covariance import KINDS
+from tofuse.arrays import Bool, Float64
 from tofuse.filters.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
@@ -41,8 +41,6 @@ from tofuse.simulation import sensor
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
 from tofuse.simulation.scene import Scene, build
-
-Float64 = NDArray[np.float64]
 
 SUBPIXELS = 3
 AWAY = 3.0  # in units of 1 cm and 1 degree
@@ -146,7 +144,7 @@ def comes_back(
     return True
 
 
-def roc_area(score: Float64, positive: NDArray[np.bool_]) -> float:
+def roc_area(score: Float64, positive: Bool) -> float:
     """Share of pairs of a positive and a negative that the score ranks rightly."""
     ranks = np.argsort(np.argsort(score)) + 1.0
     n, m = positive.sum(), (~positive).sum()

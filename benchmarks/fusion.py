@@ -36,8 +36,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.evaluation.surface import Shape, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
@@ -59,8 +59,6 @@ from tofuse.recordings.native import corrected_depth
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import Plan, plan
 
-Float64 = NDArray[np.float64]
-
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
 _NOISE_SHARE = 0.01  # of the range
 _ELSEWHERE = np.repeat([0.05, 0.03], 3)  # m and radians off the path
@@ -79,7 +77,7 @@ def simulated(every: int, everything: bool) -> tuple[Plan, list[RangeFrame]]:
     return made, frames
 
 
-def seen_by(made: Plan, masks: list[NDArray[np.bool_]], frames: list[RangeFrame]) -> Float64:
+def seen_by(made: Plan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:
     """True points (N, 3) behind the pixels of the masks, one in each voxel."""
     seen = []
     rate = made.sequence.frame_rate_hz
@@ -104,7 +102,7 @@ def method(everything: bool) -> Config:
 
 def views_of(
     frames: list[RangeFrame], config: Config
-) -> tuple[list[RangeView], list[NDArray[np.bool_]], list[RangeFrame]]:
+) -> tuple[list[RangeView], list[Bool], list[RangeFrame]]:
     """What the method keeps of frames, which pixels its filters leave, and the corrected frames."""
     correctors = [correction.start() for correction in config.corrections]
     views, masks, corrected = [], [], []

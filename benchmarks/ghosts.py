@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 import sequences
+from tofuse.arrays import Bool, Float64
 from tofuse.evaluation.surface import Shape, distances
 from tofuse.evaluation.trajectory import align
 from tofuse.fusion.mesh import Mesh
@@ -44,9 +44,6 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import Plan, plan, write
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 OUT = sequences.OUT / "recordings" / "ghosts"
 WALKS = (

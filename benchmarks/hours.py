@@ -31,9 +31,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
@@ -48,9 +48,6 @@ from tofuse.simulation.scene import Scene
 from tofuse.simulation.scenes import furniture, household
 from tofuse.simulation.scenes.assembly import Assembly, placed
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96

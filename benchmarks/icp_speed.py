@@ -19,8 +19,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.filters.base import apply_filters
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
@@ -28,8 +28,6 @@ from tofuse.pipeline.methods import thesis
 from tofuse.recordings.frames import Frame
 from tofuse.registration.icp import algorithm_1
 from tofuse.registration.selectors import Random
-
-Float64 = NDArray[np.float64]
 
 POINTS = 1000
 RESOLUTION_M = 0.01

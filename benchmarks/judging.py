@@ -21,21 +21,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 import sequences
 import verdict
 from pairs import roc_area
 from robustness import OURS, agreement, ours, peer, peer_methods
+from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.pipeline.judging import judge
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-
-Float64 = NDArray[np.float64]
 
 NOISE_M, NOISE_RAD = 1e-3, np.radians(0.02)
 DRIFT, SCALE, LATE_S = 0.01, 1.01, 0.03

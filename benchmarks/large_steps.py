@@ -22,7 +22,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -38,8 +39,6 @@ from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.plane_sets import PlaneSets
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.view_pair import register_pair
-
-Float64 = NDArray[np.float64]
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 RIGHT_M, RIGHT_DEG = 0.15, 4.0

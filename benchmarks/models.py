@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.experiments import measures
 from tofuse.experiments.cases import CHEST
@@ -29,8 +29,6 @@ from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 from tofuse.simulation.record import plan, simulate_recording
 from tofuse.simulation.scenes import box
-
-Float64 = NDArray[np.float64]
 
 CASES = {
     "rail": ("rail", {}),

@@ -28,8 +28,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.filters.multipath import Multipath, MultipathCorrector
 from tofuse.geometry.cameras import ray_lengths
@@ -56,8 +56,6 @@ FRAMES = 8
 GROSS = Flag.NO_RETURN | Flag.UNDER_EXPOSED | Flag.SATURATED | Flag.MIXED | Flag.WRAPPED
 GROSS |= Flag.SMEAR | Flag.MIRROR
 ONLY = Effects.none(multipath=True)
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass
@@ -110,7 +108,7 @@ def apply(corrector: MultipathCorrector, frame: RangeFrame, case: Case) -> Range
     return fixed
 
 
-def planes_of(depth: NDArray[np.float32], frame: RangeFrame) -> list[NDArray[np.bool_]]:
+def planes_of(depth: Float32, frame: RangeFrame) -> list[Bool]:
     """Masks of the flat surfaces in a noise-free image with at least 300 pixels.
 
     Pixels on one plane share the normal there, as its components tell.
@@ -124,10 +122,10 @@ def planes_of(depth: NDArray[np.float32], frame: RangeFrame) -> list[NDArray[np.
 
 
 def grouped(
-    normals: Float64, points: Float64, free: NDArray[np.bool_], alike: float, off_m: float
-) -> list[NDArray[np.bool_]]:
+    normals: Float64, points: Float64, free: Bool, alike: float, off_m: float
+) -> list[Bool]:
     """Take the largest planes one after another, seeded by a fixed grid of pixels."""
-    found: list[NDArray[np.bool_]] = []
+    found: list[Bool] = []
     free = free.copy()
     seeds = [(i, j) for i in range(6, free.shape[0], 12) for j in range(6, free.shape[1], 12)]
     while len(found) < 4:
@@ -157,7 +155,7 @@ def plane(points: Float64) -> tuple[Float64, Float64]:
     return normal, off
 
 
-def angles(frame: RangeFrame, surfaces: list[NDArray[np.bool_]]) -> Float64:
+def angles(frame: RangeFrame, surfaces: list[Bool]) -> Float64:
     """Angles in degrees between every two surfaces."""
     normals = [plane(frame.point_image[m & frame.valid].astype(float))[0] for m in surfaces]
     pairs = [abs(a @ b) for k, a in enumerate(normals) for b in normals[:k]]
@@ -211,7 +209,7 @@ def real(folder: Path) -> None:
     )
 
 
-def surfaces_of(frame: RangeFrame, trusted: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def surfaces_of(frame: RangeFrame, trusted: Bool) -> list[Bool]:
     """Masks of the large flat surfaces of a measured image."""
     points = frame.point_image.astype(float)
     span = 5

@@ -31,8 +31,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
+
+from tofuse.arrays import Float32, Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -48,8 +49,6 @@ from tofuse.simulation import scene as scenes
 from tofuse.simulation import sensor
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.render import render
-
-Float64 = NDArray[np.float64]
 
 OUT = Path(__file__).resolve().parent / "out" / "pair_covariance"
 POINTS = 20_000
@@ -191,9 +190,7 @@ def _views(
     return frames, np.asarray(sequence.T_world_camera(s, t))
 
 
-def _thinned(
-    points: NDArray[np.float32], rng: np.random.Generator, most: int = POINTS
-) -> NDArray[np.float32]:
+def _thinned(points: Float32, rng: np.random.Generator, most: int = POINTS) -> Float32:
     return points[np.sort(rng.permutation(len(points))[:most])]
 
 
@@ -201,8 +198,8 @@ def _cloud(
     family: str,
     kind: str,
     seed: int,
-    source: NDArray[np.float32],
-    target: NDArray[np.float32],
+    source: Float32,
+    target: Float32,
     true: Float64,
     _rng: np.random.Generator | None = None,
 ) -> Case:
@@ -214,8 +211,8 @@ def _moved(
     family: str,
     kind: str,
     seed: int,
-    source: NDArray[np.float32],
-    target: NDArray[np.float32],
+    source: Float32,
+    target: Float32,
     true: Float64,
     rng: np.random.Generator,
 ) -> Case:

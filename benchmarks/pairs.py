@@ -30,7 +30,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Bool, Float64, Intp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -50,9 +51,6 @@ from tofuse.registration.cloud_pair import register_clouds
 from tofuse.registration.confidence import BELIEVED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.simulation.record import simulate
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
 # Shrinks coefficients a little, so that few pairs that are told apart exactly make no certainty.
@@ -367,7 +365,7 @@ class Samples:
 
     x: Float64
     right: Bool
-    scene: NDArray[np.intp]
+    scene: Intp
 
 
 def samples(most: int, data: Path) -> tuple[Samples, Samples]:

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import quaternion, se3
 from tofuse.posegraph.castellani import Castellani
@@ -33,8 +33,6 @@ from tofuse.posegraph.g2o import read_g2o, write_g2o
 from tofuse.posegraph.graph import Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.lu_milios import LuMilios
-
-Float64 = NDArray[np.float64]
 
 SHARE = 0.3  # of all loops that are false
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, UInt8
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
@@ -24,8 +24,6 @@ from tofuse.geometry import se3
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.results.output import read_run_json
-
-Float64 = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURE = ROOT / "docs" / "images" / "room.png"
@@ -65,15 +63,13 @@ def from_above() -> Float64:
     return tilt @ turn
 
 
-def canvas(size: tuple[int, int]) -> NDArray[np.uint8]:
+def canvas(size: tuple[int, int]) -> UInt8:
     image = np.empty((size[1], size[0], 3), np.uint8)
     image[:] = BACKGROUND_BGR
     return image
 
 
-def draw_cloud(
-    points: Float64, color: NDArray[np.uint8], size: tuple[int, int]
-) -> tuple[NDArray[np.uint8], Float64]:
+def draw_cloud(points: Float64, color: UInt8, size: tuple[int, int]) -> tuple[UInt8, Float64]:
     """Draw points seen from far away; returns the image (BGR) and the world point in its centre."""
     R = from_above()
     low, high = np.percentile(points, [1, 99], axis=0)
@@ -90,13 +86,13 @@ def draw_cloud(
     return image, centre
 
 
-def draw_path(image: NDArray[np.uint8], poses: Float64, centre: Float64) -> None:
+def draw_path(image: UInt8, poses: Float64, centre: Float64) -> None:
     seen = (poses[:, :3, 3] - centre) @ from_above().T / PIXEL_M
     line = np.round((seen[:, :2] + np.array(image.shape[1::-1]) / 2) * 16).astype(np.int32)
     cv2.polylines(image, [line], False, PATH_BGR, 2, cv2.LINE_AA, shift=4)
 
 
-def draw_frame(frame: RangeFrame, width: int) -> NDArray[np.uint8]:
+def draw_frame(frame: RangeFrame, width: int) -> UInt8:
     """Draw the amplitude, and below it the depth in false colours (near is bright)."""
     height = round(width * frame.camera.height / frame.camera.width)
     grey = np.zeros(frame.depth.shape, np.uint8)
@@ -113,7 +109,7 @@ def draw_frame(frame: RangeFrame, width: int) -> NDArray[np.uint8]:
     )
 
 
-def picture(folder: Path) -> NDArray[np.uint8]:
+def picture(folder: Path) -> UInt8:
     cloud = read_ply(folder / "cloud.ply")
     points = cloud.points.astype(float)
     keep = points[:, 1] > -CEILING_M

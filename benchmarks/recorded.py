@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scoring import Tolerance
 from sequences import kinect_loop
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-
-Float64 = NDArray[np.float64]
 
 # One for each way to read the reference; none where there is nothing to compare with.
 References = Callable[[Path, Recording], list[Float64]]

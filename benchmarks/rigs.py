@@ -19,9 +19,9 @@ import argparse
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera
@@ -34,8 +34,6 @@ from tofuse.simulation import scene as scenes
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.paths import rotation
 from tofuse.simulation.rig import Mount, around, relative, simulate_rig, wander
-
-Float64 = NDArray[np.float64]
 
 STILL = Effects(multipath=False, scatter=0.0, smear=False)
 MOVING = Effects(multipath=False, smear=False)

@@ -22,7 +22,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
 
 import scoring
 import sequences
@@ -30,14 +29,13 @@ import stress
 from peers import Method, kiss, o3d, sgicp
 from recorded import RECORDED, Recorded
 from scoring import Part, Score, Truth
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import map_consistency
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
-
-Float64 = NDArray[np.float64]
 
 OURS = "tofuse"
 TUNING_FRAMES = 40

@@ -30,6 +30,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.kernels.threads import run_chunks
@@ -38,8 +39,6 @@ from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
-
-Float64 = NDArray[np.float64]
 
 LENGTH = 60  # frames of the sequence that goes forth and back
 BANDWIDTH_BYTES = 1 << 28
@@ -74,7 +73,7 @@ def made_frames(columns: int, count: int) -> list[RangeFrame]:
     return frames
 
 
-def _room(origin: Float64, directions: Float64) -> tuple[Float64, NDArray[np.intp]]:
+def _room(origin: Float64, directions: Float64) -> tuple[Float64, Intp]:
     """z of what rays of unit z hit, from inside a box and from outside two more, and its axis."""
     with np.errstate(divide="ignore"):
         inverse = 1 / directions

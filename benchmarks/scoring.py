@@ -26,14 +26,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.evaluation.trajectory import mean_rotation
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 OFF_M, OFF_RAD = 0.05, np.radians(3.0)
 JOIN_M, JOIN_RAD = 0.20, np.radians(10.0)
@@ -270,7 +267,7 @@ def marks(part: Part, k: int, error: Float64, tolerance: Tolerance) -> set[str]:
     return found
 
 
-def sides(estimate: Float64, truth: Float64, tolerance: Tolerance) -> NDArray[np.intp]:
+def sides(estimate: Float64, truth: Float64, tolerance: Tolerance) -> Intp:
     """Label (N,) of the side that each pose is of."""
     metres, radians = relative_errors(estimate, truth)
     tied = (metres <= tolerance.off_m) & (radians <= tolerance.off_rad)
@@ -311,7 +308,7 @@ class Truth:
     """
 
     poses: Float64
-    groups: NDArray[np.intp]
+    groups: Intp
     tolerance: Tolerance = field(default_factory=Tolerance)
 
 

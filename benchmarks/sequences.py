@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import poses_of_frames
 from tofuse.files.trajectory import read_tum
@@ -27,8 +27,6 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.simulation.record import simulate
-
-Float64 = NDArray[np.float64]
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE / "out"

@@ -23,8 +23,8 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align, displacement
 from tofuse.geometry import se3
 from tofuse.pipeline.merging import MergeOptions, merge_files
@@ -36,8 +36,6 @@ from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import Plan, plan, write
 from tofuse.simulation.scenes import flat, furniture
 from tofuse.simulation.scenes.assembly import Assembly, placed
-
-Float64 = NDArray[np.float64]
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
 RUNS = Path(__file__).resolve().parent / "out" / "sessions"

@@ -18,16 +18,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import sequences
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.results.types import Reconstruction
 
-Float64 = NDArray[np.float64]
 Spoil = Callable[[RangeFrame], RangeFrame]
 
 FRAMES, FIRST = 16, 7
@@ -168,7 +167,7 @@ def errors(result: Reconstruction, poses: Sequence[Float64 | None]) -> Float64:
     return out
 
 
-def admitted(result: Reconstruction, off: Float64) -> NDArray[np.bool_]:
+def admitted(result: Reconstruction, off: Float64) -> Bool:
     """(N,) whether errors (N, 2), m and rad, are such as the frames themselves allow for."""
     out = np.array([len(frame.unobservable) > 0 for frame in result.diagnostics.frames])
     for k, frame in enumerate(result.diagnostics.frames):

@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from scoring import Truth
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.recordings.open import open_recording
@@ -30,9 +30,6 @@ from tofuse.simulation import scene as simulated
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.passing import Kind, Passing
 from tofuse.simulation.record import plan, write
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "robustness"
 
@@ -53,7 +50,7 @@ class Take:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def at(self, chosen: Sequence[int] | Integers) -> Take:
+    def at(self, chosen: Sequence[int] | Intp) -> Take:
         """Return some of the frames, in the order given."""
         return replace(self, frames=tuple(self.frames[k] for k in chosen), poses=self.poses[chosen])
 
@@ -222,7 +219,7 @@ class Case:
     truth: Truth
 
 
-def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = ()) -> Integers:
+def groups(frames: Sequence[RangeFrame], poses: Float64, blind: Sequence[int] = ()) -> Intp:
     """(N,) number of the group of frames that overlap; -1 for those that are blind or alone.
 
     Parameters

@@ -27,7 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Float64
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -42,8 +43,6 @@ from tofuse.kernels.threads import threads as using_threads
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.methods import default
 from tofuse.recordings.frames import RangeFrame
-
-Float64 = NDArray[np.float64]
 
 WARM_UP = 5
 CONSISTENCY_FRAMES = 60

@@ -23,11 +23,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import sequences
 from recorded import RECORDED
 from stress import farther
+from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import displacement
 from tofuse.pipeline.checks import tolerance_of
@@ -38,8 +38,6 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import simulate
-
-Float64 = NDArray[np.float64]
 
 OUT = sequences.OUT / "recordings" / "verdict"
 # Stride among the raw frames of each scene.

@@ -8,21 +8,21 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from made_ifm import head_info
+from tofuse.arrays import UInt16
 
 WIDTH, HEIGHT = 32, 24
 
 
-def depth_counts(k: int) -> NDArray[np.uint16]:
+def depth_counts(k: int) -> UInt16:
     """Depth of frame k: a slope, one invalid pixel, in counts."""
     counts = (1000 + 10 * np.arange(WIDTH) + k + np.zeros((HEIGHT, 1))).astype(np.uint16)
     counts[3, 4] = 0
     return counts
 
 
-def infrared_counts(k: int) -> NDArray[np.uint16]:
+def infrared_counts(k: int) -> UInt16:
     return (40 + k + np.arange(HEIGHT)[:, None] + np.zeros(WIDTH)).astype(np.uint16)
 
 
@@ -200,7 +200,7 @@ class FakeOrbbec(ModuleType):
             get_device=lambda: SimpleNamespace(get_device_info=lambda: info),
         )
 
-    def _frame(self, counts: NDArray[np.uint16], k: int) -> Any:
+    def _frame(self, counts: UInt16, k: int) -> Any:
         return SimpleNamespace(
             get_width=lambda: WIDTH,
             get_height=lambda: HEIGHT,

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 
-Float64 = NDArray[np.float64]
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]
 
 CAMERA = Pinhole(128, 96, 92.0, 92.0, 63.5, 47.5)

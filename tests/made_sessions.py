@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from made_rooms import BOXES, CAMERA, Box, at, seen
+from tofuse.arrays import Float64
 from tofuse.fusion.options import Fusion
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.reconstruct import reconstruct
@@ -20,8 +20,6 @@ from tofuse.recordings.opening import Opening
 from tofuse.registration.search import SearchOptions
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
-
-Float64 = NDArray[np.float64]
 
 QUICK = SearchOptions("full", full_candidates=15, photo_candidates=5)
 # Two walks that see the same corner of the room from opposite sides.

@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import (
     Consistency,
@@ -31,9 +31,6 @@ from tofuse.pipeline.evaluating import evaluate
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.native import NativeSource
 from tofuse.recordings.recording import ArraySource, Recording, evenly
-
-Float64 = NDArray[np.float64]
-
 
 # A room to look at, and poses that see it ------------------------------------------------------
 

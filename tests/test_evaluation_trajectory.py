@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.evaluation.trajectory import (
     align,
@@ -19,8 +19,6 @@ from tofuse.evaluation.trajectory import (
     relative_error,
 )
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
 
 
 def walk(n: int, seed: int = 0, spread: float = 1.0) -> Float64:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.kernels.selected_inverse import factorise, fill_in, invert
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 def some_matrix(n: int, links: int, seed: int) -> tuple[Float64, Int64, Int64]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import quaternion, se3
 from tofuse.posegraph.build import Measured, build_graph, chain
@@ -13,7 +13,6 @@ from tofuse.posegraph.castellani import Castellani, Problem, free_vertices, norm
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import PoseGraph
 
-Float64 = NDArray[np.float64]
 NORMALISATIONS = ("thesis", "fusiello")
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.posegraph import robust
@@ -18,14 +18,12 @@ from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.solve import Settings, solve
 from tofuse.posegraph.sparse import PairSystem
 
-Float64 = NDArray[np.float64]
-
 SIGMA = np.array([0.005, 0.01, 0.02, 0.002, 0.004, 0.003])  # of the edges: tx ty tz rx ry rz
 
 
 def walk(
     n: int = 60, loops: int = 40, false: int = 0, seed: int = 0
-) -> tuple[PoseGraph, Float64, NDArray[np.bool_]]:
+) -> tuple[PoseGraph, Float64, Bool]:
     """Two rounds of a path, loops between them, some of them false; the truth; which are false."""
     rng = np.random.default_rng([seed, n])
     k = np.arange(n)

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from tofuse import parts
+from tofuse.arrays import Float64
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
@@ -20,8 +20,6 @@ from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.icp import algorithm_1
 from tofuse.simulation.peaks import peaks_views
-
-Float64 = NDArray[np.float64]
 
 
 def pose(x: float = 0.0, z: float = 0.0, *, heading: float = 0.0, pitch: float = 0.0) -> Float64:

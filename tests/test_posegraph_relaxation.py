@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.posegraph.build import Measured, build_graph, chain
 from tofuse.posegraph.elch import Elch
@@ -13,8 +13,6 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.lu_milios import LuMilios, solve_linear
 from tofuse.posegraph.sparse import PairSystem
-
-Float64 = NDArray[np.float64]
 
 
 def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph, Float64]:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.files.ply import write_ply
 from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
@@ -34,7 +34,7 @@ def seen(camera: Camera, seed: int) -> RangeFrame:
     return RangeFrame(seed, 0.0, camera, depth.astype(np.float32), amplitude_image=amplitude)
 
 
-def cloud_of(frame: RangeFrame, order: NDArray[np.intp] | None = None) -> CloudFrame:
+def cloud_of(frame: RangeFrame, order: Intp | None = None) -> CloudFrame:
     order = np.arange(len(frame)) if order is None else order
     amplitude = frame.amplitude
     assert amplitude is not None
@@ -71,7 +71,7 @@ def test_coordinates_rounded_to_a_millimetre_will_do() -> None:
     assert len(found.image(rounded)) == len(rounded)
 
 
-def moved(points: NDArray[np.float32]) -> NDArray[np.float32]:
+def moved(points: Float32) -> Float32:
     turn = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
     return (points @ turn.T + (0.1, 0.2, 3.0)).astype(np.float32)
 

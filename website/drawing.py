@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, UInt8
 from tofuse.files.ply import Ply
 from tofuse.geometry import se3
 from tofuse.kernels import bvh
-
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 SIZE = (720, 480)  # pixels
 TILT, TURN = np.radians(48.0), np.radians(62.0)
@@ -36,7 +33,7 @@ class Picture:
         low, high = np.percentile(seen, [0.5, 99.5], axis=0)
         self.centre = (low + high) / 2
         self.scale = 0.9 * float(np.min(np.array(SIZE) / np.maximum(high - low, 1e-6)[:2]))
-        self.image: Image = np.empty((SIZE[1], SIZE[0], 3), np.uint8)
+        self.image: UInt8 = np.empty((SIZE[1], SIZE[0], 3), np.uint8)
         self.image[:] = BACKGROUND
 
     def surface(self, mesh: Ply) -> None:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drawing import ESTIMATE, TRUTH, Picture
 from tofuse.evaluation.trajectory import evaluate_trajectory
@@ -29,7 +28,6 @@ from tofuse.pipeline.run import Options, run
 from tofuse.results.output import frames_in_main_model, read_run_json
 
 ROOT = Path(__file__).resolve().parents[1]
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 import pairs
 from cloud_pairs import OBJECT_M
 from leaders import Board, Score, default_made
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
@@ -26,8 +26,6 @@ from tofuse.registration.icp import Icp
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
-
-Float64 = NDArray[np.float64]
 
 # Guesses are off by so much: m and degrees.
 STARTS = ((0.02, 1.0), (0.1, 5.0), (0.2, 10.0), (0.4, 20.0), (0.8, 40.0))

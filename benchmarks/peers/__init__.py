@@ -8,10 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.recordings.frames import RangeFrame
-
-Float64 = NDArray[np.float64]
 
 MAX_DEPTH_M = 12.0
 
@@ -64,9 +63,9 @@ class PinholeImages:
 
     camera: Camera
     pinhole: Pinhole = field(init=False)
-    _rows: NDArray[np.intp] = field(init=False, repr=False)
-    _columns: NDArray[np.intp] = field(init=False, repr=False)
-    _inside: NDArray[np.bool_] = field(init=False, repr=False)
+    _rows: Intp = field(init=False, repr=False)
+    _columns: Intp = field(init=False, repr=False)
+    _inside: Bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         c = self.camera

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from peers import MAX_DEPTH_M, Method, Session
+from tofuse.arrays import Float64
 from tofuse.recordings.frames import RangeFrame
-
-Float64 = NDArray[np.float64]
 
 _VOXELS_M = (0.05, 0.1)
 _THRESHOLDS_M = (0.1, 0.5)

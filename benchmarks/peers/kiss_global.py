@@ -6,12 +6,10 @@ import importlib
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
 
 
 def method(voxel_m: float) -> Callable[[Frame, Frame], Float64] | None:

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from peers import MAX_DEPTH_M, Method, PinholeImages, Session, grid
+from tofuse.arrays import Float64, Int64, UInt8
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-
-Float64 = NDArray[np.float64]
 
 # Counts of a metre: 0.2 mm, so that rounding is far below the noise of any camera.
 _SCALE = 5000.0
@@ -83,7 +81,7 @@ class _Images:
 
     def color(self, frame: RangeFrame, kind: str) -> Any:
         shape = (*frame.depth.shape, 3)
-        rgb: NDArray[np.uint8] = np.zeros(shape, np.uint8)
+        rgb: UInt8 = np.zeros(shape, np.uint8)
         if kind == "color" and frame.color_image is not None:
             rgb = self.images.take(frame.color_image)
         elif kind == "amplitude":
@@ -176,7 +174,7 @@ class _DenseSession:
 
 def fused(
     frames: Sequence[RangeFrame], poses: Float64, voxel_m: float, least: float
-) -> tuple[Float64, NDArray[np.int64]]:
+) -> tuple[Float64, Int64]:
     """Vertices and faces of its TSDF of the frames at given poses (N, 4, 4).
 
     Truncation is 8 voxels, its default; `least` is the weight, one a view, from which it shows a
@@ -198,7 +196,7 @@ def fused(
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64)
 
 
-def _grey(frame: RangeFrame) -> NDArray[np.uint8]:
+def _grey(frame: RangeFrame) -> UInt8:
     """Amplitude without its falloff with range, 0 to 255: the median at 100."""
     light = frame.amplitude_image
     assert light is not None

@@ -7,12 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
 
 # Of the tutorial: 5 cm for a room. Radii and distances are multiples of it.
 VOXEL_M = 0.05

@@ -24,13 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from peers import PinholeImages
+from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
-
-Float64 = NDArray[np.float64]
 
 _SCALE = 5000.0  # counts of a metre
 _LEAST_WEIGHT = 1.0  # what one frame saw is shown
@@ -176,11 +174,11 @@ class _Images:
             blocks = volume.compute_unique_block_coordinates(depth, *seen_from)
             volume.integrate(blocks, *images, *seen_from)
 
-    def _counts(self, frame: RangeFrame) -> NDArray[np.uint16]:
+    def _counts(self, frame: RangeFrame) -> UInt16:
         z = np.round(self.pinhole.take(frame.z) * _SCALE)
         return np.where(z < 65535, z, 0).astype(np.uint16)
 
-    def _colors(self, frame: RangeFrame) -> NDArray[np.uint8]:
+    def _colors(self, frame: RangeFrame) -> UInt8:
         if not self.colored:
             return np.full((*frame.depth.shape, 3), _GREY, np.uint8)
         assert frame.color_image is not None

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from peers import MAX_DEPTH_M, Method, Session
+from tofuse.arrays import Float64
 from tofuse.recordings.frames import RangeFrame
-
-Float64 = NDArray[np.float64]
 
 # Each peer is tried with every pair of these, and the best on the first frames is taken.
 _VOXELS_M = (0.02, 0.04, 0.08)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from tofuse.cli.progress import TerminalProgress
@@ -36,7 +36,6 @@ from tofuse.results.types import Reconstruction
 if TYPE_CHECKING:
     from viser import ViserServer
 
-Float64 = NDArray[np.float64]
 
 _THUMBNAIL = (420, 262)  # pixels
 

@@ -8,14 +8,10 @@ from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.recordings.frames import RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 # Small images are enlarged until they have this many columns: the detector wants large squares.
 _COLUMNS = 640

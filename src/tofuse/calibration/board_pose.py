@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.calibration.board import Board
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera
-
-Float64 = NDArray[np.float64]
 
 
 def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64, float] | None:

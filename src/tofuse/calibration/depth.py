@@ -16,16 +16,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
+from tofuse.arrays import Float64, Intp
 from tofuse.calibration.plane_views import PlaneView
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
 from tofuse.sensor.correction import DepthCorrection
-
-Float64 = NDArray[np.float64]
-Intp = NDArray[np.intp]
 
 _KNOT_M = 0.04
 _MOST_KNOTS = 200

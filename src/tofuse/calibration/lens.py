@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from tofuse.arrays import Float64
 from tofuse.calibration.board import Board, find_corners, picture
 from tofuse.calibration.board_pose import board_pose, pose_of
 from tofuse.errors import InputError
@@ -25,8 +25,6 @@ from tofuse.geometry.cameras import (
     Rational,
 )
 from tofuse.recordings.recording import Recording
-
-Float64 = NDArray[np.float64]
 
 LEAST_VIEWS = 4
 _SEARCHED = 160  # frames at most in which the board is looked for

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_bytes, read_text
 from tofuse.geometry.cameras import (
@@ -28,8 +28,6 @@ from tofuse.geometry.cameras import (
     RayTable,
 )
 from tofuse.recordings.camera_file import checked_lens
-
-Float64 = NDArray[np.float64]
 
 _LIMIT = 64 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
+from tofuse.arrays import Bool, Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
@@ -19,10 +19,6 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import still_stretches
 from tofuse.sensor.noise import AmplitudeLaw, ConfidenceLaw, Law, NoiseModel, RangeLaw
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 LEAST_FRAMES = 3
 _LEAST_PIXELS = 40  # in a bin

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.calibration.board import Board, find_corners, picture
 from tofuse.calibration.board_pose import board_pose
 from tofuse.errors import InputError
@@ -19,10 +19,6 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.registration.plane_sets import PlaneSets
 from tofuse.sensor.noise import NoiseModel
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Intp = NDArray[np.intp]
 
 _SEARCHED = 60  # frames at most
 # A pixel on a plane is at most this far off: what the correction is for, and noise.

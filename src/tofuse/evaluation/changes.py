@@ -18,20 +18,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import nearest_depth
 from tofuse.registration.view_points import ViewPoints, landing_pixels
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 Kind = Literal["appeared", "vanished"]
 
 # Points of each view, and pairs of views of one session from which is learnt how they disagree.
@@ -144,9 +141,7 @@ def _prepared(views: Sequence[SurfaceMap], poses: Float64) -> list[_Seen]:
     ]
 
 
-def _compare(
-    source: _Seen, target: _Seen
-) -> tuple[Integers, Float64, Float64, Float64, NDArray[np.bool_]]:
+def _compare(source: _Seen, target: _Seen) -> tuple[Intp, Float64, Float64, Float64, Bool]:
     """What a view says of the points of another one.
 
     Returns
@@ -230,7 +225,7 @@ def _changed(
 ) -> Float64:
     """(K, 3) middles of the voxels with surfaces of one session that the other saw through."""
 
-    def work(start: int, stop: int) -> list[tuple[Float64, Float64, Integers]]:
+    def work(start: int, stop: int) -> list[tuple[Float64, Float64, Intp]]:
         found = []
         for k in range(start, stop):
             source = own[k]

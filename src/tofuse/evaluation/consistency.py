@@ -25,8 +25,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.correction import Corrector
 from tofuse.geometry import se3
@@ -35,9 +36,6 @@ from tofuse.kernels.consistency import agreement_sums, move_points, project_by_l
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording, evenly
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 MAX_COLUMNS = 320
 MIN_DEPTH, MAX_DEPTH = 0.1, 12.0  # m

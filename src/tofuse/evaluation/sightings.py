@@ -14,16 +14,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import evenly
 from tofuse.registration.agreement import AgreementOptions, agreement
-
-Float64 = NDArray[np.float64]
 
 # Of each image: some points, compared with images of this width.
 _POINTS = 700

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import InputError
 from tofuse.kernels.kdtree import KdTree
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 _SAMPLED = 400_000  # points of a mesh
 _TRIED = 4  # samples of a mesh near a point whose triangles are tried

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 MAX_GAP_S = 0.02
 RPE_FRAMES = (1, 30)
@@ -84,7 +82,7 @@ class TrajectoryError:
     rotation_rms_rad: float
     relative: tuple[RelativeError, ...]
     T_reference_estimate: Float64
-    pairs: Integers
+    pairs: Intp
     position_errors: Float64
 
     def ate_within(self, reference_m: float) -> tuple[float, float]:
@@ -160,7 +158,7 @@ def evaluate_trajectory(
     )
 
 
-def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S) -> Integers:
+def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S) -> Intp:
     """Match times (N,) with times (M,) one to one, less than `max_gap` s apart, closest first.
 
     NaN matches nothing. Returns (A, 2) positions in a and b, in order of a's time.

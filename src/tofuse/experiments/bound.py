@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 _DRAWS = 20_000
 

@@ -8,8 +8,8 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.experiments import measures
 from tofuse.experiments.measures import BoxFit, PathScore
 from tofuse.experiments.recorded import Recorded, record_scene
@@ -22,9 +22,6 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.simulation.scene import SCENES
 from tofuse.simulation.scenes import box
-
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 METHODS = ("thesis", "default")
 GUESSES = ("identity", "previous")
@@ -354,7 +351,7 @@ def _facts(
     return found | (more[case.scene](recorded, recording) if case.scene in more else {})
 
 
-def corner_in_view(recorded: Recorded, stride: int) -> NDArray[np.bool_]:
+def corner_in_view(recorded: Recorded, stride: int) -> Bool:
     """(N,) mask: which frames of a stride see a corner of the room, by the true poses."""
     from tofuse.simulation.scenes import room
 

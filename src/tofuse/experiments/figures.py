@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.experiments.peaks import AXES, PeaksRun, PeaksSweep
 from tofuse.report import plots
 from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, framed, svg
@@ -15,7 +15,6 @@ from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE,
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Float64 = NDArray[np.float64]
 
 _POINTS_RGB = (112, 138, 176)
 _MARGINS = (50.0, 36.0, 12.0, 26.0)  # left, bottom, right, top, in pixels

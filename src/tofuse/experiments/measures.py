@@ -9,14 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-
 
 _FITTED = 20_000  # points of a model that walls are fitted to
 

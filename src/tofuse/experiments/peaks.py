@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.experiments.bound import (
     joint_covariance,
     mean_distance,
@@ -33,8 +33,6 @@ from tofuse.simulation.peaks import (
     peaks_seen,
     peaks_views,
 )
-
-Float64 = NDArray[np.float64]
 
 SIGMAS_M = tuple(k / 100 for k in range(1, 11))
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
@@ -163,7 +161,7 @@ def peaks_bound_of_one(sigma: float, shares: Sequence[float]) -> Float64:
     return np.asarray(np.quantile(mean_distances(C), shares), np.float64)
 
 
-def _seen() -> NDArray[np.bool_]:
+def _seen() -> Bool:
     """(points, cameras) what each camera sees."""
     seen = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
     for k, rows in enumerate(peaks_seen()):

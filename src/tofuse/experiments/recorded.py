@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.filters.base import apply_filters
 from tofuse.geometry import se3
 from tofuse.pipeline.config import Config
@@ -17,8 +17,6 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.simulation.record import Plan, plan
-
-Float64 = NDArray[np.float64]
 
 # About 1 cm apart in a room, so that distances from them are good to half of that.
 _SURFACE_POINTS = 500_000

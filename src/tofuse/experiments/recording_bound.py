@@ -11,18 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.geometry import se3
 from tofuse.sensor.models import CameraModel
 from tofuse.simulation import optics
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.record import Plan
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Int64 = NDArray[np.int64]
 
 # Unknowns of a view: its pose, and the logarithm of its exposure.
 _UNKNOWNS = 7

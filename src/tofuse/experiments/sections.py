@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.experiments import figures
 from tofuse.experiments.cases import GUESSES, METHODS, CaseResult, Model, Run
 from tofuse.experiments.peaks import PeaksSweep
@@ -16,8 +16,6 @@ from tofuse.geometry import se3
 from tofuse.report import images
 from tofuse.simulation.peaks import peaks_views
 from tofuse.simulation.scenes import box, room
-
-Float64 = NDArray[np.float64]
 
 _EXAMPLE_SIGMA = 0.09
 

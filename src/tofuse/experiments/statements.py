@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.experiments import measures
 from tofuse.experiments.cases import CaseResult, Run
 from tofuse.experiments.peaks import PeaksRun, PeaksSweep
@@ -20,7 +20,6 @@ from tofuse.geometry import se3
 from tofuse.simulation.peaks import RADIUS_M
 from tofuse.simulation.scenes import box, rail, room, torso
 
-Float64 = NDArray[np.float64]
 Outcome = Literal["agrees", "partly", "disagrees"]
 
 _AGREES, _DISAGREES = 0.8, 0.2
@@ -379,9 +378,9 @@ def _picks_up(results: Results, method: str) -> Finding:
     )
 
 
-def _corner_steps(case: CaseResult, run: Run) -> NDArray[np.bool_]:
+def _corner_steps(case: CaseResult, run: Run) -> Bool:
     """(N - 1,) mask of the motions between frames that both see a corner."""
-    seen: NDArray[np.bool_] = case.facts["corners"][run.stride]
+    seen: Bool = case.facts["corners"][run.stride]
     return seen[1:] & seen[:-1]
 
 

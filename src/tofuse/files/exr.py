@@ -14,13 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.images import MAX_PIXELS
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 MAGIC = b"\x76\x2f\x31\x01"
 _SINGLE_SCAN_LINES = 2  # the version, with none of the flags for tiles, parts or deep data

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float32, Int32, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes, write_text
 from tofuse.files.reading import read_bytes
@@ -239,14 +240,14 @@ def _accessor(view: int, values: NDArray[np.generic]) -> dict[str, Any]:
     return accessor
 
 
-def _light_of_screen() -> NDArray[np.uint16]:
+def _light_of_screen() -> UInt16:
     """(256,) linear light of sRGB values (IEC 61966-2-1), ascending."""
     s = np.arange(256) / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     return np.round(65535 * light).astype("<u2")
 
 
-def linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def linear(color: UInt8) -> UInt16:
     """Linear light and opacity (N, 4) of sRGB colours."""
     out = np.full((*color.shape[:-1], 4), 65535, "<u2")
     out[..., :3] = _light_of_screen()[color]
@@ -257,11 +258,11 @@ def linear(color: NDArray[np.uint8]) -> NDArray[np.uint16]:
 class Glb:
     """A mesh as `write_glb` takes it; see there."""
 
-    points: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    normals: NDArray[np.float32] | None
-    color: NDArray[np.uint8] | None
-    scalars: Mapping[str, NDArray[np.float32]]
+    points: Float32
+    faces: Int32
+    normals: Float32 | None
+    color: UInt8 | None
+    scalars: Mapping[str, Float32]
 
 
 def read_glb(path: str | Path) -> Glb:

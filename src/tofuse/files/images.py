@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes
 from tofuse.files.reading import read_bytes, read_head
@@ -183,12 +184,12 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
     return image if grey else np.ascontiguousarray(image[..., ::-1])
 
 
-def read_color(path: str | Path) -> NDArray[np.uint8]:
+def read_color(path: str | Path) -> UInt8:
     """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is repeated, 16 bits are cut to 8."""
     return as_color(read_image(path))
 
 
-def as_color(image: NDArray[Any]) -> NDArray[np.uint8]:
+def as_color(image: NDArray[Any]) -> UInt8:
     """Return an image of `read_image` as (H, W, 3) uint8 RGB."""
     if image.dtype == np.uint16:
         image = (image.astype(np.uint16) >> 8).astype(np.uint8)
@@ -217,7 +218,7 @@ def png_bytes(image: NDArray[np.generic]) -> bytes:
     return bytes(data)
 
 
-def jpeg_bytes(image: NDArray[np.uint8], quality: int = 92) -> bytes:
+def jpeg_bytes(image: UInt8, quality: int = 92) -> bytes:
     """Encode (H, W, 3) uint8 RGB as JPEG."""
     import cv2
 

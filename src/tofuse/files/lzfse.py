@@ -10,8 +10,8 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Int64, UInt8
 from tofuse.errors import InputError
 
 _END, _RAW, _TABLED, _PACKED, _SMALL = b"bvx$", b"bvx-", b"bvx1", b"bvx2", b"bvxn"
@@ -59,7 +59,7 @@ def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
     return out.tobytes()
 
 
-def _packed(data: bytes, at: int, out: NDArray[np.uint8], done: int, path: str | Path) -> int:
+def _packed(data: bytes, at: int, out: UInt8, done: int, path: str | Path) -> int:
     """Decode a block with packed tables to the end of `out`; return where the next one begins."""
     from tofuse.kernels.lzfse import STATES, lzfse_block
 
@@ -102,7 +102,7 @@ def _packed(data: bytes, at: int, out: NDArray[np.uint8], done: int, path: str |
     return end
 
 
-def _counts(data: bytes, path: str | Path) -> NDArray[np.int64]:
+def _counts(data: bytes, path: str | Path) -> Int64:
     """Unpack how many states each of the 360 symbols has."""
     bits, left = int.from_bytes(data, "little"), 8 * len(data)
     out = np.zeros(_SYMBOLS, np.int64)

@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes
 from tofuse.files.reading import read_bytes
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 MAX_POINTS = 1 << 28
 _NORMALS = ("normal_x", "normal_y", "normal_z")

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import MAX_PIXELS
 
@@ -15,7 +15,7 @@ _SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
 _HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
 
 
-def parse_pgm(data: bytes, where: str | Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
     """Decode (H, W) uint8 or uint16.
 
     Raises

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import replacing
 from tofuse.files.reading import read_bytes
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -46,7 +44,7 @@ class Ply:
     """
 
     vertex: dict[str, NDArray[np.generic]]
-    faces: NDArray[np.int32] | None = None
+    faces: Int32 | None = None
     comments: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -58,7 +56,7 @@ class Ply:
         return self._columns(("x", "y", "z"), np.float32)
 
     @property
-    def coordinates(self) -> NDArray[np.float64]:
+    def coordinates(self) -> Float64:
         """(N, 3) float64, for coordinates that float32 can't hold."""
         return self._columns(("x", "y", "z"), np.float64)
 
@@ -335,7 +333,7 @@ def _native(column: NDArray[np.generic]) -> NDArray[np.generic]:
     return column.astype(column.dtype.newbyteorder("="))
 
 
-def _fans(polygons: NDArray[np.generic]) -> NDArray[np.int32]:
+def _fans(polygons: NDArray[np.generic]) -> Int32:
     """Cut (M, n) polygons into (M (n - 2), 3) triangles."""
     with np.errstate(invalid="ignore"):
         p = polygons.astype(np.int64)
@@ -348,14 +346,12 @@ def _fans(polygons: NDArray[np.generic]) -> NDArray[np.int32]:
     return np.clip(triangles.reshape(-1, 3), -1, 2**31 - 1).astype(np.int32)
 
 
-def _uneven_fans(rows: list[NDArray[np.generic]]) -> NDArray[np.int32]:
+def _uneven_fans(rows: list[NDArray[np.generic]]) -> Int32:
     parts = [_fans(row[None]) for row in rows]
     return np.concatenate([np.zeros((0, 3), np.int32), *parts])
 
 
-def _checked_faces(
-    faces: NDArray[np.generic], vertices: int, path: str | Path
-) -> NDArray[np.int32]:
+def _checked_faces(faces: NDArray[np.generic], vertices: int, path: str | Path) -> Int32:
     if faces.size and (faces.min() < 0 or faces.max() >= vertices):
         raise InputError(
             f"has faces that name vertices other than 0 to {vertices - 1}",

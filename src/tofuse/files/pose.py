@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.geometry.se3 import check_pose
-
-Float64 = NDArray[np.float64]
 
 FIELD = "T_target_source"
 _REMEDY = (

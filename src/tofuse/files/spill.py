@@ -20,11 +20,10 @@ from typing import IO, Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
 from tofuse.files.memory import give_back
-
-Bytes = NDArray[np.uint8]
 
 _PIECE = 16 << 20  # bytes that are copied at a time
 _OFTEN = 128 << 20  # bytes that leave memory before it is given back to the system
@@ -52,7 +51,7 @@ class SpillFile:
         self.folder = None if folder is None else str(folder)
         self._file: IO[bytes] | None = None
 
-    def append(self, data: Bytes) -> int:
+    def append(self, data: UInt8) -> int:
         """Write at the end; returns where that is. OutputError where the disk is full."""
         offset = self.size
         try:
@@ -71,7 +70,7 @@ class SpillFile:
         self.size = offset + len(data)
         return offset
 
-    def read(self, offset: int, out: Bytes) -> None:
+    def read(self, offset: int, out: UInt8) -> None:
         """Fill `out` with what was written there."""
         left = out.data
         try:
@@ -119,13 +118,13 @@ class Piece:
     offset: int
     size: int
 
-    def copy(self) -> Bytes:
+    def copy(self) -> UInt8:
         """Return the bytes."""
         data = np.empty(self.size, np.uint8)
         self.file.read(self.offset, data)
         return data
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Bytes:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> UInt8:
         """See `copy`."""
         return self.copy()
 
@@ -340,7 +339,7 @@ def _compact(array: NDArray[Any]) -> NDArray[Any]:
     return array.copy(order="C")
 
 
-def _bytes_of(array: NDArray[Any]) -> Bytes:
+def _bytes_of(array: NDArray[Any]) -> UInt8:
     """Of an array in C order; what is written there is written to the array."""
     return array.reshape(-1).view(np.uint8) if array.size else np.empty(0, np.uint8)
 

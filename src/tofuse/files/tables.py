@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
-
-Float64 = NDArray[np.float64]
 
 
 def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:

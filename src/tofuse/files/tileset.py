@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_bytes
-
-Float64 = NDArray[np.float64]
 
 # Tiles have z up; what draws glTF in them turns its y there: (x, y, z) becomes (x, -z, y).
 R_TILES_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

@@ -5,15 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
 from tofuse.files.tables import exact
 from tofuse.geometry.quaternion import from_matrix, to_matrix
-
-Float64 = NDArray[np.float64]
 
 ASSOCIATION_LIMIT_S = 0.02
 
@@ -122,7 +121,7 @@ def associate(
     *,
     limit: float = ASSOCIATION_LIMIT_S,
     exclusive: bool = True,
-) -> NDArray[np.intp]:
+) -> Intp:
     """For each of (N,) timestamps, the index of the nearest of (M,) others, or -1.
 
     Only within `limit` seconds (inclusive, give or take a nanosecond); if `exclusive`, an entry

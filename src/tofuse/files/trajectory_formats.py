@@ -15,16 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_file, is_folder, read_text
 from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry import se3
 from tofuse.geometry.quaternion import to_matrix
-
-Float64 = NDArray[np.float64]
-Intp = NDArray[np.intp]
 
 # Files that a folder may hold poses in, the first that is there counts.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")

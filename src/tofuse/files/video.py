@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import InputError
 
 MAX_SIDE = 8192
@@ -47,7 +47,7 @@ class Video:
         if not usable or not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             raise InputError("is no video that can be decoded", where=path, remedy="copy it again")
 
-    def read(self, index: int) -> NDArray[np.uint8]:
+    def read(self, index: int) -> UInt8:
         """Return frame `index` as (H, W, 3) RGB; InputError if it can't be decoded."""
         import cv2
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32
 from tofuse.filters._options import within
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.geometry.cameras import unknown_rays
 from tofuse.kernels.neighbourhood import is_steeper, largest_angle
 from tofuse.kernels.threads import run_chunks
@@ -59,7 +59,7 @@ class NeighbourhoodAngle(Filter):
         return np.logical_not(steep, out=steep)
 
 
-def neighbourhood_angle(frame: RangeFrame) -> NDArray[np.float32]:
+def neighbourhood_angle(frame: RangeFrame) -> Float32:
     """Neighbourhood angle xi (H, W) in rad; 0 at points without a valid neighbour.
 
     Eq 2.6 takes the arcsine of ``|p_n| sin(phi) / |p_n - p_i|``, by the law of sines the sine of

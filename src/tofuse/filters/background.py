@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+from tofuse.arrays import Bool
 from tofuse.errors import InputError
 from tofuse.filters._options import above, within
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.background import MovingObject, moving_object
 from tofuse.recordings.frames import Frame, RangeFrame

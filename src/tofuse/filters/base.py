@@ -6,13 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Bool
 from tofuse.parts import name_of
 from tofuse.recordings.frames import Frame
-
-Bool = NDArray[np.bool_]
 
 
 class Filter(Protocol):

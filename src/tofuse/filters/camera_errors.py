@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.filters.correction import Correction, Corrector
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
-
-Float64 = NDArray[np.float64]
 
 # More is no error of a camera, but another camera.
 _MOST_FOCAL, _MOST_OFFSET_M = 0.5, 1.0

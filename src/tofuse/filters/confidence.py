@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from tofuse.arrays import Bool
 from tofuse.filters._options import whole
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 

@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
 
 
 class Corrector(Protocol):

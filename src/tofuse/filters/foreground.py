@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32
 from tofuse.filters._options import above, within
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
@@ -56,7 +56,7 @@ class Foreground(Filter):
         return frame.z <= limit
 
 
-def otsu(values: NDArray[np.float32]) -> tuple[float, float]:
+def otsu(values: Float32) -> tuple[float, float]:
     """Find the threshold that parts values (N,) best into two classes (Otsu 1979, 256 bins).
 
     Returns the threshold (the lower class is at most that) and Otsu's separability eta, 0 to 1:

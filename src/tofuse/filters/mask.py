@@ -11,8 +11,9 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
+from tofuse.arrays import Bool
 from tofuse.errors import InputError
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 

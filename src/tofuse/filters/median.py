@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32
 from tofuse.filters._options import above, whole
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.kernels.neighbourhood import window_median
 from tofuse.kernels.threads import run_chunks
 from tofuse.parts import part
@@ -49,7 +49,7 @@ class Median(Filter):
         return np.abs(frame.z - local_median(frame.z, self.size)) <= self.threshold
 
 
-def local_median(z: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+def local_median(z: Float32, size: int) -> Float32:
     """Median (H, W) of the valid (positive) pixels in the window around each; 0 if there is none.
 
     The window is cut at the image's border. Of an even number the two in the middle are averaged.

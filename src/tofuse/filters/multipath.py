@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.filters._options import above, at_least, whole, within
 from tofuse.filters.correction import Correction, Corrector
 from tofuse.parts import part
@@ -15,9 +15,6 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.multipath import Bounces, GainEstimator, Interference, LightImage, Reflections
 from tofuse.sensor.multipath_map import LightMap
 from tofuse.sensor.multipath_surfaces import FALLOFF
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Cameras of one frequency measure with periods up to this. A longer ambiguity is a beat of several
 # frequencies, which says nothing about the phase that was measured.

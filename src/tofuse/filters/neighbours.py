@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.filters._options import above, whole, within
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
@@ -80,7 +80,7 @@ class NeighbourShare(Filter):
         return _spread(frame, keep)
 
 
-def mean_neighbour_distance(points: NDArray[np.float32], k: int) -> NDArray[np.float64]:
+def mean_neighbour_distance(points: Float32, k: int) -> Float64:
     """Mean distance (N,) in m of points (N, 3) to their k nearest others.
 
     Of fewer than k others all count; a point alone is infinitely far from any.

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from tofuse.filters.correction import Correction, Corrector, Float64
+from tofuse.arrays import Float64
+from tofuse.filters.correction import Correction, Corrector
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.noise import NoiseModel

@@ -9,20 +9,17 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Complex128, Float64
 from tofuse.errors import InputError
 from tofuse.filters._options import above, within
-from tofuse.filters.correction import Correction, Corrector, Float64
+from tofuse.filters.correction import Correction, Corrector
 from tofuse.filters.multipath import light_image
 from tofuse.parts import part
 from tofuse.recordings.background import moving_object
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.multipath import LightImage
 from tofuse.sensor.scattering import Scattering, learn_shares
-
-Bool = NDArray[np.bool_]
-Complex = NDArray[np.complex128]
 
 # A pixel with less than this share of its light its own is measured too badly to be saved.
 _LEAST_OWN = 0.5
@@ -144,7 +141,7 @@ def _moves_and_still(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
     return moves, ~around & np.isfinite(found.far.z) & (found.far.share > _STILL)
 
 
-def light_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex | None:
+def light_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex128 | None:
     """Return the light (H, W) of a frame, with its phase; 0 where there is none.
 
     None where the light or the period is not known.
@@ -153,7 +150,7 @@ def light_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex | 
     return None if image is None else _phasor(image)
 
 
-def _phasor(image: LightImage) -> Complex:
+def _phasor(image: LightImage) -> Complex128:
     """Phasor (H, W) of the raw light; 0 where there is none."""
     seen = (image.z > 0) & (image.light > 0)
     x, y = image.rays[..., 0], image.rays[..., 1]

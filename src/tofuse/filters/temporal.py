@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.filters._options import above, whole
-from tofuse.filters.base import Bool, Filter
+from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
@@ -57,7 +57,7 @@ class TemporalDeviation(Filter):
         return ~(deviation > self.threshold)
 
 
-def z_deviation(z: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+def z_deviation(z: Sequence[Float32]) -> Float64:
     """Sample standard deviation (H, W) in m of z images (H, W), 0 = invalid left out.
 
     NaN where fewer than two images have a value.

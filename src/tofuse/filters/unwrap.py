@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.filters._options import above
 from tofuse.filters.correction import Correction, Corrector
 from tofuse.filters.multipath import light_image
@@ -16,9 +16,6 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.multipath_surfaces import FALLOFF
 from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _ROUNDS = 4
 

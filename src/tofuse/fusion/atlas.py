@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Int32, Intp
 from tofuse.fusion.mesh import Mesh
-
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 MARGIN = 1.4  # texels around each triangle that are painted too
 _PADDING = 3  # texels between pieces
@@ -113,7 +110,7 @@ def _by_xatlas(xatlas: Any, mesh: Mesh, size: int) -> Atlas:
     return Atlas(np.concatenate(rows).astype(np.int32), faces, places.astype(np.float32), size)
 
 
-def _parts(mesh: Mesh) -> list[NDArray[np.intp]]:
+def _parts(mesh: Mesh) -> list[Intp]:
     """Faces (K,) of each part of the mesh: halved across its longest side until it is small.
 
     The library tries every two neighbouring pieces of what it gets at once, which for 60,000

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, Int64, UInt8
 from tofuse.fusion.exchange import Shape
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _BUFFER_ROWS = 2_000_000
 _KEY_BITS = 21  # voxels per axis: 2^21, that is 21 km at 1 cm
@@ -44,8 +42,8 @@ class Cloud:
 
     points: Float32
     normals: Float32 | None
-    color: NDArray[np.uint8] | None
-    views: NDArray[np.int32]
+    color: UInt8 | None
+    views: Int32
     offset: Float64
     sigma: Float32 | None = None
 
@@ -96,7 +94,7 @@ class CloudBuilder:
 
     config: Fusion
     voxel_m: float
-    _keys: list[NDArray[np.int64]] = field(default_factory=list)
+    _keys: list[Int64] = field(default_factory=list)
     _sums: list[Float64] = field(default_factory=list)
     _rows: int = 0
 
@@ -193,20 +191,20 @@ def _raw_amplitude(frame: Frame) -> Float32:
     return amplitude
 
 
-def _voxel_keys(points: Float64, voxel: float) -> NDArray[np.int64]:
+def _voxel_keys(points: Float64, voxel: float) -> Int64:
     half = 1 << (_KEY_BITS - 1)
     ijk = np.clip(np.floor(points / voxel), -half, half - 1).astype(np.int64) + half
     return (ijk[:, 0] << 2 * _KEY_BITS) | (ijk[:, 1] << _KEY_BITS) | ijk[:, 2]
 
 
-def _sum_by_key(keys: NDArray[np.int64], rows: Float64) -> tuple[NDArray[np.int64], Float64]:
+def _sum_by_key(keys: Int64, rows: Float64) -> tuple[Int64, Float64]:
     order = np.argsort(keys, kind="stable")
     keys, rows = keys[order], rows[order]
     starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
     return keys[starts], np.add.reduceat(rows, starts, axis=0)
 
 
-def _colors(sums: Float64) -> NDArray[np.uint8] | None:
+def _colors(sums: Float64) -> UInt8 | None:
     rgb, grey = sums[:, 10] > 0, sums[:, 12] > 0
     if not (rgb.any() or grey.any()):
         return None
@@ -218,7 +216,7 @@ def _colors(sums: Float64) -> NDArray[np.uint8] | None:
     return out
 
 
-def grey_of(albedo: Float64) -> NDArray[np.uint8]:
+def grey_of(albedo: Float64) -> UInt8:
     """Colours (N, 3) as grey, of albedos (N,) in any unit."""
     if len(albedo) == 0:
         return np.zeros((0, 3), np.uint8)

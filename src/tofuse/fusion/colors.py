@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-UInt8 = NDArray[np.uint8]
+from tofuse.arrays import Bool, UInt8
 
 # Where no image showed a colour.
 UNSEEN = (142, 142, 142)
 
 
-def has_color(colors: UInt8) -> NDArray[np.bool_]:
+def has_color(colors: UInt8) -> Bool:
     """Say which colours (N, 3) an image showed."""
     return np.asarray(colors.any(1), np.bool_)
 

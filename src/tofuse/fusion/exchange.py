@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tofuse._version import __version__
+from tofuse.arrays import Float32, Float64, Int32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.e57 import write_e57
 from tofuse.files.glb import write_glb, write_gltf
@@ -22,8 +23,6 @@ from tofuse.files.ply import write_ply
 from tofuse.files.stl import write_stl
 from tofuse.files.usdz import write_usdz
 from tofuse.fusion.colors import seen_colors
-
-Float64 = NDArray[np.float64]
 
 # From x right, y down, z forward into glTF's x right, y up, z towards the viewer.
 _R_GLTF_WORLD = np.diag([1.0, -1.0, -1.0])
@@ -40,12 +39,12 @@ class Shape:
     know textures leave `color` out.
     """
 
-    points: Float64 | NDArray[np.float32]
-    normals: NDArray[np.float32] | None
-    color: NDArray[np.uint8] | None
+    points: Float64 | Float32
+    normals: Float32 | None
+    color: UInt8 | None
     scalars: Mapping[str, ArrayLike]
-    faces: NDArray[np.int32] | None = None
-    uv: NDArray[np.float32] | None = None
+    faces: Int32 | None = None
+    uv: Float32 | None = None
     texture: bytes | None = None
 
     def save(self, path: str | Path, R_up_world: Float64 = _R_GLTF_WORLD) -> None:

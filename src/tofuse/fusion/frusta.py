@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.fusion.kept import Views
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import farthest_told
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _CHUNKS = 16
 _ROUNDING = 1.001  # of single precision, with plenty to spare
@@ -56,7 +53,7 @@ class Frusta:
         T = np.array([se3.inverse(pose) for pose in poses]).reshape(-1, 4, 4)
         return cls(T, spans, _ROUNDING * far)
 
-    def touching(self, low: Float64, high: Float64) -> NDArray[np.bool_]:
+    def touching(self, low: Float64, high: Float64) -> Bool:
         """Which views (N,) may say something of the box from `low` to `high` (3,), m.
 
         Some that do not are among them; none that does is missing.

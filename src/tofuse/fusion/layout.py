@@ -12,18 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int32, Int64
 from tofuse.fusion.kept import Views, about
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.views import RangeView
 from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, enter
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import near_cubes
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
 
 _CHUNKS = 16
 # Where a view shows no surface near by, at most every 4th one counts, and four times: of hundreds

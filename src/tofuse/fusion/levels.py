@@ -12,12 +12,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.fusion.mesh import Mesh
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Place = tuple[int, int, int]
 
 # Edge of a tile in edges of its triangles: some 128^2 cells, of two triangles, for each surface

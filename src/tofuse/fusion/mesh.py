@@ -9,15 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import has_color
 from tofuse.fusion.exchange import Shape
 from tofuse.kernels.clustering import connect, number_keys, plane_sums, settle
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-UInt8 = NDArray[np.uint8]
 
 # A place is held at its middle by so much of what the planes around it hold.
 _HELD = 0.02
@@ -86,7 +82,7 @@ class Mesh:
         """Return the vertices as a cloud."""
         return Cloud(self.vertices, self.normals, self.color, self.views, self.offset, self.sigma)
 
-    def rows(self, faces: NDArray[np.bool_]) -> Mesh:
+    def rows(self, faces: Bool) -> Mesh:
         """Return the mesh of the faces (M,) that are True, without vertices that no face has."""
         kept = self.faces[faces]
         used = np.zeros(len(self), bool)
@@ -127,8 +123,8 @@ class Mesh:
         """
         ends = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
         border = ends[~np.isin(ends @ [len(self), 1], ends @ [1, len(self)])]
-        vertices: list[tuple[NDArray[np.int64], Float64, float]] = []
-        faces: list[NDArray[np.int64]] = []
+        vertices: list[tuple[Int64, Float64, float]] = []
+        faces: list[Int64] = []
         for rim in _loops(border):
             p = self.vertices[rim].astype(float)
             length = float(np.linalg.norm(p - np.roll(p, -1, 0), axis=1).sum())
@@ -188,7 +184,7 @@ class Mesh:
         group, count = self._groups(cell_m)
         return self._merged(group, count, self._regrouped(group), cell_m)
 
-    def _groups(self, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _groups(self, cell_m: float) -> tuple[Intp, Intp]:
         """Which vertices (N,) are put together, and how many are in each group (G,)."""
         key = np.zeros(len(self), np.int64)
         for along in self.vertices.T:  # one axis at a time takes a third of the memory
@@ -206,15 +202,13 @@ class Mesh:
         count = np.bincount(side, minlength=2 * len(order))
         return (np.cumsum(count > 0) - 1)[side], count[count > 0]
 
-    def _regrouped(self, group: NDArray[np.intp]) -> Int32:
+    def _regrouped(self, group: Intp) -> Int32:
         """The faces between groups that are left of those between vertices."""
         a, b, c = (group[self.faces[:, k]] for k in range(3))
         left = (a != b) & (b != c) & (c != a)
         return np.stack([a[left], b[left], c[left]], -1).astype(np.int32)
 
-    def _merged(
-        self, group: NDArray[np.intp], count: NDArray[np.intp], faces: Int32, cell_m: float
-    ) -> Mesh:
+    def _merged(self, group: Intp, count: Intp, faces: Int32, cell_m: float) -> Mesh:
         def mean(values: NDArray[np.generic]) -> Float64:
             columns = values.reshape(len(values), -1).T
             sums = [np.bincount(group, column.astype(float), len(count)) for column in columns]
@@ -238,7 +232,7 @@ class Mesh:
         )
         return merged.rows(np.ones(len(faces), bool))
 
-    def _mean_color(self, group: NDArray[np.intp], groups: int) -> UInt8 | None:
+    def _mean_color(self, group: Intp, groups: int) -> UInt8 | None:
         """Mean (G, 3) of the colours that images showed; black where none of a group has one."""
         if self.color is None:
             return None
@@ -247,7 +241,7 @@ class Mesh:
         sums = [np.bincount(group[known], c[known].astype(float), groups) for c in self.color.T]
         return np.round(np.stack(sums, -1) / count[:, None]).astype(np.uint8)
 
-    def _near_planes(self, group: NDArray[np.intp], middles: Float64, cell_m: float) -> Float64:
+    def _near_planes(self, group: Intp, middles: Float64, cell_m: float) -> Float64:
         """Where each group's place (G, 3) is nearest to the planes of its triangles.
 
         Directions that these don't hold stay at the middle, and no place is beyond half a cell.
@@ -261,7 +255,7 @@ class Mesh:
         return middles + step.clip(-0.5 * cell_m, 0.5 * cell_m)
 
 
-def _loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _loops(edges: Int64) -> list[Int64]:
     """Loops of directed edges (K, 2); where several pass one vertex, they are told apart there."""
     follow: dict[int, list[int]] = {}
     for a, b in edges.tolist():

@@ -8,8 +8,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.fusion.kept import KeptClouds, KeptViews
@@ -20,8 +20,6 @@ from tofuse.fusion.views import RangeView
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, Frame
-
-Float64 = NDArray[np.float64]
 
 _SKETCHED, _SKETCHED_PIXELS = 60, 6000  # views in a sketch, and about so many pixels of each
 

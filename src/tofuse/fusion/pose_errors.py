@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model
 from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # It varies slowly over the surface: cells of this share of the model's diagonal are asked.
 _CELL = 0.01
@@ -65,7 +62,7 @@ class _Cells:
     size: float
     points: Float64
     offset: Float64
-    of_point: NDArray[np.intp]
+    of_point: Intp
 
     @classmethod
     def of(cls, cloud: Cloud) -> _Cells:
@@ -100,7 +97,7 @@ def _sigma(
     return np.asarray(np.sqrt(best), np.float64)
 
 
-def _seen(frame: RangeFrame, points: Float64, size: float) -> NDArray[np.bool_]:
+def _seen(frame: RangeFrame, points: Float64, size: float) -> Bool:
     """(N,) which points (N, 3) of the camera's frame an image measured."""
     pixel = np.nan_to_num(np.rint(frame.camera.project(points)), nan=-1.0, posinf=-1, neginf=-1)
     limits = (frame.camera.width, frame.camera.height)

@@ -10,16 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Int32, Int64, UInt8
 from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import grey_of
 from tofuse.fusion.mesh import Mesh
 from tofuse.kernels.clustering import connect, settle
-
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +120,7 @@ def _places(piece: Piece, names: Int64) -> Int32:
     return np.searchsorted(names, piece.names).astype(np.int32)
 
 
-def colored(tints: Float32) -> NDArray[np.uint8] | None:
+def colored(tints: Float32) -> UInt8 | None:
     """Colours (N, 3) of light (N, C): RGB of three channels, grey of the root of the albedo."""
     channels = tints.shape[1]
     if channels == 3:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.fusion.atlas import MARGIN, Atlas, unwrap
 from tofuse.fusion.cloud import grey_of
 from tofuse.fusion.colors import UNSEEN, has_color, seen_colors
@@ -20,10 +21,6 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import Projection
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 # How far a surface may be from what a view sees there: m, and as a share of the depth.
 _SLACK, _SLACK_SHARE = 0.02, 0.02
@@ -194,8 +191,8 @@ class _Sheet:
     """
 
     atlas: Atlas
-    painted: NDArray[np.bool_]
-    corners: NDArray[np.int32]
+    painted: Bool
+    corners: Int32
     shares: Float32
     points: Float32
     normals: Float32
@@ -214,9 +211,7 @@ class _Sheet:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
         return cls(atlas, painted, corners, shares, points, normals)
 
-    def at_texels(
-        self, values: NDArray[np.generic], where: NDArray[np.bool_] | None = None
-    ) -> Float32:
+    def at_texels(self, values: NDArray[np.generic], where: Bool | None = None) -> Float32:
         """Values (K, C) between those of the vertices (N, C); of some of the texels (K,)."""
         if where is None:
             return _between(values, self.corners, self.shares)
@@ -229,7 +224,7 @@ class _Sheet:
         return _spread(image, self.painted)
 
 
-def _between(values: NDArray[np.generic], corners: NDArray[np.int32], shares: Float32) -> Float32:
+def _between(values: NDArray[np.generic], corners: Int32, shares: Float32) -> Float32:
     out = np.empty((len(corners), values.shape[1]), np.float32)
     # Piece by piece: what the system has to find memory for anew takes longer than the sums.
     for start in range(0, len(out), _TEXELS_AT_ONCE):
@@ -311,7 +306,7 @@ def _see(
     )  # fmt: skip
 
 
-def _spread(image: UInt8, painted: NDArray[np.bool_]) -> UInt8:
+def _spread(image: UInt8, painted: Bool) -> UInt8:
     """Fill what nobody owns with the nearest colour, so that smaller copies don't darken."""
     if painted.all() or not painted.any():
         return image

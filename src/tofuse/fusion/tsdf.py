@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int32, Int64, UInt16
 from tofuse.files.spill import Spill
 from tofuse.fusion.frusta import Frusta
 from tofuse.fusion.kept import Views, about
@@ -23,10 +23,6 @@ from tofuse.kernels.blocks import EDGE, VOXELS, index_of, mark_eighths, neighbou
 from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.tsdf import integrate, open_view, settle_free
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 _CHUNKS = 16
 _AT_ONCE = 16  # views
@@ -76,14 +72,14 @@ class Volume:
     own: int
     distance: Float32
     weight: Float32
-    seen: NDArray[np.uint16]
+    seen: UInt16
     color: Float32
     free: Float32
     turns: int = 1
     added: int = 0
 
     @cached_property
-    def index(self) -> tuple[Int64, NDArray[np.int32]]:
+    def index(self) -> tuple[Int64, Int32]:
         """Where the row of a block is found by its key."""
         return index_of(self.keys)
 
@@ -116,7 +112,7 @@ class Volume:
         views: Views,
         poses: Float64,
         advance: Callable[[], None] | None = None,
-        touching: NDArray[np.bool_] | None = None,
+        touching: Bool | None = None,
     ) -> None:
         """Add views at their poses (N, 4, 4), in order; `advance` is called for each.
 
@@ -328,15 +324,15 @@ class Volume:
 
     def _faces(
         self,
-        neighbours: NDArray[np.int32],
-        cells: NDArray[np.int32],
+        neighbours: Int32,
+        cells: Int32,
         starts: Int64,
         points: Float64,
-    ) -> tuple[NDArray[np.int32], Int64]:
+    ) -> tuple[Int32, Int64]:
         """Triangles of the own blocks, and how many each block has."""
         counts = np.zeros(self.own, np.int64)
 
-        def run(firsts: Int64, faces: NDArray[np.int32], fill: bool) -> NDArray[np.int32]:
+        def run(firsts: Int64, faces: Int32, fill: bool) -> Int32:
             run_chunks(
                 lambda a, b: make_faces(
                     neighbours,
@@ -369,10 +365,10 @@ class _Net:
     normals: Float32
     tints: Float32
     sigma: Float32
-    views: NDArray[np.int32]
-    faces: NDArray[np.int32]
+    views: Int32
+    faces: Int32
     per_block: Int64  # (own,) faces of each block
-    cells: NDArray[np.int32]  # (B, VOXELS) number of the vertex within its block, or -1
+    cells: Int32  # (B, VOXELS) number of the vertex within its block, or -1
 
 
 def _backs(reach: float) -> Float32:

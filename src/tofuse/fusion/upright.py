@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.fusion.mesh import Mesh
-
-Float64 = NDArray[np.float64]
 
 # Vertices that take part, and of them the planes that are tried.
 _POINTS, _TRIED = 4000, 150

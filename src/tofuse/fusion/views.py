@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Int8, UInt8, UInt16
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.middle import median
 from tofuse.kernels.tsdf import draw_to_planes, mark_jumps, pack_view
@@ -20,8 +21,6 @@ from tofuse.maps.surface_map import (
     with_more_planes,
 )
 from tofuse.recordings.frames import CloudFrame, RangeFrame
-
-Float32 = NDArray[np.float32]
 
 # Weights, in 1/m^2, are kept as logarithms: six steps an octave, from 2^-14 on.
 _STEPS, _LEAST = 6.0, -14.0
@@ -67,11 +66,11 @@ class RangeView:
     index: int
     timestamp: float
     projection: Projection
-    z: NDArray[np.uint16]
+    z: UInt16
     unit: float
-    normals: NDArray[np.int8]
-    strength: NDArray[np.uint8]
-    light: NDArray[np.float16] | NDArray[np.uint8] | None
+    normals: Int8
+    strength: UInt8
+    light: NDArray[np.float16] | UInt8 | None
     sigma_m: float
 
     @classmethod
@@ -184,7 +183,7 @@ class RangeView:
         return CloudFrame(self.index, self.timestamp, points, color=color, amplitude=amplitude)
 
 
-def _typical_sigma(variance: Float32, good: NDArray[np.bool_]) -> float:
+def _typical_sigma(variance: Float32, good: Bool) -> float:
     """Of every fourth pixel, or of all if none of these is good."""
     for step in (2, 1):
         some = variance[::step, ::step][good[::step, ::step]]
@@ -193,7 +192,7 @@ def _typical_sigma(variance: Float32, good: NDArray[np.bool_]) -> float:
     return 0.0
 
 
-def _widened(mask: NDArray[np.uint8], margin: int) -> NDArray[np.bool_]:
+def _widened(mask: UInt8, margin: int) -> Bool:
     size = 2 * margin + 1
     return cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0
 
@@ -221,15 +220,13 @@ def without_camera_errors(
         yield replace(view, z=counts, unit=unit, projection=straight[id(old)])
 
 
-def _encoded(weight: Float32) -> NDArray[np.uint8]:
+def _encoded(weight: Float32) -> UInt8:
     known = weight > 0
     code = 1 + np.round(_STEPS * (np.log2(np.where(known, weight, 1)) - _LEAST))
     return np.where(known, np.clip(code, 1, 255), 0).astype(np.uint8)
 
 
-def _light(
-    frame: RangeFrame, shape: tuple[int, ...]
-) -> NDArray[np.float16] | NDArray[np.uint8] | None:
+def _light(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
     if frame.color_image is not None:
         return np.round(_reduced(frame.color_image.astype(np.float32), shape)).astype(np.uint8)
     if frame.amplitude_image is None:

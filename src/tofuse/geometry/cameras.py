@@ -15,10 +15,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.errors import InputError
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @runtime_checkable
@@ -49,20 +47,20 @@ def ray_lengths(camera: Camera) -> Float32:
     return _derived(camera)[0]
 
 
-def unknown_rays(camera: Camera) -> NDArray[np.bool_] | None:
+def unknown_rays(camera: Camera) -> Bool | None:
     """(H, W) whether a pixel's ray is unknown; None if no pixel's is."""
     return _derived(camera)[1]
 
 
 # What is computed once for a camera, as every frame asks for it.
-_computed: WeakKeyDictionary[Camera, tuple[Float32, NDArray[np.bool_] | None]] = WeakKeyDictionary()
+_computed: WeakKeyDictionary[Camera, tuple[Float32, Bool | None]] = WeakKeyDictionary()
 
 
-def _derived(camera: Camera) -> tuple[Float32, NDArray[np.bool_] | None]:
+def _derived(camera: Camera) -> tuple[Float32, Bool | None]:
     found = _computed.get(camera)
     if found is None:
         rays = camera.rays()
-        unknown: NDArray[np.bool_] = np.isnan(rays.sum(-1))
+        unknown: Bool = np.isnan(rays.sum(-1))
         lengths = _frozen(np.sqrt(1 + (rays * rays).sum(-1)))
         found = (lengths, unknown if unknown.any() else None)
         _computed[camera] = found

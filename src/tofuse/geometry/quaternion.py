@@ -6,12 +6,12 @@ This is also the order of TUM trajectories (qx qy qz qw) and of SciPy.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from tofuse.arrays import Float64
 
 
-def unnormalised_matrix(q: ArrayLike) -> Array:
+def unnormalised_matrix(q: ArrayLike) -> Float64:
     """``R_u(q)`` of eq 2.12, (..., 3, 3): a rotation scaled by ``q . q``."""
     u, v, w, s = np.moveaxis(np.asarray(q, float), -1, 0)
     rows = [
@@ -22,13 +22,13 @@ def unnormalised_matrix(q: ArrayLike) -> Array:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def to_matrix(q: ArrayLike) -> Array:
+def to_matrix(q: ArrayLike) -> Float64:
     """``R(q) = R_u(q) / (q . q)`` of eq 2.11: orthogonal for any q other than zero."""
     q = np.asarray(q, float)
     return unnormalised_matrix(q) / (q * q).sum(-1)[..., None, None]
 
 
-def from_matrix(R: ArrayLike) -> Array:
+def from_matrix(R: ArrayLike) -> Float64:
     """Unit quaternion (..., 4) with s >= 0 of rotation matrices (..., 3, 3).
 
     Each of the four components can be found from the diagonal; the largest is used to divide,
@@ -64,7 +64,7 @@ def from_matrix(R: ArrayLike) -> Array:
     return np.where(q[..., 3:] < 0, -q, q)
 
 
-def multiply(a: ArrayLike, b: ArrayLike) -> Array:
+def multiply(a: ArrayLike, b: ArrayLike) -> Float64:
     """Product with ``to_matrix(multiply(a, b)) == to_matrix(a) @ to_matrix(b)``."""
     au, av, aw, as_ = np.moveaxis(np.asarray(a, float), -1, 0)
     bu, bv, bw, bs = np.moveaxis(np.asarray(b, float), -1, 0)
@@ -79,12 +79,12 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
     )
 
 
-def conjugate(q: ArrayLike) -> Array:
+def conjugate(q: ArrayLike) -> Float64:
     """Inverse of a unit quaternion: the three vector components negated."""
     return np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
-def from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
+def from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Float64:
     """Quaternion of a rotation by `angle` (rad) about the unit vector `axis` (section 2.4)."""
     axis = np.asarray(axis, float)
     half = np.asarray(angle, float)[..., None] / 2

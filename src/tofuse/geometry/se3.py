@@ -9,16 +9,15 @@ that leaves the translation alone.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
-
-Array = NDArray[np.float64]
 
 _SMALL = 1e-4  # rad; below it the series are exact to float64
 
 
-def hat(w: ArrayLike) -> Array:
+def hat(w: ArrayLike) -> Float64:
     """Return the (..., 3, 3) matrix with ``hat(w) @ v == cross(w, v)``."""
     w = np.asarray(w, float)
     out = np.zeros((*w.shape[:-1], 3, 3))
@@ -28,7 +27,7 @@ def hat(w: ArrayLike) -> Array:
     return out
 
 
-def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
+def _coefficients(angle: Float64) -> tuple[Float64, Float64, Float64]:
     """Return sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3, without cancellation near zero."""
     small = angle < _SMALL
     a = np.where(small, 1.0, angle)
@@ -43,7 +42,7 @@ def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
     return s1, s2, s3
 
 
-def so3_exp(w: ArrayLike) -> Array:
+def so3_exp(w: ArrayLike) -> Float64:
     """Rotation matrix (..., 3, 3) of a rotation vector (..., 3) in radians (Rodrigues)."""
     w = np.asarray(w, float)
     s1, s2, _ = _coefficients(np.linalg.norm(w, axis=-1))
@@ -51,7 +50,7 @@ def so3_exp(w: ArrayLike) -> Array:
     return np.eye(3) + s1[..., None, None] * W + s2[..., None, None] * (W @ W)
 
 
-def so3_log(R: ArrayLike) -> Array:
+def so3_log(R: ArrayLike) -> Float64:
     """Rotation vector (..., 3), of length 0 to pi, of a rotation matrix (..., 3, 3)."""
     from tofuse.geometry.quaternion import from_matrix
 
@@ -64,7 +63,7 @@ def so3_log(R: ArrayLike) -> Array:
     return scale[..., None] * vector
 
 
-def left_jacobian(w: ArrayLike) -> Array:
+def left_jacobian(w: ArrayLike) -> Float64:
     """Left Jacobian of SO(3), (..., 3, 3): translation part of the SE(3) exponential."""
     w = np.asarray(w, float)
     _, s2, s3 = _coefficients(np.linalg.norm(w, axis=-1))
@@ -72,7 +71,7 @@ def left_jacobian(w: ArrayLike) -> Array:
     return np.eye(3) + s2[..., None, None] * W + s3[..., None, None] * (W @ W)
 
 
-def left_jacobian_inverse(w: ArrayLike) -> Array:
+def left_jacobian_inverse(w: ArrayLike) -> Float64:
     """Inverse of `left_jacobian`, (..., 3, 3)."""
     w = np.asarray(w, float)
     angle = np.linalg.norm(w, axis=-1)
@@ -90,7 +89,7 @@ def left_jacobian_inverse(w: ArrayLike) -> Array:
     return np.eye(3) - 0.5 * W + c[..., None, None] * (W @ W)
 
 
-def exp(xi: ArrayLike) -> Array:
+def exp(xi: ArrayLike) -> Float64:
     """Rigid motion (..., 4, 4) of a twist (..., 6): the full SE(3) exponential."""
     xi = np.asarray(xi, float)
     T = np.zeros((*xi.shape[:-1], 4, 4))
@@ -100,7 +99,7 @@ def exp(xi: ArrayLike) -> Array:
     return T
 
 
-def log(T: ArrayLike) -> Array:
+def log(T: ArrayLike) -> Float64:
     """Twist (..., 6) of a rigid motion (..., 4, 4); the inverse of `exp` for angles below pi."""
     T = np.asarray(T, float)
     w = so3_log(T[..., :3, :3])
@@ -108,7 +107,7 @@ def log(T: ArrayLike) -> Array:
     return np.concatenate([t, w], axis=-1)
 
 
-def jacobian_inverse(xi: ArrayLike) -> Array:
+def jacobian_inverse(xi: ArrayLike) -> Float64:
     """Inverse right Jacobian J (..., 6, 6): ``log(exp(xi) exp(d)) = xi + J d + O(d^2)``.
 
     In the (t, r) order, from the left one at ``-xi`` (Barfoot, eqs 7.86 and 7.95). Singular where
@@ -123,7 +122,7 @@ def jacobian_inverse(xi: ArrayLike) -> Array:
     return out
 
 
-def jacobian(xi: ArrayLike) -> Array:
+def jacobian(xi: ArrayLike) -> Float64:
     """Right Jacobian J (..., 6, 6): ``exp(xi + d) = exp(xi) exp(J d + O(d^2))``."""
     xi = -np.asarray(xi, float)
     J = left_jacobian(xi[..., 3:])
@@ -134,7 +133,7 @@ def jacobian(xi: ArrayLike) -> Array:
     return out
 
 
-def _coupling(xi: Array) -> Array:
+def _coupling(xi: Float64) -> Float64:
     """Block Q (..., 3, 3) of the left Jacobian, by which a rotation moves a translation."""
     V, W = hat(xi[..., :3]), hat(xi[..., 3:])
     angle = np.linalg.norm(xi[..., 3:], axis=-1)
@@ -163,7 +162,7 @@ def _coupling(xi: Array) -> Array:
     )
 
 
-def inverse(T: ArrayLike) -> Array:
+def inverse(T: ArrayLike) -> Float64:
     """Inverse of rigid motions (..., 4, 4): ``T_b_a`` from ``T_a_b``."""
     T = np.asarray(T, float)
     out = np.zeros_like(T)
@@ -174,7 +173,7 @@ def inverse(T: ArrayLike) -> Array:
     return out
 
 
-def adjoint(T: ArrayLike) -> Array:
+def adjoint(T: ArrayLike) -> Float64:
     """Adjoint (..., 6, 6): ``T exp(xi) T^-1 == exp(adjoint(T) @ xi)`` in the (t, r) order."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
@@ -185,33 +184,33 @@ def adjoint(T: ArrayLike) -> Array:
     return out
 
 
-def transform(T: ArrayLike, points: ArrayLike) -> Array:
+def transform(T: ArrayLike, points: ArrayLike) -> Float64:
     """Map points (..., N, 3) by ``T_a_b`` (..., 4, 4): points of frame b, in frame a."""
     T = np.asarray(T, float)
     return np.asarray(points) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
-def about(centre: ArrayLike, T: ArrayLike) -> Array:
+def about(centre: ArrayLike, T: ArrayLike) -> Float64:
     """Return the motions (..., 4, 4) that move things about a centre (3,) as T does the origin."""
     to, back = np.eye(4), np.eye(4)
     to[:3, 3], back[:3, 3] = centre, -np.asarray(centre, float)
     return np.asarray(to @ np.asarray(T, float) @ back)
 
 
-def point_jacobian(points: ArrayLike) -> Array:
+def point_jacobian(points: ArrayLike) -> Float64:
     """Return the derivatives (..., 3, 6) of ``exp(xi) p`` at zero, ``[I, -hat(p)]``."""
     p = np.asarray(points, float)
     return np.concatenate([np.broadcast_to(np.eye(3), (*p.shape, 3)), -hat(p)], axis=-1)
 
 
-def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: ArrayLike) -> Array:
+def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: ArrayLike) -> Float64:
     """Motion from T_a (share 0) to T_b (share 1) at constant body velocity (a screw)."""
     T_a = np.asarray(T_a, float)
     share = np.asarray(share, float)
     return T_a @ exp(share[..., None] * log(inverse(T_a) @ np.asarray(T_b, float)))
 
 
-def orthonormalise(T: ArrayLike) -> Array:
+def orthonormalise(T: ArrayLike) -> Float64:
     """Replace the rotation by the nearest one (SVD), against the drift of long products."""
     T = np.array(T, float)
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
@@ -220,7 +219,7 @@ def orthonormalise(T: ArrayLike) -> Array:
     return T
 
 
-def angle(R: ArrayLike) -> Array:
+def angle(R: ArrayLike) -> Float64:
     """Screw-axis angle, 0 to pi rad, of rotations (..., 3, 3) or motions (..., 4, 4).
 
     Computed from both sine and cosine, so it is accurate at 0 and at pi (Soderkvist and Wedin).
@@ -233,7 +232,7 @@ def angle(R: ArrayLike) -> Array:
     return np.arctan2(np.linalg.norm(axis, axis=-1), trace - 1)
 
 
-def check_pose(T: ArrayLike, *, where: str = "pose") -> Array:
+def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     """Return T as a float64 (4, 4) array, or raise InputError if it is no rigid motion."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():

@@ -6,14 +6,11 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.sample import Sample
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Images are looked at with so many columns at most.
 _COLUMNS = 160

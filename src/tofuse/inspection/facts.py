@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry.cameras import Pinhole, RayTable
 from tofuse.inspection.values import depths_of
 from tofuse.recordings.frames import Frame, RangeFrame
@@ -34,7 +34,7 @@ def facts_of(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
     return facts
 
 
-def _time(times: NDArray[np.float64]) -> str:
+def _time(times: Float64) -> str:
     if len(times) < 2:
         return "a single moment"
     step = float(np.median(np.diff(times)))
@@ -91,13 +91,13 @@ def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:
     }
 
 
-def _extent(frame: Frame) -> NDArray[np.float64]:
+def _extent(frame: Frame) -> Float64:
     """Size (3,) in m of the box that holds nearly all points of a view."""
     low, high = np.percentile(frame.points, [1, 99], axis=0)
     return high - low
 
 
-def _share(poses: NDArray[np.float64] | None) -> str:
+def _share(poses: Float64 | None) -> str:
     if poses is None:
         return "none"
     return f"for {int(np.isfinite(poses[:, 0, 0]).sum())} frames"

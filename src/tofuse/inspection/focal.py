@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.geometry import check_kind, wrong_focal
@@ -22,8 +22,6 @@ from tofuse.inspection.motion import Pair, aligned, aligned_pair, field_of_view
 from tofuse.inspection.sample import MAP_COLUMNS, Sample, part_starts
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
-
-Float64 = NDArray[np.float64]
 
 # Views that are turned by this share of the field of view tell; by less than that many degrees,
 # too little.

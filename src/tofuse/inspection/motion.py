@@ -6,16 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.view_points import landing_pixels
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Views are small, so nearly all pixels take part from the start.
 _OPTIONS = ProjectiveOptions(

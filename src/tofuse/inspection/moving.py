@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.inspection import channels
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.motion import Pair
@@ -113,7 +113,7 @@ def check_moving_objects(sample: Sample) -> Iterator[Finding]:
         )
 
 
-def _moved(pairs: Sequence[Pair]) -> NDArray[np.float64]:
+def _moved(pairs: Sequence[Pair]) -> Float64:
     """Of pairs that fit, how much of the image moved; nothing if too few do."""
     fit = [p for p in pairs if p.found.score > _FITS_WELL and p.fits and p.shift < _FAST]
     if len(fit) < max(2, _OFTEN * len(pairs)):

@@ -27,15 +27,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.maps.surface_map import SurfaceMap
 
-Float64 = NDArray[np.float64]
 Model = Literal["kind", "z", "range"]
-Int64 = NDArray[np.int64]
 
 # Neighbouring pixels belong to one surface if their normals differ by less than this, and their
 # planes put each other's depth within so many sigmas or this share of it.
@@ -115,7 +113,7 @@ def regions_of(view: SurfaceMap, frame: int) -> list[Region]:
     return out
 
 
-def _labels(view: SurfaceMap, on: NDArray[np.bool_]) -> Int64:
+def _labels(view: SurfaceMap, on: Bool) -> Int64:
     """(H, W) number of the piece that each pixel is of."""
     rows, columns = on.shape
     number = np.arange(rows * columns).reshape(rows, columns)

@@ -7,8 +7,8 @@ from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.motion import Pair, aligned_pair
 from tofuse.inspection.planar import Bending, Region, bending, regions_of
@@ -137,5 +137,5 @@ def part_starts(recording: Recording) -> list[int]:
     """Positions in the recording at which another of several joined ones begins."""
     joined = recording.metadata.get("parts", ())
     starts = list(accumulate(part["frames"] for part in joined))[:-1]
-    indices: NDArray[np.intp] = recording.indices
+    indices: Intp = recording.indices
     return [int(np.searchsorted(indices, s)) for s in starts]

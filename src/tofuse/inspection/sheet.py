@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import OutputError
 from tofuse.inspection.values import fliers
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
@@ -16,7 +16,6 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 if TYPE_CHECKING:
     from tofuse.inspection.inspect import Inspection
 
-UInt8 = NDArray[np.uint8]
 
 _COLUMNS = 5
 # Rows of a mask: what a pixel is, and its colour.

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.sample import Sample
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.unwrap import on_surface
-
-Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 # Typical distances in m that ToF cameras hardly have.
 _NEAREST_M, _FARTHEST_M = 0.15, 12.0

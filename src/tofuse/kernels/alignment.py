@@ -14,13 +14,10 @@ it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import landing
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Columns of a source point: position in m, unit normal, sigma of z as a share of z, log albedo
 # (NaN where unknown) and its slope by the position, 1/m.

@@ -8,12 +8,9 @@ those of each 4 x 4 x 4 are neighbours in memory.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Int32, Int64, UInt8
 from tofuse.kernels.jit import kernel
-
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
 
 EDGE = 8  # voxels along the edge of a block
 VOXELS = EDGE**3
@@ -107,7 +104,7 @@ def index_of(keys: Int64) -> tuple[Int64, Int32]:
 
 
 @kernel
-def mark_eighths(cubes: Int64, table: Int64, rows: Int32, marks: NDArray[np.uint8]) -> None:
+def mark_eighths(cubes: Int64, table: Int64, rows: Int32, marks: UInt8) -> None:
     """Set the bits of eighths of blocks, in `marks` (B,), given the keys of cubes of their size.
 
     `table` and `rows` are those of `index_of`; blocks that are not in there are passed over.

@@ -8,13 +8,9 @@ Benthin and Wald (JCGT 2013): a ray never slips between two triangles that share
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int32
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 LEAF = 4
 BINS = 16

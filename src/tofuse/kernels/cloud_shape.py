@@ -5,13 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 # A neighbourhood thinner than this share of its length is a line and has no normal.
 _LINE = 1e-8

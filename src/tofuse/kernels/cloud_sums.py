@@ -8,11 +8,9 @@ the source's frame: p a source point, and r the residual turned into that frame,
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
 
 
 @kernel

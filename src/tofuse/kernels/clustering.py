@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.kernels.blocks import EMPTY, slot_of
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 @kernel
@@ -47,7 +44,7 @@ def number_keys(keys: Int64, number: Int64) -> Int64:
 
 
 @kernel
-def connect(faces: NDArray[np.int32], group: NDArray[np.int32]) -> None:
+def connect(faces: Int32, group: Int32) -> None:
     """Join the vertices of each triangle in `group` (N,), which is 0 to N - 1 before the first.
 
     `faces` (M, 3) are rows of the vertices. Of each vertex `group` has one that comes before it in
@@ -71,7 +68,7 @@ def connect(faces: NDArray[np.int32], group: NDArray[np.int32]) -> None:
 
 
 @kernel
-def settle(group: NDArray[np.int32]) -> None:
+def settle(group: Int32) -> None:
     """Let each vertex know the first one of its piece; see `connect`."""
     for n in range(len(group)):
         group[n] = group[group[n]]  # what comes before is settled already
@@ -79,9 +76,9 @@ def settle(group: NDArray[np.int32]) -> None:
 
 @kernel
 def plane_sums(
-    vertices: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    group: NDArray[np.int64],
+    vertices: Float32,
+    faces: Int32,
+    group: Int64,
     middles: Float64,
     A: Float64,
     b: Float64,

@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 
 @kernel

@@ -10,14 +10,11 @@ most follows from how large such tilts and slopes are known to be.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels.alignment import LIGHT, NORMAL, POINT, SIGMA
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @kernel

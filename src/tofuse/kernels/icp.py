@@ -7,13 +7,9 @@ threads, and its result then depends on how many there are.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 @kernel

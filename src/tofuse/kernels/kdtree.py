@@ -14,16 +14,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import InputError
 from tofuse.kernels.cloud_matching import kdtree_nearest_featured
 from tofuse.kernels.cloud_shape import ball_moments
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.threads import run_chunks
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 LEAF_SIZE = 10
 # Below this many queries a second thread costs more than it brings.

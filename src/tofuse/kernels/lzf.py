@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.kernels.jit import kernel
-
-UInt8 = NDArray[np.uint8]
 
 
 @kernel

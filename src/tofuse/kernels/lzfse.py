@@ -7,12 +7,9 @@ tabled asymmetric numeral systems (Duda 2013), and the bit streams are read from
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Int64, UInt8
 from tofuse.kernels.jit import kernel
-
-UInt8 = NDArray[np.uint8]
-Int64 = NDArray[np.int64]
 
 # States of the four tables: literal runs, copy lengths, distances, literals.
 STATES = (64, 64, 256, 1024)

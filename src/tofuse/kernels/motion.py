@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
 
 
 @kernel

@@ -13,15 +13,10 @@ where d is the difference of depth. It is negative where the views agree.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, UInt8
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import landing
-
-Bool = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 # Outcomes of a comparison.
 NONE = 0  # no depth, or it projects to where the other view has none

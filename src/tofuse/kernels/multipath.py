@@ -8,14 +8,9 @@ b, c of the plane 1/z = a x + b y + c through it (all 0 where no plane fits).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Complex128, Float32, Float64
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Bool = NDArray[np.bool_]
 
 X, Y, W, LIGHT, AREA, A, B, C, COLUMNS = range(9)
 
@@ -267,7 +262,12 @@ def light_surfaces(
 
 @kernel
 def seen_sources(
-    good: Bool, points: Float64, normals: Float64, area: Float64, radiosity: Complex, out: Float32
+    good: Bool,
+    points: Float64,
+    normals: Float64,
+    area: Float64,
+    radiosity: Complex128,
+    out: Float32,
 ) -> int:
     """Make sources of nodes (Hn, Wn): one of every 2 x 2 that are alike, else one of each.
 

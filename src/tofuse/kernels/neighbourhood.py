@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32
 from tofuse.kernels.jit import kernel
 
 
 @kernel
-def window_median(
-    z: NDArray[np.float32], half: int, start: int, stop: int, out: NDArray[np.float32]
-) -> None:
+def window_median(z: Float32, half: int, start: int, stop: int, out: Float32) -> None:
     """Write the median of the positive values around each pixel of some rows; 0 without any.
 
     Parameters
@@ -51,11 +49,11 @@ def window_median(
 
 @kernel
 def largest_angle(
-    points: NDArray[np.float32],
-    valid: NDArray[np.bool_],
+    points: Float32,
+    valid: Bool,
     start: int,
     stop: int,
-    out: NDArray[np.float32],
+    out: Float32,
 ) -> None:
     """Write the largest angle, over the 8 neighbours, between camera and neighbour at each point.
 
@@ -101,12 +99,12 @@ def largest_angle(
 
 @kernel
 def is_steeper(
-    z: NDArray[np.float32],
-    rays: NDArray[np.float32],
+    z: Float32,
+    rays: Float32,
     cosine2: np.float32,
     start: int,
     stop: int,
-    out: NDArray[np.bool_],
+    out: Bool,
 ) -> None:
     """Write where an angle as in `largest_angle` is obtuse and above a threshold.
 

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
 
 BY_RANGE, BY_AMPLITUDE, BY_CONFIDENCE, BY_CAMERA = 0, 1, 2, 3
 SATURATED = 65535.0
-
-Float32 = NDArray[np.float32]
 
 
 @kernel
@@ -23,9 +19,9 @@ def range_sigma(
     law: int,
     channel: Float32,
     compensated: bool,
-    levels: NDArray[np.float64],
+    levels: Float64,
     cosine: Float32,
-    parameters: NDArray[np.float64],
+    parameters: Float64,
     start: int,
     stop: int,
     out: Float32,

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Int32
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 
 @kernel
@@ -16,7 +13,7 @@ def carry_planes(
     w: Float32,
     sigma: Float32,
     rays: Float32,
-    wanted: NDArray[np.bool_],
+    wanted: Bool,
     planes: Float32,
     variance: Float32,
     steps: Int32,

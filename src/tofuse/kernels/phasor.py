@@ -8,18 +8,16 @@ then real and imaginary part of the harmonics 1, 3 and 5.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.kernels.jit import kernel
-
-Array = NDArray[np.float64]
 
 CHANNELS = 7
 
 
 @kernel
 def ray_phasors(
-    strength: Array, path: Array, wave_number: float, start: int, stop: int, out: Array
+    strength: Float64, path: Float64, wave_number: float, start: int, stop: int, out: Float64
 ) -> None:
     """Phasors out (N, 7) of rays start to stop, from R returns each: strength, path (N, R)."""
     for i in range(start, stop):
@@ -46,7 +44,7 @@ def ray_phasors(
 
 
 @kernel
-def pool(fine: Array, weights: Array, stride: int, start: int, stop: int, out: Array) -> None:
+def pool(fine: Float64, weights: Float64, stride: int, start: int, stop: int, out: Float64) -> None:
     """Weighted sums out (H, W, C) over windows of fine (Hf, Wf, C), for rows start to stop."""
     for v in range(start, stop):
         for u in range(out.shape[1]):
@@ -60,13 +58,13 @@ def pool(fine: Array, weights: Array, stride: int, start: int, stop: int, out: A
 
 @kernel
 def off_plane(
-    points: Array,
-    normals: Array,
+    points: Float64,
+    normals: Float64,
     window: int,
     stride: int,
     start: int,
     stop: int,
-    out: Array,
+    out: Float64,
 ) -> None:
     """Largest distance out (H, W) of a window's points from the plane at its centre.
 
@@ -102,15 +100,15 @@ def off_plane(
 
 @kernel
 def upsample(
-    coarse: Array,
-    coarse_points: Array,
-    coarse_normals: Array,
-    points: Array,
-    normals: Array,
+    coarse: Float64,
+    coarse_points: Float64,
+    coarse_normals: Float64,
+    points: Float64,
+    normals: Float64,
     step: int,
     start: int,
     stop: int,
-    out: Array,
+    out: Float64,
 ) -> None:
     """Joint bilateral interpolation of a coarse grid, for rows start to stop of out (H, W, C).
 

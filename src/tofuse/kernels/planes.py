@@ -11,14 +11,11 @@ view sees says nothing of its pose.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.kernels.cloud_shape import symmetric_eigen
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 _FLAT = 1e-9
 

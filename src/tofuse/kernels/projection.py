@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @kernel

@@ -10,8 +10,8 @@ the point p by, the distance moves by m . b(p) - n . b(q).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels.alignment import (
     ALBEDO,
     ALBEDO_SLOPE,
@@ -46,10 +46,6 @@ from tofuse.kernels.alignment import SQUARES_P as ALBEDO_SQUARES
 from tofuse.kernels.alignment import WEIGHT_P as ALBEDO_WEIGHT
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import jacobian_row, landing
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # Errors of the camera, in the order of their unknowns.
 OFFSET = 0  # missing from the range, m

@@ -7,14 +7,11 @@ point gives a row of its own, as the cameras of a rig share unknowns over many p
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import landing
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Columns of a row: signed distance to the target's plane in m and its variance (0: the point has no
 # partner), the target's normal in the source's frame, the source's own normal, the moved point,

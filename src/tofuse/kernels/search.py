@@ -9,14 +9,11 @@ The frame (x0, y0, 1/dx, 1/dy) tells the ray coordinates of the nodes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.motion import moved
 from tofuse.kernels.projection import jacobian_row, landing
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Nearer than this, a point has no place in an image, m.
 _NEAREST = 0.05
@@ -52,7 +49,7 @@ def _judge(
     frame: Float64,
     reach: float,
     block: Float32,
-    node: NDArray[np.int32],
+    node: Int32,
 ) -> None:
     """Add to the sums of each pose what one image's points say of it, landing in the other's.
 
@@ -137,7 +134,7 @@ def _judge(
 @kernel
 def thinned(
     rotations: Float64, translations: Float64, depth: float, apart: float, count: int
-) -> NDArray[np.int64]:
+) -> Int64:
     """Choose the first `count` poses, leaving out those near an earlier one that was chosen.
 
     Poses (N, 3, 3) and (N, 3) are near each other if they move points at `depth` by less than
@@ -526,7 +523,7 @@ def lowest_plane(
     points: Float64,
     normals: Float64,
     band: Float64,
-    tried: NDArray[np.int64],
+    tried: Int64,
     cosine: float,
     most_below: float,
     far: float,

@@ -8,12 +8,9 @@ by its lower triangle in compressed columns: the rows of column k are
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 B = 6
 

@@ -9,8 +9,8 @@ pixels for independent has R^T R (the normal equations with an unknown for each 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels.alignment import (
     FITS,
     JACOBIAN,
@@ -25,10 +25,6 @@ from tofuse.kernels.alignment import (
 )
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.refinement import UNKNOWNS, G, H
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # Of each patch: sums of w, w r and w J.
 WEIGHT = 0

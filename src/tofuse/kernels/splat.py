@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int32
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
 
 # Of the eye's distance: what is nearer to it is not drawn.
 _NEAREST = 0.02

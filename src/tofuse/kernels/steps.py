@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as sums
 from tofuse.kernels.alignment import accumulate, bin_edge, normal_equations
 from tofuse.kernels.doubt import faked_information
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.motion import composed, moved, twist_between
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Points from which it is told how much information can be faked.
 SOME_POINTS = 500

@@ -8,12 +8,9 @@ images, so windows can be as wide as the noise asks for and the surface allows.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int64
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _SUMS = 12
 
@@ -97,8 +94,8 @@ def fit_planes(
     w: Float32,
     rays: Float32,
     weight: Float32,
-    wanted: NDArray[np.bool_],
-    radii: NDArray[np.int64],
+    wanted: Bool,
+    radii: Int64,
     limit: float,
     fill: float,
     offset: float,
@@ -210,7 +207,7 @@ def fit_planes(
 
 
 @kernel
-def _by_count(radii: NDArray[np.int64], limit: float) -> tuple[Float64, Float64]:
+def _by_count(radii: Int64, limit: float) -> tuple[Float64, Float64]:
     """What a window's fit needs of the number n of its valid pixels, without a root for each.
 
     Either is (len(radii), most pixels + 1): 1 / (n - 3), and the largest mean squared residual.

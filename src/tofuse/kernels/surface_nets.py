@@ -8,16 +8,10 @@ of `tofuse.kernels.tsdf`; cells reach into the next blocks, so there are no seam
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, Int64, UInt16
 from tofuse.kernels.blocks import EDGE, VOXELS, block_of, voxel_at, voxel_of
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
-UInt16 = NDArray[np.uint16]
 
 _SIDE = EDGE + 1
 

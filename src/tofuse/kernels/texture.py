@@ -7,13 +7,9 @@ by its finest octave, so that a camera's pixels can resolve it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32
 from tofuse.kernels.jit import kernel
-
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 PLAIN, NOISE, WOOD, TILES, PRINT, SPECKLE = 0, 1, 2, 3, 4, 5
 

@@ -8,8 +8,8 @@ pose tells more of its error than the noise of the pixels does.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels.alignment import (
     DIFFERENCE,
     FITS,
@@ -31,9 +31,6 @@ from tofuse.kernels.alignment import (
     put_point,
 )
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Layout of a tile's sums, over the distances of its pixels.
 A = 0  # 7: sum of w J, what an error common to the tile does to the gradient
@@ -116,7 +113,7 @@ def tile_sums(
 
 
 @kernel
-def _add_to_tiles(tiles: Float64, of: NDArray[np.int64], block: Float32, count: int) -> None:
+def _add_to_tiles(tiles: Float64, of: Int64, block: Float32, count: int) -> None:
     for k in range(count):
         if block[FITS * LANES + k] > 0:
             tile, root = tiles[of[k]], np.float64(block[ROOT * LANES + k])

@@ -7,17 +7,11 @@ Distances are positive in front of a surface and cut at `reach`. Blocks are thos
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt8, UInt16
 from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, block_key, block_of
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.projection import landing
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
-UInt16 = NDArray[np.uint16]
 
 MOST_SEEN = 65535  # views that a voxel can count
 # How many cells of the grid of rays are looked through before a block is taken voxel by voxel.
@@ -30,8 +24,8 @@ _LEAST_WEIGHT = np.float32(1e-30)  # against a division by 0
 def near_cubes(
     z: UInt16,
     unit: float,
-    normals: NDArray[np.int8],
-    strength: NDArray[np.uint8],
+    normals: Int8,
+    strength: UInt8,
     rays: Float32,
     T_world_camera: Float64,
     cube_m: float,
@@ -90,7 +84,7 @@ def draw_to_planes(
     sigmas: float,
     smooth: Float32,
     variance: Float32,
-    measured: NDArray[np.bool_],
+    measured: Bool,
 ) -> None:
     """Draw depths towards the planes around them, the more the noisier they are.
 
@@ -135,9 +129,7 @@ def draw_to_planes(
 
 
 @kernel
-def mark_jumps(
-    z: Float32, sigma: Float32, share: float, sigmas: float, jump: NDArray[np.uint8]
-) -> None:
+def mark_jumps(z: Float32, sigma: Float32, share: float, sigmas: float, jump: UInt8) -> None:
     """Mark both sides of jumps in depth: by this share of it, and by more than the noise makes.
 
     `z` and `sigma` (H, W) are the depth in m, 0 where there is none, and its standard deviation;
@@ -170,9 +162,9 @@ def pack_view(
     rays: Float32,
     lengths2: Float32,
     variance: Float32,
-    good: NDArray[np.bool_],
+    good: Bool,
     least_cosine: float,
-    normals: NDArray[np.int8],
+    normals: Int8,
     weights: Float32,
 ) -> None:
     """Fill what `unpack_view` needs of a view: `normals` (H, W, 3), and `weights` (H, W) in 1/m^2.
@@ -217,8 +209,8 @@ def pack_view(
 def open_view(
     z: UInt16,
     unit: float,
-    normals: NDArray[np.int8],
-    strength: NDArray[np.uint8],
+    normals: Int8,
+    strength: UInt8,
     weights: Float32,
     rays: Float32,
     lookup_frame: Float64,
@@ -298,8 +290,8 @@ def open_view(
 def farthest_told(
     z: UInt16,
     unit: float,
-    normals: NDArray[np.int8],
-    strength: NDArray[np.uint8],
+    normals: Int8,
+    strength: UInt8,
     rays: Float32,
     backs: Float32,
 ) -> float:
@@ -454,7 +446,7 @@ def integrate(
     codes: Int32,
     weights: Float32,
     backs: Float32,
-    near: NDArray[np.uint8],
+    near: UInt8,
     turns: int,
     light: Float32,
     shape: tuple[int, int],

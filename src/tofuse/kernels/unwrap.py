@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32
 from tofuse.kernels.jit import kernel
-
-Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 # Where a pixel's neighbours lie, (row, column): opposite directions two apart.
 STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))

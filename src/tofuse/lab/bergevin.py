@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.multiview import Cloud, Float64, Pairs, Relaxing
+from tofuse.lab.multiview import Cloud, Pairs, Relaxing
 from tofuse.parts import part
 
 # Relative size of eigenvalues that are rounding errors.

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.kernels.cloud_sums import plane_sums
 from tofuse.lab.neighbourhoods import neighbourhood, with_normals
 from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Float64, Matches
+from tofuse.registration.interfaces import Alignment, Matches
 from tofuse.registration.pairs import SurfacePairs, solve, surface_pairs
 from tofuse.registration.surface_metrics import PointToPlane, SurfaceMetric
 

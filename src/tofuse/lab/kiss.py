@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
@@ -20,9 +20,6 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.base import Registration
 from tofuse.registration.interfaces import Alignment, Matches, Points
 from tofuse.registration.metrics import PointToPoint
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # Of the range: edges of the map's voxels, the first threshold's sigma and the smallest motion that
 # it learns from (the paper: 1 m, 2 m and 0.1 m of 100 m).

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.lab.neighbourhoods import neighbourhood
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.interfaces import Float64, Int64, Points
+from tofuse.registration.interfaces import Points
 from tofuse.registration.selectors import All, at_most
 
 _FEWEST = 8
@@ -252,5 +252,5 @@ def _rows(arm: Float64, n: Float64) -> Float64:
     return np.column_stack([n, np.cross(arm, n), (arm * n).sum(1)])
 
 
-def _sigma(residual: NDArray[np.float64]) -> float:
+def _sigma(residual: Float64) -> float:
     return float(np.sqrt((residual**2).sum() / max(len(residual) - 7, 1)))

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
@@ -24,8 +24,6 @@ from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.shape import shape_at
-
-Float64 = NDArray[np.float64]
 
 # Views overlap if this share of the points of one has a partner in the other, and so many.
 _OVERLAP, _FEWEST = 0.1, 30
@@ -53,7 +51,7 @@ class Cloud:
     view: CloudFrame
     points: Float64
     normals: Float64
-    boundary: NDArray[np.bool_]
+    boundary: Bool
     tree: KdTree
 
     @classmethod

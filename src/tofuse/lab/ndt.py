@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
@@ -15,7 +16,7 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.interfaces import Float64, Int64, Points
+from tofuse.registration.interfaces import Points
 from tofuse.registration.selectors import at_most
 
 # Points that a cell needs, and the smallest variance of it, relative to the largest.

@@ -7,13 +7,10 @@ from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.kernels.kdtree import KdTree
 from tofuse.registration.interfaces import Alignment, Matches, Points
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # A quadric through a point has five coefficients.
 _FEWEST = 6

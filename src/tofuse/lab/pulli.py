@@ -8,17 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.multiview import (
-    Cloud,
-    Float64,
-    Pairs,
-    Relaxing,
-    resolution_of,
-    rotation_to,
-)
+from tofuse.lab.multiview import Cloud, Pairs, Relaxing, resolution_of, rotation_to
 from tofuse.parts import part
 from tofuse.registration.icp import Icp
 from tofuse.registration.rejectors import Boundary, MaxDistance

@@ -7,9 +7,10 @@ from functools import cache
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.kernels.icp import transform_points
 from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
+from tofuse.registration.interfaces import Alignment, Matches, Metric
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.pairs import in_scales
 from tofuse.registration.surface_metrics import TangentPlanes

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.multiview import Cloud, Float64, Pairs, Relaxing, rotation_to
+from tofuse.lab.multiview import Cloud, Pairs, Relaxing, rotation_to
 from tofuse.parts import part
 
 # The first view stays: by so much it counts more than all pairs.

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.castellani import free_vertices
 from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
-
-Float64 = NDArray[np.float64]
 
 
 @part("optimiser", "stochastic", label="validated")

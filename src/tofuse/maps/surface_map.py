@@ -9,8 +9,8 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels.alignment import make_target
 from tofuse.kernels.middle import median
@@ -23,9 +23,6 @@ from tofuse.kernels.surface import (
 )
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Rows of a chunk: many, as each costs a hand-over between threads, and windows reach into the next;
 # fixed, so that the number of threads changes nothing.
@@ -192,9 +189,9 @@ class Projection:
     _thinned: dict[int, Projection] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
-    def unknown(self) -> NDArray[np.bool_] | None:
+    def unknown(self) -> Bool | None:
         """(H, W) whether a pixel's ray is unknown; None if no pixel's is."""
-        unknown: NDArray[np.bool_] = np.isnan(self.lengths2)
+        unknown: Bool = np.isnan(self.lengths2)
         return unknown if unknown.any() else None
 
     @cached_property
@@ -459,7 +456,7 @@ def _with_noisy_planes(
     frame: RangeFrame,
     w: Float32,
     noise: Float32,
-    missing: NDArray[np.bool_],
+    missing: Bool,
     options: SurfaceOptions,
 ) -> SurfaceMap:
     """Return the view with planes where it is noisier than its typical pixel.
@@ -488,7 +485,7 @@ def _with_carried_planes(
     quiet: Float32,
     w: Float32,
     noise: Float32,
-    missing: NDArray[np.bool_],
+    missing: Bool,
     options: SurfaceOptions,
 ) -> SurfaceMap:
     """Return the view with the planes of their neighbours at pixels that have measured these.
@@ -508,7 +505,7 @@ def _with_carried_planes(
 
 
 @lru_cache(maxsize=8)
-def _steps(radius: int) -> tuple[NDArray[np.int32], Float32]:
+def _steps(radius: int) -> tuple[Int32, Float32]:
     """Steps to the pixels near one, the nearest first, and the growth of variance on the way.
 
     That of a plane fitted to a window of this radius: with the squared distance over the window's
@@ -522,7 +519,7 @@ def _steps(radius: int) -> tuple[NDArray[np.int32], Float32]:
     return around[order].astype(np.int32), growth.astype(np.float32)
 
 
-def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> NDArray[np.bool_]:
+def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
     """As `_near_edges`, where each pixel has a noise (H, W) of its own, as a share of its depth."""
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
@@ -536,7 +533,7 @@ def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> NDArray
     return _widened(edge, options.edge_margin)
 
 
-def _widened(edge: NDArray[np.uint8], margin: int) -> NDArray[np.bool_]:
+def _widened(edge: UInt8, margin: int) -> Bool:
     size = 2 * margin + 1
     return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
 
@@ -551,7 +548,7 @@ def _with_shared(
     return variance + np.float32(_SHARE_ERROR) * once, variance + once
 
 
-def _inverse(values: Float32, known: NDArray[np.bool_]) -> Float32:
+def _inverse(values: Float32, known: Bool) -> Float32:
     """One over each value, 0 where it is not known: at once for all, which is faster."""
     return np.reciprocal(np.where(known, values, np.float32(np.inf)))
 
@@ -638,7 +635,7 @@ def _fitted(
     w: Float32,
     rays: Float32,
     weight: Float32,
-    wanted: NDArray[np.bool_],
+    wanted: Bool,
     limit: float,
     options: SurfaceOptions,
 ) -> tuple[Float32, Float32]:
@@ -662,7 +659,7 @@ def _chunks(rows: int) -> int:
     return max(2, rows // _CHUNK_ROWS)
 
 
-def _near_edges(w: Float32, jump: float, margin: int) -> NDArray[np.bool_]:
+def _near_edges(w: Float32, jump: float, margin: int) -> Bool:
     """Pixels within `margin` of a jump in depth by a share `jump`, or of a missing pixel.
 
     There a pixel mixes light of both sides, as far as the lens blurs.

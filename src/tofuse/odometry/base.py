@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Bool, Float64
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.motion import Moment
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link, Registration
-
-Float64 = NDArray[np.float64]
 
 Status = Literal["tracked", "predicted", "lost", "skipped"]
 
@@ -57,7 +53,7 @@ class Step:
     component: int = 0
     links: tuple[Link, ...] = ()
     doubtful: bool = False
-    moving: NDArray[np.bool_] | None = None
+    moving: Bool | None = None
 
 
 class Tracker(Protocol):

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
@@ -21,8 +19,6 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.projective import ProjectiveOptions, Target, align, registration_of
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
-
-Float64 = NDArray[np.float64]
 
 
 @part("odometry", "given")

@@ -6,16 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.likeness import look_of, unlikeness
 from tofuse.registration.projective import Target
 from tofuse.registration.verification import IN_SIGHT
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Keyframes that are kept, so that memory stays flat.
 CAPACITY = 40

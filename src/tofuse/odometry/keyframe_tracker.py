@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, surface_map
@@ -24,8 +24,6 @@ from tofuse.registration.base import Link, Registration
 from tofuse.registration.projective import registration_of
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit, comparable
-
-Float64 = NDArray[np.float64]
 
 
 class KeyframeTracker(Tracker):

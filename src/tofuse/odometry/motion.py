@@ -13,11 +13,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.kernels.motion import distance_and_angle, moved, twist_between
-
-Float64 = NDArray[np.float64]
 
 # What a motion may differ from the expected one, whatever was seen before: m and rad. Carried
 # cameras at 5 to 30 frames a second stay below. At lower rates the same accelerations, of 3 m/s^2,

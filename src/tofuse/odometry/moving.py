@@ -18,19 +18,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.geometry import se3
 from tofuse.kernels import moving as kernels
 from tofuse.kernels.middle import median
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.recordings.frames import RangeFrame
-
-Bool = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 # Rows of cells of a chunk; fixed, so that the number of threads changes nothing.
 _CHUNK_ROWS = 60
@@ -573,7 +568,7 @@ def _robust_scale(ratios: Float32) -> float:
     return scale
 
 
-def _counts(outcome: UInt8, masked: Bool | None) -> NDArray[np.int64]:
+def _counts(outcome: UInt8, masked: Bool | None) -> Int64:
     """How many comparisons agree, and how many see through a surface."""
     of = [outcome == kernels.AGREES, outcome == kernels.IN_FRONT]
     if masked is not None:

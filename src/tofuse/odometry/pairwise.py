@@ -6,8 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
@@ -20,9 +20,6 @@ from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import PROBABLE, Link, Registration
 from tofuse.registration.confidence import CERTAIN
 from tofuse.registration.reduce import extent
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # The motion is followed without a search once it has predicted the results of so many of the last
 # searches, of which one more is looked at.

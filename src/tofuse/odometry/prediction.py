@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.registration.projective import UNITS, span
-
-Float64 = NDArray[np.float64]
 
 # Constrained dimensions from which an rms is measured; below, motions are known by a share.
 _LEAST_CONSTRAINED = 30.0
@@ -100,7 +98,7 @@ class Prediction:
 
 def _errors(
     poses: Float64, motions: Float64, unobservable: Sequence[Float64], ahead: int
-) -> tuple[Float64, NDArray[np.bool_]]:
+) -> tuple[Float64, Bool]:
     """Rms error of going on by a motion for some frames, of translation and rotation; (2,) each.
 
     In `UNITS`, over constrained directions, and whether there were enough of them.
@@ -121,7 +119,7 @@ def _errors(
     return np.sqrt(squares / np.maximum(dimensions, 1)), dimensions >= _LEAST_CONSTRAINED
 
 
-def runs(unobservable: Sequence[Float64]) -> NDArray[np.intp]:
+def runs(unobservable: Sequence[Float64]) -> Intp:
     """For how many frames in a row, this one included, some direction was degenerate; (N,)."""
     weak = np.array([len(u) > 0 for u in unobservable], np.intp)
     count = np.cumsum(weak)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit, comparable
 from tofuse.registration.view_pair import register_pair
-
-Float64 = NDArray[np.float64]
 
 # A search costs about as much as tracking so many frames. With one search for so many frames, being
 # lost costs no more than tracking does; some are free, as short recordings may be all large steps.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.geometry import se3
 from tofuse.odometry.attempts import Attempt, Attempts
@@ -14,8 +13,6 @@ from tofuse.odometry.relocalization import Relocalizer
 from tofuse.odometry.segmentation import Segmentation
 from tofuse.registration.agreement import AgreementOptions, agreement
 from tofuse.registration.verification import UsualFit, finely_scaled, self_scaled
-
-Float64 = NDArray[np.float64]
 
 # Between rival poses, what a deviation from the usual motion costs, as a fraction of the points:
 # little, as where a scene determines the pose a wrong one loses more.

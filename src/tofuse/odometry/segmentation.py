@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.attempts import Attempt, Attempts, Reference
@@ -12,8 +12,6 @@ from tofuse.odometry.keyframe_map import Keyframe
 from tofuse.odometry.moving import Moving, MovingObjects, without_pixels
 from tofuse.odometry.relocalization import Relocalizer
 from tofuse.registration.projective import Target
-
-Float64 = NDArray[np.float64]
 
 # Fraction of a view that moves, from which the rest is aligned once more, and which is reported.
 NOTICED = 0.01

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
@@ -17,7 +17,6 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar
 from tofuse.registration.icp import algorithm_1
 
-Float64 = NDArray[np.float64]
 Guess = Literal["identity", "previous", "odometry"]
 
 # Keeps the draws of odometry apart from those of other stages that register the same pair.

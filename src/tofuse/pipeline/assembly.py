@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.kernels.threads import threads
 from tofuse.pipeline.backend import BackEnd
 from tofuse.pipeline.checkpoint import NotKept, Stages
@@ -20,8 +20,6 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.joining import Group, Join
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop
 from tofuse.results.types import Reconstruction
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.evaluation.sightings import Sightings, sightings
 from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
@@ -48,8 +48,6 @@ from tofuse.results.verdict import ranked
 _LOOKS = 2
 
 T = TypeVar("T")
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,7 +441,7 @@ class BackEnd:
         frames, at = self._checked(graph)
         return sightings(frames, graph.poses[at]) if len(frames) > 1 else None
 
-    def _checked(self, graph: PoseGraph) -> tuple[list[RangeFrame], NDArray[np.intp]]:
+    def _checked(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """The images that are compared in the end, and where their poses are in the graph."""
         frames = [f for f in self._kept.checks if f.index in self._poses]
         row = {int(frame): k for k, frame in enumerate(graph.ids)}

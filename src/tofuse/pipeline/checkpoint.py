@@ -23,6 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import Ended, InputError, OutputError
 from tofuse.files.arrays import Arrays, read_npz, write_npz
 from tofuse.files.stamps import Stamp, stamp, stamps_in
@@ -289,7 +290,7 @@ def _json(data: NDArray[Any] | None) -> Any:
         raise StateError("it is no checkpoint") from None
 
 
-def _text(data: Any) -> NDArray[np.uint8]:
+def _text(data: Any) -> UInt8:
     return np.frombuffer(json.dumps(data, separators=(",", ":")).encode(), np.uint8)
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.sightings import Sightings
 from tofuse.geometry import se3
 from tofuse.odometry.motion import Moment, jumps
@@ -22,8 +22,6 @@ from tofuse.registration.base import Registration
 from tofuse.results.ranges import Range, in_words, is_one, runs, runs_of, size, union
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.results.verdict import ranked, verdict_of
-
-Float64 = NDArray[np.float64]
 
 # Below this share of corresponding points a registration is a guess.
 WEAK_SHARE = 0.05

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.pipeline.frame_log import FrameLog, poses_in_world
 from tofuse.posegraph.joining import Group, How, Join
 from tofuse.results.ranges import runs
 from tofuse.results.types import Component, Reconstruction
 
-Float64 = NDArray[np.float64]
 # Reconstructs frames, given their poses in one frame and what joins their components.
 Reconstruct = Callable[[FrameLog, dict[int, Float64], Sequence[Join]], Reconstruction]
 

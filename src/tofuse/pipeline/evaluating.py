@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency, poses_of_frames
 from tofuse.evaluation.trajectory import TrajectoryError, evaluate_trajectory
@@ -21,7 +21,6 @@ from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
 from tofuse.results.output import clock_of, read_run_json
 
-Float64 = NDArray[np.float64]
 Poses = str | Path | Float64
 
 _TRAJECTORY = "trajectory.txt"  # of a result

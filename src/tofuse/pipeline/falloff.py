@@ -17,9 +17,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
 from tofuse.kernels.alignment import LIGHT, POINT
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
@@ -30,7 +30,6 @@ from tofuse.registration.projective import ProjectiveOptions, Target, align, poi
 from tofuse.registration.verification import PATIENT
 from tofuse.registration.view_points import landing_pixels
 
-Float64 = NDArray[np.float64]
 Prepare = Callable[[Frame], Frame]
 
 # Pairs of frames, evenly spaced over the recording; frames from one to the other, which are doubled

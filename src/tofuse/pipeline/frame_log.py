@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
@@ -18,8 +18,6 @@ from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link
 from tofuse.results.types import FrameRecord
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

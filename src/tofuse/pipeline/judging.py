@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import Consistency, map_consistency
 from tofuse.evaluation.sightings import Sightings, compared, prepared
@@ -44,8 +44,6 @@ from tofuse.results.output import accuracy_json, plain, reasons_json, write_resu
 from tofuse.results.ranges import in_words, runs_of
 from tofuse.results.types import Reason, Reconstruction, Verdict
 from tofuse.results.verdict import ranked, verdict_of
-
-Float64 = NDArray[np.float64]
 
 # Frames whose images are compared under the poses.
 _CHECKED = 60

@@ -9,8 +9,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import side_threads
 from tofuse.odometry.base import Step
@@ -18,8 +18,6 @@ from tofuse.pipeline.frame_log import FrameLog
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.loops import ClosedLoop, Loops
 from tofuse.registration.base import Link
-
-Float64 = NDArray[np.float64]
 
 # A job begins at one frame and counts this many frames later, however soon it was done: the poses
 # are then the same on every machine. A slow machine waits there.

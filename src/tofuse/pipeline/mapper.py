@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.memory import give_back
 from tofuse.kernels.threads import thread_count, threads, undivided
@@ -29,8 +27,6 @@ from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import Frame
 from tofuse.results.types import FrameRecord, Reconstruction
-
-Float64 = NDArray[np.float64]
 
 
 class Mapper:

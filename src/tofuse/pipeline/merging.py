@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
@@ -42,8 +42,6 @@ from tofuse.results.types import (
     in_main_model,
 )
 from tofuse.results.verdict import verdict_of
-
-Float64 = NDArray[np.float64]
 
 # View pairs that are registered at most to join the same two sessions, and searches for each
 # session that is to be joined.

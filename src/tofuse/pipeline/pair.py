@@ -8,9 +8,9 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.pose import read_pose
 from tofuse.geometry import se3
@@ -21,8 +21,6 @@ from tofuse.recordings.single import SingleView, open_view
 from tofuse.registration.register import register
 from tofuse.results.folder import OutputFolder
 from tofuse.results.pair import LocalView, PairResult, pair_folder, write_pair
-
-Float64 = NDArray[np.float64]
 
 # Clouds this far out are registered about their middle: errors of rotation would have long levers.
 FAR_M = 1000.0

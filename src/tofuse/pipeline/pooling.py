@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tofuse.arrays import Float64
 
 # Degrees of freedom of Student's t (Lange, Little and Taylor 1989 suggest 4).
 _FREEDOM = 4.0

@@ -6,17 +6,13 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.filters.base import Removal, apply_filters
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Tracker
 from tofuse.pipeline.config import Config, check_views
 from tofuse.recordings.frames import Frame, RangeFrame
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.pipeline.config import Config
 from tofuse.posegraph.outside import GravityEdges, OdometryEdges
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, Source
-
-Float64 = NDArray[np.float64]
 
 Prior = Literal["auto", "none", "device"]
 

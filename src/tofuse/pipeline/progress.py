@@ -8,9 +8,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.recordings.frames import Frame
 from tofuse.results.types import FrameRecord
 
@@ -30,7 +28,7 @@ class Progress(Protocol):
         """Say something that a person should know."""
         ...
 
-    def placed(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """Show where a frame, as it is for the model, lies by what is known so far."""
         ...
 
@@ -47,7 +45,7 @@ class Silent:
     def note(self, text: str) -> None:
         """See `Progress`."""
 
-    def placed(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """See `Progress`."""
 
 
@@ -73,7 +71,7 @@ class Both:
         self.first.note(text)
         self.second.note(text)
 
-    def placed(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
         """See `Progress`."""
         self.first.placed(frame, T_world_camera)
         self.second.placed(frame, T_world_camera)

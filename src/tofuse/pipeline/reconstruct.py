@@ -10,9 +10,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
 from tofuse.filters.confidence import Confidence
@@ -32,8 +32,6 @@ from tofuse.recordings.phones import ARKIT_UP, POSES_BY
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
 from tofuse.sensor.noise import NOISE, NoiseModel
-
-Float64 = NDArray[np.float64]
 
 _TRACKING = "tracking"
 # So many frames are read and prepared in advance; each takes some of its images' size.
@@ -303,7 +301,7 @@ def reference_in_world(recording: Recording, result: Reconstruction) -> Float64 
     return np.where(np.isfinite(reference), T_world_reference @ reference, np.nan)
 
 
-def truth_points(recording: Recording, count: int = 100_000) -> NDArray[np.float32] | None:
+def truth_points(recording: Recording, count: int = 100_000) -> Float32 | None:
     """Return points (K, 3) on the true surfaces of a simulated recording, in its world frame."""
     path = Path(recording.path) / "truth" / "surface.ply"
     if not path.is_file():

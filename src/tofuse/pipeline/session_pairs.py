@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.evaluation.changes import changes
 from tofuse.evaluation.sightings import Sightings, compared
 from tofuse.maps.surface_map import SurfaceMap
@@ -17,7 +17,6 @@ from tofuse.recordings.recording import evenly
 from tofuse.results.sessions import AS_GOOD_AS_CERTAIN
 from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
 
-Float64 = NDArray[np.float64]
 View = PosedView[SurfaceMap]
 
 # Views of each session that are compared with those of the others.

@@ -8,9 +8,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.odometry.base import Status
 from tofuse.odometry.given import GivenPoses, StatedPose
@@ -24,8 +22,6 @@ from tofuse.recordings.recording import Recording
 from tofuse.results.folder import component_name, is_result, settle
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.reopening import RecordedPart, recorded_parts, reopened, where_it_lies
-
-Float64 = NDArray[np.float64]
 
 _REMEDY = "give the --out of `tofuse run`"
 

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from tofuse.arrays import Float32, Float64, Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
@@ -37,9 +37,6 @@ from tofuse.registration.projective import (
     Target,
     align,
 )
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Runs of so many views each, each of them one piece of evidence; where in the recording they begin.
 _VIEWS = 4
@@ -356,7 +353,7 @@ def _compared(
     return J, distance, weight
 
 
-def _landed(view: SurfaceMap, points: Float64) -> tuple[NDArray[np.intp], ...]:
+def _landed(view: SurfaceMap, points: Float64) -> tuple[Intp, ...]:
     """Row and column (M,) of the pixels of a view that points (M, 3) land on, and if they do."""
     grid = view.projection
     ahead = points[:, 2] > 1e-3

@@ -14,17 +14,15 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.trust import joint_covariance, pose_covariances
 from tofuse.posegraph.views import PosedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
-
-Float64 = NDArray[np.float64]
 
 _LEVEL = 0.95
 # Poses, evenly spaced, that the rms is taken over, and the least certain ones beside them.
@@ -249,7 +247,7 @@ def covariances_of(graph: PoseGraph, shown: Shown) -> Float64:
     return _HIDDEN**2 * C
 
 
-def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, Bool]:
     """Covariances (N, 6, 6) of the poses, and whether position and rotation are unbounded, (N, 2).
 
     Relative to the first one; to another if that is one of the few that are not bounded.
@@ -265,7 +263,7 @@ def _single(graph: PoseGraph, limits: Float64) -> tuple[Float64, NDArray[np.bool
     return covariances, unbounded
 
 
-def _is_unbounded(covariances: Float64, limits: Float64) -> NDArray[np.bool_]:
+def _is_unbounded(covariances: Float64, limits: Float64) -> Bool:
     """(N, 2) whether a direction of position or rotation is known no better than the limits."""
     known = np.isfinite(covariances).all((1, 2))
     out = np.ones((len(covariances), 2), np.bool_)
@@ -275,7 +273,7 @@ def _is_unbounded(covariances: Float64, limits: Float64) -> NDArray[np.bool_]:
     return out
 
 
-def _aligned(C: Float64, poses: Float64, rms: NDArray[np.bool_]) -> tuple[Float64, Float64]:
+def _aligned(C: Float64, poses: Float64, rms: Bool) -> tuple[Float64, Float64]:
     """Covariances (3m, 3m) of positions and rotations in the world, less a rigid motion of all.
 
     Parameters
@@ -299,7 +297,7 @@ def _aligned(C: Float64, poses: Float64, rms: NDArray[np.bool_]) -> tuple[Float6
     return _without(positions, motion, rms), _without(rotations, turn, rms)
 
 
-def _without(C: Float64, motion: Float64, rms: NDArray[np.bool_]) -> Float64:
+def _without(C: Float64, motion: Float64, rms: Bool) -> Float64:
     """Covariance (3m, 3m) after the best fit of motions (m, 3, k) of the chosen ones is removed."""
     k = motion.shape[2]
     flat = motion.reshape(-1, k)
@@ -308,7 +306,7 @@ def _without(C: Float64, motion: Float64, rms: NDArray[np.bool_]) -> Float64:
     return np.asarray(left @ C @ left.T, np.float64)
 
 
-def _bounds(C: Float64, rms: NDArray[np.bool_]) -> tuple[float, Float64]:
+def _bounds(C: Float64, rms: Bool) -> tuple[float, Float64]:
     """95 % bounds of the rms over the chosen ones, and of each one's length (m,)."""
     m = len(rms)
     chosen = np.repeat(rms, 3)

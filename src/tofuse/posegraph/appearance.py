@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.registration.likeness import (
     alike,
@@ -15,9 +15,6 @@ from tofuse.registration.likeness import (
     unlikeness,
     unlikeness_of_pairs,
 )
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Of pairs of nearly the same views (this many positions off either way) so many are taken: two can
 # confirm each other, and more would take the place of other loops.

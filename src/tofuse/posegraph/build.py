@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.posegraph.graph import PoseGraph
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

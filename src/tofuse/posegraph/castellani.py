@@ -17,18 +17,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import quaternion, se3
 from tofuse.parts import part
 from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_motions
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 Normalisation = Literal["thesis", "fusiello"]
 
@@ -49,7 +46,7 @@ class Problem:
         (M,) normalisation factors, rad and m.
     """
 
-    edges: NDArray[np.intp]
+    edges: Intp
     R: Float64
     t: Float64
     sigma_angle: Float64
@@ -232,7 +229,7 @@ class _Step:
 
 
 def normal_equations(
-    edges: NDArray[np.intp], free: Bool
+    edges: Intp, free: Bool
 ) -> Callable[[Float64, Float64, Float64], tuple[Any, Float64]]:
     """Prepare the assembly of ``H = J^T J`` (sparse) and ``g = -J^T r`` of the free vertices.
 

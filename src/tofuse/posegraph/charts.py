@@ -9,11 +9,9 @@ from __future__ import annotations
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import quaternion, se3
-
-Float64 = NDArray[np.float64]
 
 Rotation = Literal["tangent", "quaternion", "cosines"]
 

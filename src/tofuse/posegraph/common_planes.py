@@ -14,18 +14,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Int64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import planes as kernels
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.sparse import Factor, PairSystem
 from tofuse.registration.reduce import extent
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Integers = NDArray[np.intp]
 
 # Rounds in which cells move to the middle of their points, which lays them along the surface.
 _SETTLING = 2
@@ -124,7 +120,7 @@ class Aligned:
     """
 
     poses: Float64
-    pairs: Integers
+    pairs: Intp
     covariance: Float64
     size: float
     sigma: float
@@ -156,7 +152,7 @@ class _Points:
 class _Cells:
     """Points sorted into cells, and the plane of each."""
 
-    order: Integers
+    order: Intp
     start: Int64
     p: Float64
     x: Float64
@@ -167,7 +163,7 @@ class _Cells:
     views: Int64
 
     @cached_property
-    def shared(self) -> NDArray[np.bool_]:
+    def shared(self) -> Bool:
         """(S,) cells that several views see."""
         return self.views > 1
 
@@ -354,7 +350,7 @@ def _fitted(points: _Points, x: Float64, cell: Int64, size: int) -> _Cells:
     return _Cells(order, start, points.p[order], x, view, mean, axes, spread, views)
 
 
-def _seen_from_behind(cells: _Cells, poses: Float64) -> NDArray[np.bool_]:
+def _seen_from_behind(cells: _Cells, poses: Float64) -> Bool:
     """(M,) points, by cell, of the back of what has two sides that are apart."""
     size = len(cells.mean)
     cell = np.repeat(np.arange(size), np.diff(cells.start))
@@ -428,7 +424,7 @@ def _variance(cells: _Cells, least: int) -> Float64:
     return variance
 
 
-def _pairs(divisions: Sequence[_Cells], variances: Sequence[Float64], n: int) -> Integers:
+def _pairs(divisions: Sequence[_Cells], variances: Sequence[Float64], n: int) -> Intp:
     """Pairs of views i < j that see the same cell."""
     common = np.zeros((n, n))
     for cells, variance in zip(divisions, variances, strict=True):

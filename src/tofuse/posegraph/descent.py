@@ -6,17 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph import robust
 from tofuse.posegraph.charts import CHARTS, Chart, Rotation
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import Factor, PairSystem
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 
 _NOTHING = 1e-12  # mean squared error of an edge, in units of its information: rounding
 
@@ -30,7 +26,7 @@ class Problem:
 
     def __init__(
         self,
-        pairs: Integers,
+        pairs: Intp,
         measurements: Float64,
         information: Float64,
         fixed: Bool,

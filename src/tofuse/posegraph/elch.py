@@ -9,18 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
 from tofuse.posegraph.sparse import parts_of
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 _LEAST = 1e-12  # of the largest: no edge is so certain that it has no length
 
@@ -77,9 +74,7 @@ def _lengths(graph: PoseGraph) -> tuple[Float64, Float64]:
     return out[0], out[1]
 
 
-def _shares(
-    graph: PoseGraph, length: Float64, known: NDArray[np.bool_], loop: int
-) -> Float64 | None:
+def _shares(graph: PoseGraph, length: Float64, known: Bool, loop: int) -> Float64 | None:
     """(N,) share of the loop's error that each pose takes, 0 to 1; None where it closes nothing."""
     n = len(graph.ids)
     start, end = graph.edges[loop]

@@ -11,15 +11,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import replacing
 from tofuse.files.reading import read_text
 from tofuse.geometry import quaternion
 from tofuse.posegraph.graph import PoseGraph
-
-Float64 = NDArray[np.float64]
 
 VERTEX = "VERTEX_SE3:QUAT"
 EDGE = "EDGE_SE3:QUAT"

@@ -6,13 +6,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +31,7 @@ class Gravity:
         McClure): an accelerometer that is moved measures more than gravity.
     """
 
-    vertices: Integers
+    vertices: Intp
     directions: Float64
     sigma: Float64
     world: Float64 | None = None
@@ -57,7 +54,7 @@ class Anchors:
         (a, 6, 6) of the right perturbation, order (tx ty tz rx ry rz).
     """
 
-    vertices: Integers
+    vertices: Intp
     poses: Float64
     information: Float64
 
@@ -84,12 +81,12 @@ class PoseGraph:
         What is known of single poses, or None. g2o files don't hold it.
     """
 
-    ids: Integers
+    ids: Intp
     poses: Float64
-    edges: Integers
+    edges: Intp
     measurements: Float64
     information: Float64
-    loop: NDArray[np.bool_]
+    loop: Bool
     gravity: Gravity | None = None
     anchors: Anchors | None = None
 
@@ -137,7 +134,7 @@ class PoseGraph:
         T_i_j = se3.inverse(self.poses[i]) @ self.poses[j]
         return se3.log(se3.inverse(self.measurements) @ T_i_j)
 
-    def chi2(self, edges: NDArray[np.bool_] | None = None) -> float:
+    def chi2(self, edges: Bool | None = None) -> float:
         """Return the sum of squared errors weighted by the information, of some edges or all."""
         r = self.residuals()
         each = np.einsum("mi,mij,mj->m", r, self.information, r)

@@ -19,10 +19,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.motion import moved, twist_between
 from tofuse.maps.surface_map import SurfaceMap
@@ -44,8 +44,6 @@ from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
 from tofuse.registration.view_pair import follow, register_pair
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 How = Literal["links", "motion"]
 View = PosedView[SurfaceMap]
 
@@ -99,7 +97,7 @@ class Stretch:
     """
 
     component: int
-    frames: NDArray[np.intp]
+    frames: Intp
     times: Float64
     poses: Float64
     views: tuple[View, ...]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Intp
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.parts import part
@@ -15,9 +15,6 @@ from tofuse.posegraph.graph import GraphPart, Gravity, Optimisation, Optimiser, 
 from tofuse.posegraph.robust import Robust, Settings
 from tofuse.posegraph.solve import Solution, solve
 from tofuse.posegraph.sparse import parts_of
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 _RIGID = 1e-3  # by how much a rotation may be off orthonormal
 _FARTHEST_M = 1e9  # beyond it, a position is damage
@@ -102,7 +99,7 @@ class LevenbergMarquardt(Optimiser):
             tuple(parts),
         )
 
-    def _solve(self, graph: PoseGraph, vertices: Integers, edges: Integers) -> Solution:
+    def _solve(self, graph: PoseGraph, vertices: Intp, edges: Intp) -> Solution:
         """Solve one part; anchors are edges to one more vertex, behind the others."""
         number = np.full(len(graph.ids), -1)
         number[vertices] = np.arange(len(vertices))
@@ -131,7 +128,7 @@ class LevenbergMarquardt(Optimiser):
         )  # fmt: skip
 
 
-def _gravity_of(graph: PoseGraph, number: Integers) -> Gravity | None:
+def _gravity_of(graph: PoseGraph, number: Intp) -> Gravity | None:
     gravity = graph.gravity
     if gravity is None:
         return None
@@ -147,7 +144,7 @@ def _gravity_of(graph: PoseGraph, number: Integers) -> Gravity | None:
     )
 
 
-def pieces(graph: PoseGraph) -> list[tuple[Integers, Integers]]:
+def pieces(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
     """Positions of the vertices and of the edges of each connected part.
 
     Anchors join what they hold; gravity does not, as it leaves four of six directions free.

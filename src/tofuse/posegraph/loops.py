@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import LoopRecord
@@ -16,8 +16,6 @@ from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1
-
-Float64 = NDArray[np.float64]
 
 # Keeps the draws of loops apart from those of other stages that register the same pair.
 SEED_STAGE = 2

@@ -16,16 +16,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.graph import Optimisation, Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import check_graph
 from tofuse.posegraph.sparse import PairSystem
-
-Float64 = NDArray[np.float64]
 
 # Heading, pitch, roll of a camera (y down): singular only where it looks straight up or down.
 _EULER = "YXZ"

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
@@ -22,9 +22,6 @@ from tofuse.posegraph.loops import (
 )
 from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 
 @part("loops", "nearby", label="validated")
@@ -67,7 +64,7 @@ class Nearby(LoopDetector):
         """See `LoopDetector.start`. What a person gives takes the place of what is found."""
         return _NearbyLoops(self, seed, given)
 
-    def candidates(self, poses: Float64) -> Integers:
+    def candidates(self, poses: Float64) -> Intp:
         """Return the positions of the cameras that the newest may see again, best first.
 
         `poses` is (N, 4, 4) T_world_camera in the order of the frames; the newest comes last.

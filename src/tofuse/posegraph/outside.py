@@ -13,15 +13,13 @@ from itertools import pairwise
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.descent import vertical
 from tofuse.posegraph.graph import Gravity, PoseGraph
-
-Float64 = NDArray[np.float64]
 
 _MEDIAN = 5.3481  # of a chi-square variable with six degrees of freedom
 
@@ -43,10 +41,10 @@ class Sensed:
         (N,) number of the recording, of several joined ones: each has its own odometry.
     """
 
-    ids: NDArray[np.intp]
+    ids: Intp
     odometry: Float64
     gravity: Float64
-    parts: NDArray[np.intp]
+    parts: Intp
 
 
 @dataclass(frozen=True)
@@ -283,9 +281,7 @@ class OdometryEdges(Outside):
         sigma[:, 3:] = (self.least_rad + self.share_rad * angle)[:, None]
         return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
 
-    def _scale(
-        self, sensed: Sensed, graph: PoseGraph, C: Float64, first: NDArray[np.intp]
-    ) -> float | None:
+    def _scale(self, sensed: Sensed, graph: PoseGraph, C: Float64, first: Intp) -> float | None:
         """How many times the stated errors explain the misfit; None beyond the limit.
 
         Compared are the motions that were measured: from a reference to a frame.

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Bool
 
 
-def maximum_consistent_set(
-    consistent: NDArray[np.bool_], weights: Sequence[float] | None = None
-) -> list[int]:
+def maximum_consistent_set(consistent: Bool, weights: Sequence[float] | None = None) -> list[int]:
     """Return the clique of largest weight, ascending; of equals the one with the lowest indices.
 
     Exact, by branch and bound: made for tens of measurements, not for thousands.

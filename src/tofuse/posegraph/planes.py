@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
@@ -23,8 +23,6 @@ from tofuse.posegraph.refinement import (
 )
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
 
 
 @part("refinement", "planes")
@@ -108,7 +106,7 @@ class _Planes(Refiner):
         return replace(moved_to(unchanged, at, after), edges=edges)
 
 
-def _edges(found: Aligned, ids: Sequence[int], lost: NDArray[np.bool_]) -> list[Measured]:
+def _edges(found: Aligned, ids: Sequence[int], lost: Bool) -> list[Measured]:
     """What all views together say of neighbours: of all pairs it would be said many times."""
     out = []
     for (i, j), C in zip(found.pairs, found.covariance, strict=True):

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
@@ -25,10 +25,6 @@ from tofuse.posegraph.descent import vertical
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import PairSystem
 from tofuse.posegraph.views import KeptView, overlaps
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Integers = NDArray[np.intp]
 
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 _PAIRS_A_CHUNK = 8
@@ -125,8 +121,8 @@ class Support:
         (P,) number of its residuals.
     """
 
-    target: Integers
-    source: Integers
+    target: Intp
+    source: Intp
     good: Float64
     terms: Float64
 
@@ -165,7 +161,7 @@ class Refined:
 
     poses: Float64
     errors: Float64
-    pairs: Integers
+    pairs: Intp
     moved: tuple[float, ...]
     before: Support
     after: Support
@@ -186,7 +182,7 @@ class Beside:
         Directions in which things fall, or None.
     """
 
-    pairs: Integers
+    pairs: Intp
     measured: Float64
     information: Float64
     gravity: Gravity | None = None
@@ -209,7 +205,7 @@ class Bodies:
         (N, 4, 4) how it is fixed there.
     """
 
-    of: Integers
+    of: Intp
     T_body_view: Float64
 
     def poses(self, views: Float64) -> Float64:
@@ -221,7 +217,7 @@ class Bodies:
         """(N, 4, 4) T_world_view, by the poses (M, 4, 4) of their bodies."""
         return np.asarray(bodies[self.of] @ self.T_body_view, np.float64)
 
-    def apart(self, pairs: Integers) -> Integers:
+    def apart(self, pairs: Intp) -> Intp:
         """Those of the pairs (M, 2) of views that can move against each other."""
         i, j = self.of[pairs].T
         return pairs[i != j]
@@ -231,8 +227,8 @@ class Bodies:
 class _Pairs:
     """Directed pairs, what is known of each, and what was summed last."""
 
-    target: Integers
-    source: Integers
+    target: Intp
+    source: Intp
     exposure: Float64
     scale_g: Float64
     scale_p: Float64
@@ -248,7 +244,7 @@ def refine(
     *,
     calibrate: Sequence[int] = (),
     beside: Beside | None = None,
-    pairs: Integers | None = None,
+    pairs: Intp | None = None,
     bodies: Bodies | None = None,
 ) -> Refined:
     """Move all views until they agree with all that they overlap with.
@@ -340,7 +336,7 @@ class Response:
             -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
         )
 
-    def sigma(self, pairs: Integers, views: int) -> Float64:
+    def sigma(self, pairs: Intp, views: int) -> Float64:
         """(ERRORS,) standard deviations, by how much views (of pairs (M, 2)) differ in it.
 
         Noise that neighbouring pixels share, and errors of single views, are in it; errors that
@@ -357,7 +353,7 @@ class Response:
 def response(
     views: Sequence[KeptView],
     poses: Float64,
-    pairs: Integers,
+    pairs: Intp,
     options: RefineOptions,
     *,
     beside: Beside | None = None,
@@ -411,7 +407,7 @@ def response(
 
 def alone(
     views: Sequence[KeptView],
-    pairs: Integers,
+    pairs: Intp,
     T_i_j: Float64,
     options: RefineOptions,
     errors: Float64,
@@ -443,7 +439,7 @@ def alone(
     return np.asarray(se3.inverse(poses[::2]) @ poses[1::2], np.float64)
 
 
-def chosen(pairs: Integers, neighbours: int) -> Integers:
+def chosen(pairs: Intp, neighbours: int) -> Intp:
     """At most so many earlier partners of each view, spread evenly, first and last included."""
     keep = [np.zeros(0, np.intp)]
     for j in np.unique(pairs[:, 1]):
@@ -470,7 +466,7 @@ def _no_pairs() -> _Pairs:
 
 def _directed(
     views: Sequence[KeptView],
-    pairs: Integers,
+    pairs: Intp,
     options: RefineOptions,
     before: _Pairs,
     beside: Beside,
@@ -555,7 +551,7 @@ def _allow_for_shared(
     sums = np.empty((len(lit), shared_error.PATCHES, patch_kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
 
-    def sum_up(which: Integers) -> None:
+    def sum_up(which: Intp) -> None:
         def work(a: int, b: int) -> None:
             for k in which[a:b]:
                 source = views[state.source[lit[k]]]
@@ -607,7 +603,7 @@ def _support(
     return Support(state.target, state.source, good, state.rows[:, kernels.TERMS])
 
 
-def _alone(poses: Float64, pairs: Integers, state: _Pairs) -> tuple[Float64, Float64]:
+def _alone(poses: Float64, pairs: Intp, state: _Pairs) -> tuple[Float64, Float64]:
     """What each pair measures by itself: T_i_j, and its information."""
     H, g = _without_exposure(state)
     H, g = H[:, :6, :6], g[:, :6]

@@ -8,8 +8,8 @@ from functools import partial
 from typing import ClassVar, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.files.spill import Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
@@ -23,8 +23,6 @@ from tofuse.posegraph.suspicion import Suspicion, loop_gap, of_submaps, suspicio
 from tofuse.posegraph.views import KeptView, Outline, PosedView, Spilled, ViewStore
 from tofuse.recordings.frames import Frame
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 CameraError = Literal["offset", "scale", "focal"]
 
 # Neighbouring pixels share their noise: so many count as one.
@@ -347,7 +345,7 @@ def _beside(ids: Sequence[int], told: Told) -> Beside:
     )
 
 
-def without_losers(before: Float64, after: Float64, lost: NDArray[np.bool_]) -> Float64:
+def without_losers(before: Float64, after: Float64, lost: Bool) -> Float64:
     """Poses (N, 4, 4) `after`, but views that lost support stay where a neighbour had them.
 
     Parameters
@@ -382,7 +380,7 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
     return moved.astype(np.float32)
 
 
-def moved_to(unchanged: Refinement, at: NDArray[np.intp], after: Float64) -> Refinement:
+def moved_to(unchanged: Refinement, at: Intp, after: Float64) -> Refinement:
     """What is kept of a refinement by which the poses at positions `at` (ascending) become `after`.
 
     Parameters
@@ -402,7 +400,7 @@ def moved_to(unchanged: Refinement, at: NDArray[np.intp], after: Float64) -> Ref
     )
 
 
-def followed(poses: Float64, at: NDArray[np.intp], after: Float64) -> Float64:
+def followed(poses: Float64, at: Intp, after: Float64) -> Float64:
     """All poses (N, 4, 4), when those at positions `at` (ascending) have become `after`.
 
     Each frame keeps its motion relative to the views before and after it, and lies between what

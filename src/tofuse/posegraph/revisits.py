@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels.spread import executor
 from tofuse.maps.surface_map import SurfaceMap
@@ -43,9 +43,6 @@ from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit
 from tofuse.registration.view_pair import follow, register_pair
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 View = PosedView[SurfaceMap]
 
 _POINTS = 600

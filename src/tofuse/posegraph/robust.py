@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.posegraph.charts import Rotation
-
-Float64 = NDArray[np.float64]
 
 Robust = Literal["none", "huber", "cauchy", "geman-mcclure", "dcs", "switchable", "truncated"]
 

@@ -16,15 +16,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
 from tofuse.maps.surface_map import SurfaceMap
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # Patches in a row, and rows of patches; errors this far apart are still alike (by 1/e), as a share
 # of the image's width, as the tracker's covariance has it.

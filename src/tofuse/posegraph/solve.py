@@ -14,18 +14,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.posegraph import robust
 from tofuse.posegraph.descent import Descent, Problem
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.robust import Settings
 from tofuse.posegraph.sparse import Factor, first_of_parts
 from tofuse.posegraph.truncated import Truncated
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +58,7 @@ class Solution:
 
 def solve(
     poses: Float64,
-    pairs: Integers,
+    pairs: Intp,
     measurements: Float64,
     information: Float64,
     *,

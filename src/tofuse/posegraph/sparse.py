@@ -14,16 +14,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
-Bool = NDArray[np.bool_]
 
 # Numbers of a dense right side that is solved for at a time.
 _AT_ONCE = 4_000_000
@@ -45,9 +41,7 @@ class PairSystem:
         Unknowns of each pose; 6 wherever H and g are those of a relative pose.
     """
 
-    def __init__(
-        self, n: int, pairs: Integers, fixed: Bool | None = None, *, size: int = 6
-    ) -> None:
+    def __init__(self, n: int, pairs: Intp, fixed: Bool | None = None, *, size: int = 6) -> None:
         self.n, self.size = n, size
         self.pairs = np.asarray(pairs, np.intp).reshape(-1, 2)
         self.fixed = first_of_parts(n, self.pairs) if fixed is None else np.asarray(fixed, bool)
@@ -64,7 +58,7 @@ class PairSystem:
         self._sums(i, j, both)
         self._layout()
 
-    def _sums(self, i: Integers, j: Integers, both: Integers) -> None:
+    def _sums(self, i: Intp, j: Intp, both: Intp) -> None:
         """Make the matrices that add up what several pairs say of one block."""
         n, m = len(self.free), len(self.pairs)
         self._sum_i = _indicator(self.number[i], n, m)
@@ -232,7 +226,7 @@ class Factor:
             out[system.free] = x.reshape(-1, system.size)
         return out
 
-    def joint_covariance(self, vertices: Integers) -> Float64:
+    def joint_covariance(self, vertices: Intp) -> Float64:
         """(v k, v k) covariance of some poses' perturbations together; zero for fixed ones."""
         system, k = self.system, self.system.size
         vertices = np.asarray(vertices, np.intp)
@@ -309,7 +303,7 @@ class Factor:
         return values[place[:n]], values[place[n:]]
 
 
-def parts_of(n: int, pairs: Integers) -> Integers:
+def parts_of(n: int, pairs: Intp) -> Intp:
     """(n,) number of the connected part that each vertex is in, counted by their first vertices."""
     i, j = np.asarray(pairs, np.intp).reshape(-1, 2).T
     adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
@@ -318,7 +312,7 @@ def parts_of(n: int, pairs: Integers) -> Integers:
     return np.argsort(np.argsort(first))[where]
 
 
-def first_of_parts(n: int, pairs: Integers) -> Bool:
+def first_of_parts(n: int, pairs: Intp) -> Bool:
     """(n,) mask of the first vertex of each connected part."""
     first = np.zeros(n, bool)
     if n:
@@ -326,14 +320,14 @@ def first_of_parts(n: int, pairs: Integers) -> Bool:
     return first
 
 
-def _indicator(rows: Integers, n: int, m: int) -> Any:
+def _indicator(rows: Intp, n: int, m: int) -> Any:
     """Make an (n, m) matrix that adds column k to row rows[k]; rows below 0 are left out."""
     used = np.flatnonzero(rows >= 0)
     ones = np.ones(len(used))
     return sparse.csr_matrix((ones, (rows[used], used)), shape=(n, m))
 
 
-def _elimination_order(n: int, i: Integers, j: Integers) -> Integers:
+def _elimination_order(n: int, i: Intp, j: Intp) -> Intp:
     """Order of elimination with little fill-in: minimum degree on the graph of the poses."""
     if n < 2:
         return np.arange(n)

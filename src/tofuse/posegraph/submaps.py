@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.spread import executor
@@ -33,8 +33,6 @@ from tofuse.posegraph.refine import (
 )
 from tofuse.posegraph.views import KeptView, Outlined, looked_at, overlaps
 
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 A = TypeVar("A")
 
 # Views of its neighbours that a submap takes in, at most, as a share of its own.
@@ -55,8 +53,8 @@ class Submap:
         (M, 2) positions i < j of the views, among all, that are compared here.
     """
 
-    views: Integers
-    pairs: Integers
+    views: Intp
+    pairs: Intp
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +62,12 @@ class InSubmap:
     """One submap as it was refined: its views, where they are among all, and what was found."""
 
     views: Sequence[KeptView]
-    at: Integers
+    at: Intp
     refined: Refined
     beside: Beside
 
 
-def cut(middles: Float64, most: int) -> NDArray[np.intp]:
+def cut(middles: Float64, most: int) -> Intp:
     """(N,) number of the part that each of the places (N, 3) is in, of at most `most` places each.
 
     Halves, or as near to it as numbers allow, across the longest axis, again and again.
@@ -77,7 +75,7 @@ def cut(middles: Float64, most: int) -> NDArray[np.intp]:
     label = np.zeros(len(middles), np.intp)
     count = 0
 
-    def split(rows: Integers, parts: int) -> None:
+    def split(rows: Intp, parts: int) -> None:
         nonlocal count
         if parts == 1:
             label[rows] = count
@@ -96,7 +94,7 @@ def cut(middles: Float64, most: int) -> NDArray[np.intp]:
     return label
 
 
-def submaps(middles: Float64, pairs: Integers, most: int) -> list[Submap]:
+def submaps(middles: Float64, pairs: Intp, most: int) -> list[Submap]:
     """Cut views that look at places (N, 3), and overlap in pairs (M, 2), into submaps.
 
     A pair is compared in the submap of one of its views: that of the later one, as far as the other
@@ -120,8 +118,8 @@ def refine_submaps(
     poses: Float64,
     options: RefineOptions,
     most: int,
-    load: Callable[[Integers], list[KeptView]],
-    beside: Callable[[Integers | None], Beside],
+    load: Callable[[Intp], list[KeptView]],
+    beside: Callable[[Intp | None], Beside],
     ask: Callable[[InSubmap], A],
     calibrate: Sequence[int] = (),
 ) -> tuple[Refined, list[A]]:
@@ -229,7 +227,7 @@ def _believed(refined: Refined, start: Float64) -> Refined:
 
 
 def _solved(
-    poses: Float64, pairs: Integers, measured: Float64, information: Float64, beside: Beside
+    poses: Float64, pairs: Intp, measured: Float64, information: Float64, beside: Beside
 ) -> Float64:
     """Poses (N, 4, 4) at which all pairs together are satisfied best; the first stays."""
     before = np.arange(len(poses) - 1)

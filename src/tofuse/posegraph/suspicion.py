@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.refine import (
@@ -30,9 +30,6 @@ from tofuse.posegraph.refine import (
     response,
 )
 from tofuse.posegraph.views import KeptView
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # Light that comes by other ways, and pixels that see two surfaces, look like a focal length that is
 # wrong by up to a percent; cameras come calibrated to better than that. Depths are off by a
@@ -256,7 +253,7 @@ def loop_gap(
     return Gap(views[i].surface.index, views[j].surface.index, gaps[0], gaps[1], depth)
 
 
-def longest_loop(pairs: Integers) -> tuple[int, int] | None:
+def longest_loop(pairs: Intp) -> tuple[int, int] | None:
     """Ends of the pair that are furthest apart in time and joined by neighbours all the way."""
     if not len(pairs):
         return None

@@ -22,15 +22,12 @@ the loops, up to a limit.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.posegraph import robust
 from tofuse.posegraph.descent import Descent, Problem
 from tofuse.posegraph.robust import Settings
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 _QUARTILE = 3.4546  # of a chi-square variable with six degrees of freedom
 _ROUNDS = 20  # at most so many times loops are taken in or left out

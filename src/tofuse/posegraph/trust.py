@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.sparse import first_of_parts, parts_of
-
-Float64 = NDArray[np.float64]
 
 # A loop that counts with less of its information is left out.
 LEFT_OUT = 0.05
@@ -86,7 +84,7 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
     return np.asarray((axes * np.maximum(variances, 0)) @ axes.T, np.float64)
 
 
-def joint_covariance(graph: PoseGraph, some: NDArray[np.intp]) -> Float64 | None:
+def joint_covariance(graph: PoseGraph, some: Intp) -> Float64 | None:
     """(6v, 6v) covariance of some poses together, relative to the first one of the graph.
 
     None where the measurements do not constrain all poses of the graph.
@@ -132,7 +130,7 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     return out
 
 
-def _problem(graph: PoseGraph, fixed: NDArray[np.bool_]) -> Problem:
+def _problem(graph: PoseGraph, fixed: Bool) -> Problem:
     return Problem(
         graph.edges, graph.measurements, graph.information, fixed, graph.gravity, "tangent"
     )

@@ -9,9 +9,9 @@ from typing import Any, Generic, Protocol, TypeVar
 from weakref import finalize
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tofuse.arrays import Float32, Float64, Int64, Intp
 from tofuse.files.spill import Scratch, Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
@@ -20,10 +20,6 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import Projection, SurfaceMap
 from tofuse.posegraph import shared_error
 from tofuse.registration.projective import points_of
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # Of every view, to tell which views overlap: so many points, and an image of this width.
 _OVERLAP_POINTS = 150
@@ -104,7 +100,7 @@ class KeptView:
         return self.outline.middle
 
     @cached_property
-    def patches(self) -> NDArray[np.int64]:
+    def patches(self) -> Int64:
         """(N,) the patch of the image that each point is of, see `shared_error`."""
         return shared_error.patches_of(self.points, self.surface)
 
@@ -301,7 +297,7 @@ class ViewStore(Generic[V]):
 
 def overlaps(
     views: Sequence[Outlined], poses: Float64, least: float, *, first: int = 0
-) -> tuple[Integers, Float64]:
+) -> tuple[Intp, Float64]:
     """Pairs of views that see at least a share `least` of each other, and that share.
 
     The share is the smaller of both ways. It counts points that lie near a surface of the other
@@ -338,7 +334,7 @@ def looked_at(views: Sequence[Outlined], poses: Float64) -> Float64:
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], middles) + poses[:, :3, 3])
 
 
-def nearby(middles: Float64, first: int = 0) -> tuple[Integers, Integers]:
+def nearby(middles: Float64, first: int = 0) -> tuple[Intp, Intp]:
     """Pairs of views that are worth comparing, by the middles (N, 3) of what they see.
 
     All, where there are few views. Of many each is paired with those of the nearest middles, and
@@ -368,8 +364,8 @@ def nearby(middles: Float64, first: int = 0) -> tuple[Integers, Integers]:
 def _shares(
     views: Sequence[Outlined],
     poses: Float64,
-    target: Integers,
-    source: Integers,
+    target: Intp,
+    source: Intp,
     least: float,
 ) -> Float64:
     """Share of each source's points that its target sees; 0 where that is below `least`."""

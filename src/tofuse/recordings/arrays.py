@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
@@ -136,7 +137,7 @@ def _optional(
 
 def _to_metres(
     images: list[NDArray[Any]], unit_m: float | None
-) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
+) -> Callable[[NDArray[Any]], Float64]:
     whole = images[0].dtype.kind in "iub"
     scale = unit_m if unit_m is not None else (_MILLIMETRES if whole else 1.0)
     if not (np.isfinite(scale) and scale > 0):
@@ -177,7 +178,7 @@ def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
     return Pinhole(width, height, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
 
-def _times(given: ArrayLike | None, count: int) -> NDArray[np.float64]:
+def _times(given: ArrayLike | None, count: int) -> Float64:
     if given is None:
         return np.arange(count) / 30
     times = np.asarray(given, float)
@@ -190,7 +191,7 @@ def _times(given: ArrayLike | None, count: int) -> NDArray[np.float64]:
     return times
 
 
-def _poses(name: str, given: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+def _poses(name: str, given: ArrayLike | None, count: int) -> Float64 | None:
     if given is None:
         return None
     poses = np.asarray(given, float)

@@ -7,17 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tofuse.arrays import Bool, Float32, Float64, Int32
 from tofuse.errors import InputError
 from tofuse.recordings.frames import RangeFrame
-
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 # A surface is seen if this share of the frames, and as many frames, agree on its depth.
 _LEAST_SHARE, _LEAST_FRAMES = 0.15, 3
@@ -211,7 +207,7 @@ def _median(values: Float32, where: Bool | None) -> Float32:
     return np.nan_to_num(found).astype(np.float32)
 
 
-def _check_still(far: FarSurface, often: NDArray[np.float64]) -> None:
+def _check_still(far: FarSurface, often: Float64) -> None:
     """Refuse a background that does not stay where it is around the image, and one that is all."""
     still = far.share >= _STILL
     sides = sorted(float(side.mean()) for side in (still[0], still[-1], still[:, 0], still[:, -1]))
@@ -243,7 +239,7 @@ def _check_whole(masks: Sequence[Bool], z: Float32) -> None:
         )
 
 
-def _own(z: Float32, passing: Float32, often: NDArray[np.float64]) -> Bool:
+def _own(z: Float32, passing: Float32, often: Float64) -> Bool:
     """Say where the far surface z (H, W) is the object's own, as it hides the background always.
 
     Such a piece of the far surface lies nearer than the pieces around it. Where the object passes

@@ -9,15 +9,12 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import check_size
 from tofuse.recordings.ros_messages import GREY, image, taken
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 MISSING = "give `pip install 'tofuse[ros]'`, which brings rosbags"
 APART_S = 0.02  # amplitude farther from its depth than this is of another frame

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import input_error, is_file, read_text
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
@@ -53,7 +54,7 @@ class ColorCamera:
     """
 
     camera: Pinhole
-    T_color_depth: NDArray[np.float64]
+    T_color_depth: Float64
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_numbers
@@ -19,8 +20,6 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES
 from tofuse.recordings.reader import SURE, Sniff
 from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
-
-Float64 = NDArray[np.float64]
 
 # From here on float32 steps by more than half a millimetre.
 MAP_COORDINATES_M = 8192.0

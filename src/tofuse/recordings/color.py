@@ -5,20 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Intp, UInt8
 from tofuse.recordings.camera_file import ColorCamera, check_size
 from tofuse.recordings.frames import RangeFrame
-
-Float64 = NDArray[np.float64]
 
 # A point is hidden if another one, nearer by more than this share, lands beside it.
 HIDDEN_SHARE = 0.05
 
 
 def sampled_color(
-    frame: RangeFrame, image: NDArray[np.uint8], color: ColorCamera | None, where: str | Path
-) -> NDArray[np.uint8]:
+    frame: RangeFrame, image: UInt8, color: ColorCamera | None, where: str | Path
+) -> UInt8:
     """Colour (H, W, 3) of each valid depth pixel, from where its point lands in the image.
 
     Black where the point is out of the colour image, or hidden there by a nearer surface that the
@@ -56,7 +54,7 @@ def _cell(frame: RangeFrame, color: ColorCamera) -> int:
     return max(1, int(np.ceil(2 * pitch * color.camera.fx)))
 
 
-def _hidden(u: NDArray[np.intp], v: NDArray[np.intp], z: Float64) -> NDArray[np.bool_]:
+def _hidden(u: Intp, v: Intp, z: Float64) -> Bool:
     """Whether each point lies behind the nearest one of its cell."""
     if len(z) == 0:
         return np.zeros(0, bool)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import new_folder
@@ -24,8 +23,6 @@ from tofuse.recordings.native import (
 )
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.correction import DepthCorrection
-
-Float64 = NDArray[np.float64]
 
 FINEST_UNIT_M = 1e-4
 FINEST_SIGMA_M = 1e-5

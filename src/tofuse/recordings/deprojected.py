@@ -12,17 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, RayTable
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.organised import PINHOLE_PIXELS
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Points that the polynomial is fitted to, at most, and columns and rows of an image.
 _SAMPLED, _FEWEST, _MOST = 8000, 24, 8192
@@ -198,13 +194,13 @@ class _Lattice:
             out[part] = _powers(variables, self.degree) @ self.terms
         return out
 
-    def pixels(self, points: Float32) -> tuple[NDArray[np.intp], Bool]:
+    def pixels(self, points: Float32) -> tuple[Intp, Bool]:
         """(N, 2) nearest pixels of points (N, 3), and (N,) which points lie at their centres."""
         at = self(points[:, :2].astype(np.float64) / points[:, 2:])
         pixel = np.rint(at)
         return pixel.astype(np.intp), np.asarray((np.abs(at - pixel) < _OFF).all(1))
 
-    def moved(self, origin: NDArray[np.intp]) -> _Lattice:
+    def moved(self, origin: Intp) -> _Lattice:
         """Count columns and rows from `origin` (2,)."""
         terms = self.terms.copy()
         terms[0] -= origin
@@ -256,9 +252,7 @@ def _middle_of(slopes: Float64) -> tuple[Float64, Float64] | None:
     return part[np.argmin(np.abs(part - np.median(part, axis=0)).max(1))], np.array(steps)
 
 
-def _camera(
-    lattice: _Lattice, at: NDArray[np.intp], slopes: Float64, width: int, height: int
-) -> Camera | None:
+def _camera(lattice: _Lattice, at: Intp, slopes: Float64, width: int, height: int) -> Camera | None:
     """The camera with the mean slope (N, 2) of each pixel (N, 2); of others as the lattice goes."""
     cell = at @ (1, width)
     count = np.bincount(cell, minlength=width * height)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_header, read_image
 from tofuse.geometry.cameras import Camera
@@ -16,8 +14,6 @@ from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.sources import FileSource
-
-Float64 = NDArray[np.float64]
 
 
 class DepthImageSource(FileSource):

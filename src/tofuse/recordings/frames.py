@@ -11,8 +11,9 @@ from functools import cached_property
 from typing import Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Bool, Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import (
     Camera,
@@ -21,11 +22,6 @@ from tofuse.geometry.cameras import (
     unknown_rays,
     z_from_range,
 )
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 DepthKind = Literal["z", "range"]
 AmplitudeKind = Literal["raw", "range_compensated", "ir"]

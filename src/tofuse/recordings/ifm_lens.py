@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import RayTable
 from tofuse.recordings.camera_file import MAX_SLOPE
-
-Float64 = NDArray[np.float64]
 
 BOUGUET, FISHEYE = 0, 2
 # version, units of distance and amplitude, 3 factors, 6 of the mounting, then model and numbers.

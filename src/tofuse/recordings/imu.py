@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tofuse.arrays import Float64, Intp
 
 ACCELERATION = ("ax", "ay", "az")
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
@@ -70,7 +69,7 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
     return out
 
 
-def _nearest(times: Float64, at: Float64) -> NDArray[np.intp]:
+def _nearest(times: Float64, at: Float64) -> Intp:
     """(S,) which of the times each of `at` is nearest to, the earlier one of two."""
     order = np.argsort(times, kind="stable")
     ordered = times[order]

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import UInt8
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import make_folder, new_folder, write_text
 from tofuse.files.images import write_png
@@ -114,7 +114,7 @@ def _name(number: int, seconds: float) -> str:
     return f"{number:06d}-{max(0, round(seconds * 1e6)):012d}"
 
 
-def _color(frame: RangeFrame, white: float) -> NDArray[np.uint8]:
+def _color(frame: RangeFrame, white: float) -> UInt8:
     if frame.color_image is not None:
         return frame.color_image
     grey = np.zeros(frame.depth.shape, np.uint8)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float32, Float64, UInt16
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, replacing, write_text
 from tofuse.files.images import read_color, read_header, read_image, write_png
@@ -43,9 +44,6 @@ from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, t
 from tofuse.sensor.correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, combined
 from tofuse.sensor.models import SPEED_OF_LIGHT
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 INVALID_DEPTH = 65535
 MAX_CORRECTION_BYTES = 1 << 30
@@ -566,13 +564,13 @@ class RecordingWriter:
                 remedy="give all frames the same channels",
             )
 
-    def _counts(self, depth: Float32) -> NDArray[np.uint16]:
+    def _counts(self, depth: Float32) -> UInt16:
         counts = np.rint(depth.astype(float) / self.depth_unit_m)
         beyond = counts >= INVALID_DEPTH
         self.out_of_range += int(beyond.sum())
         return np.where(beyond, 0, counts).astype(np.uint16)
 
-    def _amplitude(self, amplitude: Float32) -> NDArray[np.uint16]:
+    def _amplitude(self, amplitude: Float32) -> UInt16:
         counts = np.rint(np.nan_to_num(amplitude.astype(float)))
         beyond = (counts >= SATURATED_AMPLITUDE) & (amplitude != SATURATED_AMPLITUDE)
         self.out_of_range += int(beyond.sum())

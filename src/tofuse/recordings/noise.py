@@ -6,15 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
 from tofuse.files.reading import is_file, is_folder
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.noise import NOISE, AmplitudeLaw, NoiseModel
-
-Float64 = NDArray[np.float64]
 
 # Words of a sensor's name, in lower case, the more telling ones first.
 _WORDS = (

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.reading import input_error, is_file, is_folder, list_folder
@@ -18,8 +17,6 @@ from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.rig import FILE_NAME, read_rig
 from tofuse.recordings.rig_source import RigSource
 from tofuse.recordings.sources import JoinedSource, LimitedSource
-
-Float64 = NDArray[np.float64]
 
 # Recordings that only their maker's program can read: what they hold, and what to do.
 CLOSED = {

@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, RayTable
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.sources import FARTHEST_M
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 SAMPLES = 8
 # How far a point may lie from its pixel's ray: what rounding to 0.1 mm and float32 can do.
@@ -226,12 +224,12 @@ def _common_rays(images: Sequence[Float32]) -> Float32 | None:
     return rays if fits else None
 
 
-def _fits(points: Float32, mask: NDArray[np.bool_], rays: Float32) -> bool:
+def _fits(points: Float32, mask: Bool, rays: Float32) -> bool:
     z = points[mask][:, 2:]
     off = np.abs(points[mask][:, :2] - rays[mask] * z)
     return bool((off <= TOLERANCE_M + TOLERANCE_SHARE * z).all())
 
 
-def _measured(points: Float32) -> NDArray[np.bool_]:
+def _measured(points: Float32) -> Bool:
     """Mask of points; some programs write the origin, not NaN, where nothing came back."""
     return np.asarray((np.abs(points) < FARTHEST_M).all(-1) & (points[..., 2] > 0))

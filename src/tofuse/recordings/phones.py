@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_header, read_image
 from tofuse.geometry.cameras import Pinhole, scaled
 from tofuse.recordings.camera_file import checked_lens
-from tofuse.recordings.frames import Float32, RangeFrame, UInt8
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions
 from tofuse.recordings.sources import FileSource, read_matrix_pose
-
-Float64 = NDArray[np.float64]
 
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.kernels.threads import side_threads
 from tofuse.recordings.frames import Frame, RangeFrame
 
 R = TypeVar("R")
-Float64 = NDArray[np.float64]
 
 
 class Source(Protocol):
@@ -95,7 +94,7 @@ class Recording:
     source: Source
     path: str
     format: str
-    indices: NDArray[np.intp]
+    indices: Intp
 
     @classmethod
     def of(cls, source: Source, path: str | Path, format: str) -> Recording:  # noqa: A002
@@ -239,7 +238,7 @@ class Recording:
             pool.shutdown(cancel_futures=True)
 
 
-def evenly(items: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+def evenly(items: Intp, count: int) -> Intp:
     """Choose at most `count` of the items, evenly spaced, the first and last among them."""
     if len(items) == 0:
         return items

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.recordings.frames import RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # Beyond this slope of a ray (60 degrees off the axis) a pinhole image is mostly stretched rim.
 STEEPEST = 1.75
@@ -44,7 +42,7 @@ def pinhole_of(camera: Camera) -> Pinhole:
     return Pinhole(width, height, float(fx), float(fy), cx, cy)
 
 
-def _sources(camera: Camera, pinhole: Pinhole) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _sources(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
     """Row and column (H, W, 2) of the pixel nearest to each pinhole pixel's ray, and whether."""
     rays = pinhole.rays().astype(float)
     points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
@@ -69,7 +67,7 @@ class Rectifier:
     def __init__(self, pinhole: Pinhole) -> None:
         self.pinhole = pinhole
         self._camera: Camera | None = None
-        self._at: tuple[NDArray[np.intp], NDArray[np.bool_]] | None = None
+        self._at: tuple[Intp, Bool] | None = None
 
     def __call__(self, frame: RangeFrame) -> RangeFrame:
         """Return a frame with z depth of the pinhole camera."""
@@ -84,9 +82,7 @@ def _as_z(frame: RangeFrame) -> RangeFrame:
     return replace(frame, depth=frame.z, depth_kind="z")
 
 
-def _moved(
-    frame: RangeFrame, pinhole: Pinhole, at: NDArray[np.intp], inside: NDArray[np.bool_]
-) -> RangeFrame:
+def _moved(frame: RangeFrame, pinhole: Pinhole, at: Intp, inside: Bool) -> RangeFrame:
     rows, columns = at[..., 0], at[..., 1]
 
     def taken(image: NDArray[Any] | None) -> NDArray[Any] | None:

@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.geometry.se3 import check_pose
 from tofuse.recordings.camera_file import read_json
-
-Float64 = NDArray[np.float64]
 
 SCHEMA = 1
 FILE_NAME = "rig.json"

@@ -7,16 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # Images of one instant are no further apart than this share of the time between images.
 _SAME_INSTANT = 0.6
@@ -71,7 +68,7 @@ class RigSource:
         }
         self.metadata["cameras"] = [camera.name for camera in rig.cameras]
 
-    def _rows(self) -> Integers:
+    def _rows(self) -> Intp:
         """(N, 3) instant, camera and position in its recording, of each frame."""
         times = [
             recording.timestamps + camera.time_offset_s

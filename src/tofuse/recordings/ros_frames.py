@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import quaternion, se3
-
-Float64 = NDArray[np.float64]
 
 _KIND = "tf2_msgs/msg/TFMessage"
 _OLD_KIND = "tf/msg/tfMessage"

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.recordings.camera_file import checked_lens
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 GREY = {"mono8": "u1", "8UC1": "u1", **ENCODINGS}

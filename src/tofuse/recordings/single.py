@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.recordings.cloud_files import shift_words
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.open import open_recording
-
-Float64 = NDArray[np.float64]
 
 MIN_POINTS = 10
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
 from tofuse.files.reading import is_file
@@ -19,9 +20,6 @@ from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
-
-Float64 = NDArray[np.float64]
-
 
 FARTHEST_M = 1e9  # beyond it, a coordinate is damage
 
@@ -49,7 +47,7 @@ class FileSource(ABC):
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
 
-    def whole_color(self, index: int) -> NDArray[np.uint8] | None:
+    def whole_color(self, index: int) -> UInt8 | None:
         """Return the colour of a frame as large as it was recorded, if it shows what depth shows.
 
         (H, W, 3) RGB of the same view as depth, at another resolution; None where there is none.
@@ -168,10 +166,10 @@ def cloud_frame(
     index: int,
     timestamp: float,
     points: NDArray[np.floating],
-    normals: NDArray[np.float32] | None = None,
+    normals: Float32 | None = None,
     *,
-    amplitude: NDArray[np.float32] | None = None,
-    color: NDArray[np.uint8] | None = None,
+    amplitude: Float32 | None = None,
+    color: UInt8 | None = None,
     origin: Float64 | None = None,
     shift: Float64 | None = None,
 ) -> CloudFrame:

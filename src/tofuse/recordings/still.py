@@ -15,15 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.geometry.cameras import Camera, RayTable
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.noise import NoiseModel
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Motion below these shares of the noise of a pixel is no motion.
 _COHERENT = 0.15
@@ -274,7 +271,7 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
     )
 
 
-def _median(depth: Float32, valid: Bool, count: NDArray[np.intp]) -> Float32:
+def _median(depth: Float32, valid: Bool, count: Intp) -> Float32:
     """Return the median (H, W) over the valid values of each pixel of (N, H, W); 0 without any."""
     ordered = np.sort(np.where(valid, depth, np.inf), axis=0)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
@@ -307,14 +304,14 @@ def _mean_amplitude(frames: Sequence[RangeFrame], near: Bool) -> Float32 | None:
     return np.where(full.sum(0) > count, SATURATED_AMPLITUDE, mean).astype(np.float32)
 
 
-def _best_confidence(frames: Sequence[RangeFrame], near: Bool) -> NDArray[np.uint8] | None:
+def _best_confidence(frames: Sequence[RangeFrame], near: Bool) -> UInt8 | None:
     images = [f.confidence_image for f in frames if f.confidence_image is not None]
     if len(images) < len(frames):
         return None
     return np.where(near, np.stack(images), 0).max(0).astype(np.uint8)
 
 
-def _mean_color(frames: Sequence[RangeFrame]) -> NDArray[np.uint8] | None:
+def _mean_color(frames: Sequence[RangeFrame]) -> UInt8 | None:
     images = [f.color_image for f in frames if f.color_image is not None]
     if len(images) < len(frames):
         return None

@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.view_points import ViewPoints
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _CHUNK_POINTS = 6000
 _CLASH = 2.0  # times the difference that counts neither way

@@ -8,8 +8,8 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
@@ -22,8 +22,6 @@ from tofuse.registration.uncertainty import UncertaintyOptions
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
 from tofuse.registration.viewpoint import as_image, viewpoint_of
-
-Float64 = NDArray[np.float64]
 
 FEWEST_POINTS = 10
 # Views as they were recorded, far apart: multipath is in them, and bends each

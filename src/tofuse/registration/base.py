@@ -6,12 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
 
 # Of a pose that is more probable than not other evidence may say that it is right.
 PROBABLE = 0.5

@@ -11,17 +11,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.agreement import Agreement
 from tofuse.registration.shape import shape_at, tree_of
 from tofuse.registration.viewpoint import RangeSphere, Viewpoint, viewpoint_of
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Points of each plane fit.
 NEIGHBOURS = 12

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame
@@ -32,8 +32,6 @@ from tofuse.registration.sample_consensus import are_distinct
 from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
-
-Float64 = NDArray[np.float64]
 
 # Points of either view at most, once they are averaged to be compared.
 _POINTS = 10_000

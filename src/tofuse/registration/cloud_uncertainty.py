@@ -20,8 +20,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.registration.cloud_agreement import NEIGHBOURS, CloudMap
 from tofuse.registration.pairs import (
@@ -30,8 +30,6 @@ from tofuse.registration.pairs import (
     loss_weights,
     unobservable_directions,
 )
-
-Float64 = NDArray[np.float64]
 
 # How far a point may be from the nearest one of its surface, in resolutions, and the cosine of the
 # largest angle between their normals.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.kdtree import KdTree
@@ -25,8 +25,6 @@ from tofuse.registration.selectors import All, Uniform
 from tofuse.registration.shape import shape_at
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PlaneToPlane
-
-Float64 = NDArray[np.float64]
 
 _SPACING_SAMPLE = 5000
 _SMALLEST_LEVEL = 60
@@ -249,6 +247,6 @@ def spacing(view: Frame) -> float:
     if len(points) < 2:
         return 0.01
     _, squared = KdTree(points).neighbours(points, 2)
-    distances: NDArray[np.float64] = np.sqrt(squared[:, 1])
+    distances: Float64 = np.sqrt(squared[:, 1])
     positive = distances[distances > 0]
     return float(np.median(positive)) if len(positive) else 0.01

@@ -12,11 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.registration.agreement import Agreement
-
-Float64 = NDArray[np.float64]
 
 # What counts as right: share of the depth, and rad.
 RIGHT_SHARE, RIGHT_RAD = 0.05, float(np.radians(4.0))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.parts import part
@@ -22,9 +23,6 @@ from tofuse.registration.sample_consensus import (
     consensus,
     registration_of,
 )
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 @part("registration", "features")

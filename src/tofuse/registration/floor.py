@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.kernels import search as kernels
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.view_points import ViewPoints
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -118,12 +116,12 @@ def find_floor(view: SurfaceMap, down: Float64, options: FloorOptions) -> Floor 
 
 def _on(
     p: Float64, n: Float64, band: Float64, normal: Float64, height: float, cosine: float
-) -> NDArray[np.bool_]:
+) -> Bool:
     """(N,) which points lie on a plane."""
     return np.asarray((np.abs(p @ normal - height) < band) & (n @ normal > cosine))
 
 
-def _fit(p: Float64, sigma: NDArray[np.float32]) -> tuple[Float64, float]:
+def _fit(p: Float64, sigma: Float32) -> tuple[Float64, float]:
     """Weighted least squares plane, its normal away from the camera."""
     w = 1 / np.maximum(sigma.astype(float), 1e-4) ** 2
     mean = w @ p / w.sum()

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels import cloud_matching as kernels
@@ -29,9 +29,6 @@ from tofuse.registration.sample_consensus import (
     registration_of,
 )
 from tofuse.registration.shape import shape_at
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 _BINS = 11
 # Resolution of the averaged views in spacings of the points: of samples taken by chance, means of
@@ -275,7 +272,7 @@ def _settled(
 
 def _fitting(
     source: Described, target: Described, tree: KdTree, T: Float64, far: float
-) -> tuple[NDArray[np.bool_], Int64]:
+) -> tuple[Bool, Int64]:
     """(n,) points of the source near a surface of the target that is turned alike, and which."""
     nearest, squared = tree.nearest(se3.transform(T, source.points), far)
     turned = source.normals @ T[:3, :3].T

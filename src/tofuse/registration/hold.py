@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

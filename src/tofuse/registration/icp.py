@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
@@ -16,7 +17,6 @@ from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.hold import Hold
 from tofuse.registration.interfaces import (
     Alignment,
-    Float64,
     History,
     Matcher,
     Metric,

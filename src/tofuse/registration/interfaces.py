@@ -12,15 +12,11 @@ from functools import cached_property
 from typing import ClassVar, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.recordings.frames import Frame
 from tofuse.registration.shape import NEIGHBOURS, Shape, normals_at, shape_at
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,15 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.errors import RegistrationError
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 Detector = Literal["sift", "orb", "fast"]
 Light = Literal["auto", "albedo", "color"]

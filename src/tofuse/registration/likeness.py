@@ -10,14 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tofuse.arrays import Float32, Float64, Intp
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _ROWS, _COLUMNS = 9, 12
 _CHUNKS = 16
@@ -82,9 +79,7 @@ def mutual_unlikeness(looks: Sequence[Float32] | Float32, shift: float) -> Float
     return np.minimum(far, far.T)
 
 
-def unlikeness_of_pairs(
-    looks: Float32, i: NDArray[np.intp], j: NDArray[np.intp], shift: float
-) -> Float64:
+def unlikeness_of_pairs(looks: Float32, i: Intp, j: Intp, shift: float) -> Float64:
     """(M,) how much the views of pairs differ, of views (N, 2, 9, 12), see `unlikeness`."""
     out = np.ones(len(i))
     order = np.argsort(i, kind="stable")
@@ -100,7 +95,7 @@ def unlikeness_of_pairs(
     return out
 
 
-def alike(looks: Float32, shift: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def alike(looks: Float32, shift: float) -> tuple[Intp, Intp]:
     """Pairs i < j of views (N, 2, 9, 12) that are likely to look alike: some of each view.
 
     An index by the first principal components of blocks of cells. It is asked for each view at each

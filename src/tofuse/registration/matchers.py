@@ -7,21 +7,14 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.kernels.cloud_matching import grid_search
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.registration.interfaces import (
-    Alignment,
-    Float64,
-    Int64,
-    Matcher,
-    Matches,
-    Points,
-    Search,
-)
+from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, Search
 from tofuse.registration.shape import tree_of
 
 Invariant = Literal["curvature", "moments"]

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.kernels.icp import point_information, weighted_moments
 from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
+from tofuse.registration.interfaces import Alignment, Matches, Metric
 
 # Second singular values this small, relatively, are rounding errors: the points lie on a line.
 _RANK_TOLERANCE = 1e-12

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.cloud_sums import direction_products, plane_sums
 from tofuse.kernels.icp import transform_points
 from tofuse.registration.interfaces import Alignment, Matches
 
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 Loss = Literal["square", "huber", "cauchy", "tukey"]
 
 FEWEST_PAIRS = 6

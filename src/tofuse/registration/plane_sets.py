@@ -8,8 +8,8 @@ from itertools import combinations, permutations
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
@@ -18,9 +18,6 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.view_points import ViewPoints
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Points of a view, and points from which planes are tried in each round of RANSAC.
 _POINTS, _TRIED = 3000, 150

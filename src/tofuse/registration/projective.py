@@ -12,16 +12,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.middle import median
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.base import Registration
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)

@@ -5,13 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Intp
 from tofuse.recordings.frames import CloudFrame, Frame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Intp = NDArray[np.intp]
 
 # Cubes that a float64 still tells apart by their number.
 _MOST_CELLS = 2.0**52

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.blas import one_blas_thread
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.registration.any_pair import FEWEST_POINTS, AnyPair
 from tofuse.registration.base import Registrar, Registration
-
-Float64 = NDArray[np.float64]
 
 _FURTHEST_M = 1e9
 # Clouds that are further apart have different frames.

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32
 from tofuse.kernels.surface import fit_planes
 from tofuse.kernels.threads import run_chunks
 from tofuse.maps.surface_map import SurfaceMap
@@ -42,7 +42,7 @@ def with_rough_planes(view: SurfaceMap) -> SurfaceMap:
     )
     own = view.planes[..., 3] > 0
     misfit = quality[..., 0]
-    spread: NDArray[np.float32] = quality[..., 1] * np.where(np.isfinite(misfit), misfit, 0)
+    spread: Float32 = quality[..., 1] * np.where(np.isfinite(misfit), misfit, 0)
     return replace(
         view,
         planes=np.where(own[..., None], view.planes, planes),

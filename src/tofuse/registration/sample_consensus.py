@@ -17,16 +17,13 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.registration.base import Registration
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 Way = Literal["samples", "compatible"]
 
 _SAMPLE = 3

@@ -14,8 +14,8 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_all, run_chunks
@@ -31,8 +31,6 @@ from tofuse.registration.projective import Level, ProjectiveOptions, Target, ali
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.view_points import ViewPoints
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Mode = Literal["auto", "both", "planar", "full"]
 
 # Patient, as albedo reaches no further than it is smooth; open directions are left to it.
@@ -223,9 +221,7 @@ class _View:
     light: Float32
     depth: float
 
-    def some(
-        self, count: int, less: NDArray[np.bool_] | None = None
-    ) -> tuple[Float32, Float32, Float32]:
+    def some(self, count: int, less: Bool | None = None) -> tuple[Float32, Float32, Float32]:
         """About so many points, their normals and light, of those marked `less` every fourth."""
         keep = np.arange(len(self.points))
         if less is not None:
@@ -452,7 +448,7 @@ class _Scorer:
 
     source: _View
     target: _View
-    less: Sequence[NDArray[np.bool_] | None]
+    less: Sequence[Bool | None]
     reach: float
 
     def __call__(self, rotations: Float64, translations: Float64, points: int) -> Float32:

@@ -7,10 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.registration.interfaces import Float64, Int64, Selector
+from tofuse.registration.interfaces import Selector
 from tofuse.registration.shape import NEIGHBOURS, normals_at
 
 

@@ -10,16 +10,12 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.kernels.cloud_shape import local_shapes
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import Frame
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 NEIGHBOURS = 20
 # Twenty neighbours spread by chance leave a gap this wide once in 300 inner points; at a straight

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.cloud_sums import (
     matrix_sums,
@@ -16,7 +17,7 @@ from tofuse.kernels.cloud_sums import (
     symmetric_sums,
 )
 from tofuse.parts import part
-from tofuse.registration.interfaces import Alignment, Float64, Matches, Metric
+from tofuse.registration.interfaces import Alignment, Matches, Metric
 from tofuse.registration.pairs import (
     Loss,
     SurfacePairs,

@@ -22,15 +22,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.kernels import tiles as kernels
 from tofuse.kernels.middle import median
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target
-
-Float64 = NDArray[np.float64]
 
 _UPPER7 = np.triu_indices(7)
 # Everything here is in units of 1 cm and 1 degree, so that eigenvalues can be compared.

@@ -8,12 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
+from tofuse.arrays import Float64
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import InTurn
 from tofuse.registration.icp import Icp
-from tofuse.registration.interfaces import Float64, Metric
+from tofuse.registration.interfaces import Metric
 from tofuse.registration.matchers import ClosestCompatible, ClosestInvariant, Invariant
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.rejectors import MaxDistance, Trimmed, Unique

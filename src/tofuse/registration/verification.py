@@ -13,13 +13,11 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.registration.agreement import AgreementOptions
 from tofuse.registration.projective import Aligned, Level
-
-Float64 = NDArray[np.float64]
 
 # Statistics of an alignment, all logarithms: odds of an outlier, odds of a point in free space, the
 # noise scale, and the standard deviation of the log albedo.

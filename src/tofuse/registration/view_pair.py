@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import Agreement, agreement
@@ -36,8 +36,6 @@ from tofuse.registration.verification import (
     comparable,
     self_scaled,
 )
-
-Float64 = NDArray[np.float64]
 
 # Near a guess few iterations do; else as many as a step of a third of the view needs.
 _NEAR = ProjectiveOptions(prior_m=3.0, prior_rad=3.0)

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Intp
 from tofuse.kernels.alignment import LIGHT, NORMAL, POINT, SIGMA
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.projective import points_of
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,7 @@ class ViewPoints:
         )
 
 
-def landing_pixels(view: SurfaceMap, points: Float64) -> NDArray[np.intp]:
+def landing_pixels(view: SurfaceMap, points: Float64) -> Intp:
     """(N, 2) column and row of the pixels that points (N, 3) land on; -1 outside."""
     lookup, (x0, y0, per_x, per_y) = view.projection.lookup, view.projection.frame
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)

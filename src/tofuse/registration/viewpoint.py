@@ -12,16 +12,11 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Intp
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-UInt8 = NDArray[np.uint8]
 
 # Points that are looked at, and neighbours whose distance shows how dense points are.
 _LOOKED_AT, _SAMPLE, _NEIGHBOURS = 50_000, 2000, 8
@@ -146,9 +141,7 @@ class RangeSphere:
         return np.asarray(self.ranges.reshape(-1)[at] - ranges, np.float64)
 
 
-def _cells(
-    points: Float64, ranges: Float64, cell: float, shape: tuple[int, ...]
-) -> NDArray[np.intp]:
+def _cells(points: Float64, ranges: Float64, cell: float, shape: tuple[int, ...]) -> Intp:
     elevation = np.arcsin(np.clip(points[:, 1] / ranges, -1, 1)) + np.pi / 2
     azimuth = np.arctan2(points[:, 0], points[:, 2]) + np.pi
     row = np.minimum((elevation / cell).astype(np.intp), shape[0] - 1)
@@ -227,7 +220,7 @@ def _axes(points: Float64) -> Float64:
     return np.stack([np.cross(y, forward), y, forward], axis=1)
 
 
-def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, NDArray[np.intp]]:
+def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, Intp]:
     """(H, W) depth of the nearest surface in each pixel, 0 without, and its nearest point."""
     shape = camera.height, camera.width
     at_pixel = camera.project(points)

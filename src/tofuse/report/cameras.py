@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.report.fields import OF_95_PERCENT, accuracy_shares
 from tofuse.report.packing import squeezed
@@ -14,8 +14,6 @@ from tofuse.report.scene import RigCameras
 from tofuse.report.subject import Subject
 from tofuse.report.words import STATUSES
 from tofuse.results.types import FrameRecord
-
-Float64 = NDArray[np.float64]
 
 
 def packed(s: Subject) -> dict[str, Any]:

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float32, Float64
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.rig import Rig
 from tofuse.report.pictures import Pictures
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

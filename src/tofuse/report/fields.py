@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.fusion.pose_errors import UNKNOWN_M
 from tofuse.report import words
 from tofuse.report.packing import squeezed
 from tofuse.report.scene import Scene, height_range
-
-Float64 = NDArray[np.float64]
 
 # Of normally distributed errors, one in twenty exceeds so many standard deviations.
 OF_95_PERCENT = 1.96

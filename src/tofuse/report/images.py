@@ -6,16 +6,10 @@ import base64
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.kernels.splat import nearest_points
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 GONE = (128, 128, 132)  # no measurement: a grey that differs from both ends of the colour map
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tofuse.arrays import Float64, Int8, UInt16
 
 _LEVEL = 6  # of zlib: higher ones take three times as long, for 3 %
 
@@ -42,11 +42,11 @@ def unsqueezed(text: str, dtype: str, columns: int) -> NDArray[Any]:
     return np.ascontiguousarray(words).view(kind)
 
 
-def steps_of(points: Float64, low: Float64, extent: Float64) -> NDArray[np.uint16]:
+def steps_of(points: Float64, low: Float64, extent: Float64) -> UInt16:
     """Return points (N, 3) as steps of a 65535th of a box."""
     return np.round((points - low) / extent * 65535).astype("<u2")
 
 
-def normal_bytes(normals: NDArray[Any]) -> NDArray[np.int8]:
+def normal_bytes(normals: NDArray[Any]) -> Int8:
     """Return unit normals (N, 3) as bytes; zeros where there is none."""
     return np.round(np.nan_to_num(normals.astype(float)) * 127).astype(np.int8)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.shape import normals_at
@@ -15,9 +15,6 @@ from tofuse.report import images
 from tofuse.report.packing import normal_bytes, squeezed, steps_of
 from tofuse.report.scene import Scene, choose, outline, spacing_of, still
 from tofuse.results.pair import LocalView, PairResult
-
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 SOURCE, TARGET = (240, 160, 60), (90, 176, 245)
 MODES = ("before", "after", "distance")
@@ -135,7 +132,7 @@ def color_bar() -> str:
     return f"linear-gradient(to right, {', '.join(f'rgb({r},{g},{b})' for r, g, b in stops)})"
 
 
-def distances(points: Float64, others: Float64, chosen: NDArray[np.intp]) -> Float64:
+def distances(points: Float64, others: Float64, chosen: Intp) -> Float64:
     """Return (n,) distances in m of the chosen ones of points (N, 3) from the surface of others.
 
     Between means of the nearest points of both views, along the normal of the other one (as M3C2,

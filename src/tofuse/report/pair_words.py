@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.results.pair import PairResult
-
-Float64 = NDArray[np.float64]
 
 _ALONG = 0.985  # cosine from which on a direction is called by the name of an axis
 _SMALL_RAD = 1e-6

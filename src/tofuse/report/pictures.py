@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.kernels.threads import run_all
 from tofuse.report.images import GONE, REMOVED, encoded, grey, viridis
 from tofuse.results import samples
 from tofuse.results.samples import FrameSample
-
-UInt8 = NDArray[np.uint8]
 
 # What a picture shows, in the order in which they are shown.
 KINDS = ("color", "range", "amplitude", "fate")

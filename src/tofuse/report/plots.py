@@ -10,13 +10,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tofuse.arrays import Float64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Float64 = NDArray[np.float64]
 
 # Stand-ins that `svg` replaces by the page's variables of the same names.
 INK, MUTED, GRID = "#010101", "#020202", "#030303"

@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
@@ -16,11 +16,6 @@ from tofuse.geometry import se3
 from tofuse.report import images
 from tofuse.report.packing import normal_bytes, squeezed, steps_of
 from tofuse.results.types import Reconstruction
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
-Integers = NDArray[np.intp]
 
 MAX_POINTS = 150_000
 MAX_FACES = 300_000
@@ -70,7 +65,7 @@ class Scene:
     loops: Float64
     surface: Mesh | None = None
     sigma: Float32 | None = None
-    views: NDArray[np.int32] | None = None
+    views: Int32 | None = None
 
     @cached_property
     def mesh(self) -> Mesh | None:
@@ -151,7 +146,7 @@ class RigCameras:
 
     names: tuple[str, ...]
     colors: tuple[tuple[int, int, int], ...]
-    of_frames: Integers
+    of_frames: Intp
 
     @classmethod
     def of(cls, told: Any, frames: int) -> RigCameras | None:
@@ -236,7 +231,7 @@ def packed(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _packed_model(scene: Scene, steps: NDArray[np.uint16]) -> dict[str, Any]:
+def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
     mesh = scene.mesh
     if mesh is None:
         normals, colors, faces = scene.normals, scene.colors, None
@@ -382,14 +377,14 @@ def outline(points: Float64, outer: float = 2.0) -> Float64:
     return points[np.unique((points @ directions).argmax(0))]
 
 
-def choose(number: int, most: int) -> Integers:
+def choose(number: int, most: int) -> Intp:
     """Choose `most` of the points at random, so that no even pattern of their order is left."""
     if number <= most:
         return np.arange(number)
     return np.sort(np.random.default_rng([0, number]).permutation(number)[:most])
 
 
-def _colors(cloud: Cloud, chosen: Integers, points: Float64) -> UInt8:
+def _colors(cloud: Cloud, chosen: Intp, points: Float64) -> UInt8:
     if cloud.color is not None:
         return seen_colors(cloud.color[chosen])
     return height_colors(points)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.report import cameras, images, plots, words
 from tofuse.report.fields import fields
 from tofuse.report.scene import Scene, opening_yaw, packed, still
 from tofuse.report.subject import OUTER, Figure, Subject, Values
-
-Float64 = NDArray[np.float64]
 
 
 def model(s: Subject) -> Values:

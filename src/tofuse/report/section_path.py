@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.suspicion import in_words
 from tofuse.report import plots, words
 from tofuse.report.subject import Figure, Subject, Values
-
-Float64 = NDArray[np.float64]
 
 
 def cameras(s: Subject) -> Values:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.rig import RigCamera
 from tofuse.report import plots, words
 from tofuse.report.subject import ROWS, Subject, Values
-
-Float64 = NDArray[np.float64]
 
 _SAID = 10  # pairs of cameras in the picture
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tofuse.arrays import Float64
 
 _ANGLES = np.radians(np.arange(0, 90, 0.5))
 _BOXED = 0.9  # of a box is filled by the hull of points that have its shape

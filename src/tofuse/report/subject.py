@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.report import straight
 from tofuse.report.extras import ReportExtras
 from tofuse.report.scene import Scene, finite, make_scene
 from tofuse.results.types import Reconstruction
 
-Float64 = NDArray[np.float64]
 Values = dict[str, Any]
 
 OUTER = 0.25  # percent of the points at each end that do not count for the measured size

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder, write_text
 from tofuse.files.tables import exact
@@ -79,7 +77,7 @@ def lens(camera: Pinhole) -> str:
     return f"{model} {camera.width} {camera.height} " + " ".join(exact(n) for n in numbers)
 
 
-def _points(points: NDArray[np.float32], color: NDArray[np.uint8]) -> list[str]:
+def _points(points: Float32, color: UInt8) -> list[str]:
     rows = zip(points.tolist(), color.tolist(), strict=True)
     return [
         f"{number} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} {_NO_ERROR}"

@@ -11,8 +11,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, new_folder, output_error
 from tofuse.files.images import jpeg_bytes
@@ -28,8 +28,6 @@ from tofuse.results.folder import RESULT, TILES, TILESET, claimed, home, is_resu
 from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.output import read_run_json
 from tofuse.results.tiles import is_tiles, write_tiles
-
-Float64 = NDArray[np.float64]
 
 # Triangles unless more are asked for, and what they take with their texture as .glb at most.
 FACES = 60_000
@@ -114,7 +112,7 @@ class _Result:
         )
 
     @cached_property
-    def frame_numbers(self) -> NDArray[np.intp]:
+    def frame_numbers(self) -> Intp:
         """Number of the frame that each pose is of."""
         frames = read_run_json(self.folder / "run.json")["frames"]
         index = np.array([frame["index"] for frame in frames], np.intp)
@@ -125,7 +123,7 @@ class _Result:
 _SCALARS = ("views", "sigma")
 
 
-def _jpeg(image: NDArray[np.uint8], vertices: int, faces: int) -> bytes:
+def _jpeg(image: UInt8, vertices: int, faces: int) -> bytes:
     """The best picture that is small enough beside so many vertices and triangles."""
     room = _MOST_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
     picture = b""

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.ply import read_ply
@@ -28,8 +27,6 @@ from tofuse.results.types import (
     SessionPair,
     SessionRecord,
 )
-
-Float64 = NDArray[np.float64]
 
 
 def load_result(folder: str | Path) -> Reconstruction:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse._version import __version__
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
@@ -31,8 +31,6 @@ from tofuse.posegraph.suspicion import Suspicion
 from tofuse.results import tiles
 from tofuse.results.folder import TILES, TILESET, OutputFolder, component_name, is_result
 from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
-
-Float64 = NDArray[np.float64]
 
 # Colours of surfaces that changed between sessions; people who are colour-blind tell them apart.
 CHANGED = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
@@ -300,7 +298,7 @@ def _session_of(index: int, result: Reconstruction) -> int | None:
     return next((k for k, session in enumerate(result.sessions) if session.has(index)), None)
 
 
-def clock_of(folder: Path) -> tuple[Float64, NDArray[np.intp]] | None:
+def clock_of(folder: Path) -> tuple[Float64, Intp] | None:
     """(N,) times in s and (N,) numbers of the frames of a result; None where `folder` is none."""
     if not is_result(folder):
         return None

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse._version import __version__
+from tofuse.arrays import Float64
 from tofuse.files.atomic import write_text
 from tofuse.files.moving import Names
 from tofuse.files.ply import write_ply
@@ -24,8 +24,6 @@ from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
 from tofuse.results.folder import Contract, OutputFolder, json_of
 from tofuse.results.output import plain
-
-Float64 = NDArray[np.float64]
 
 MARKER = "registration.json"
 FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import make_folder
 from tofuse.files.images import write_png
@@ -24,10 +25,6 @@ from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.reopening import RecordedPart, recorded_parts, reopened
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # of a count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
@@ -230,7 +227,7 @@ class ImageFolder:
         write_png(make_folder(self.folder / kind) / name, image)
 
 
-def _counts(metres: Float32, unit_m: float) -> NDArray[np.uint16]:
+def _counts(metres: Float32, unit_m: float) -> UInt16:
     """16-bit counts; 0 where they don't fit."""
     counts = np.rint(metres.astype(float) / unit_m)
     return np.where(counts < _MOST, counts, 0).astype(np.uint16)

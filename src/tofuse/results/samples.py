@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, UInt8
 from tofuse.recordings.frames import RangeFrame
 
 MOST, MOST_LOST = 160, 40  # samples of all frames, and of lost ones beside them
@@ -37,9 +38,9 @@ class FrameSample:
 
     index: int
     depth: NDArray[np.float16]
-    fate: NDArray[np.uint8]
-    amplitude: NDArray[np.float32] | None
-    color: NDArray[np.uint8] | None
+    fate: UInt8
+    amplitude: Float32 | None
+    color: UInt8 | None
 
     @classmethod
     def of(cls, frame: RangeFrame, tracked: RangeFrame, kept: RangeFrame) -> FrameSample:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofuse._version import __version__
+from tofuse.arrays import Float64
 from tofuse.files.atomic import make_folder
 from tofuse.files.glb import write_glb
 from tofuse.files.tileset import Tile, write_tileset
@@ -16,8 +16,6 @@ from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.levels import Level, Place, levels
 from tofuse.fusion.mesh import Mesh
 from tofuse.results.folder import RESULT, TILESET
-
-Float64 = NDArray[np.float64]
 
 # A surface of more triangles is tiled. So many are 110 MB of glTF, all of which has to be there
 # before anything is shown.

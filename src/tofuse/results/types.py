@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.evaluation.changes import Change
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
@@ -22,8 +22,6 @@ from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
 from tofuse.results.ranges import Range
 from tofuse.results.samples import FrameSample
-
-Float64 = NDArray[np.float64]
 
 Verdict = Literal["good", "degraded", "failed"]
 
@@ -332,6 +330,6 @@ class Reconstruction:
         )
 
     @property
-    def has_pose(self) -> NDArray[np.bool_]:
+    def has_pose(self) -> Bool:
         """(N,) mask of the frames with a pose in the main model."""
         return np.isfinite(self.trajectory[:, 0, 0])

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.recordings.rig import Rig, RigCamera
-
-Float64 = NDArray[np.float64]
 
 # False alarms of a whole rig, and the chance below which a camera's motion is called certain.
 LEVEL = 0.01

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from tofuse.arrays import Float64
 
 # Signals must overlap for this share of the shorter one, and at least for so many samples.
 _OVERLAP, _LEAST_SAMPLES = 0.5, 12

@@ -12,13 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.rigs.clocks import Lag, lag_between
-
-Float64 = NDArray[np.float64]
 
 # 1 cm, 1 degree, and 1 ms: so that unknowns can be compared.
 _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
@@ -55,7 +53,7 @@ class Track:
         """Typical time between poses, s."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
 
-    def at(self, times: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+    def at(self, times: Float64) -> tuple[Float64, Bool]:
         """Poses at other times, and whether they are known there."""
         right = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
         before, after = self.times[right - 1], self.times[right]

@@ -13,16 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import rig as kernels
 from tofuse.kernels.threads import run_chunks
 from tofuse.posegraph.refine import UNITS, Round
 from tofuse.posegraph.views import KeptView
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
 _SIZE = 7
@@ -144,7 +141,7 @@ def disagreements(
 
 
 def disagreements_of(
-    views: Sequence[KeptView], camera: Integers, poses: Float64, pairs: Integers
+    views: Sequence[KeptView], camera: Intp, poses: Float64, pairs: Intp
 ) -> dict[tuple[int, int], tuple[float, int]]:
     """As `disagreements`, of pairs (M, 2) of views of any time, whose poses are (N, 4, 4)."""
     found: dict[tuple[int, int], list[Float64]] = {}
@@ -260,7 +257,7 @@ class _System:
         both[:, 13] = row[:, kernels.BY_TARGET]
         return both * np.tile(_UNITS, 2), half * np.tile(_UNITS, 2)
 
-    def unknowns(self, k: int) -> Integers:
+    def unknowns(self, k: int) -> Intp:
         """(14,) places of the unknowns of a pair's cameras."""
         target, source = (self.views[i].camera for i in self.pairs[k])
         return np.concatenate(

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Intp
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
@@ -23,9 +23,6 @@ from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # Views of each camera that are refined together, and their points.
 _VIEWS, _POINTS = 70, 1500
@@ -174,7 +171,7 @@ def _too_loose(fit: HandEye, depth: float) -> str:
 class _Kept:
     """Views of one camera: which poses of its track they are of."""
 
-    at: Integers
+    at: Intp
     views: tuple[KeptView, ...]
 
 

@@ -16,8 +16,8 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_all
 from tofuse.maps.surface_map import SurfaceMap
@@ -30,7 +30,6 @@ from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import register_pair
 from tofuse.rigs.joint import JointOptions, View, refine_together
 
-Float64 = NDArray[np.float64]
 V = TypeVar("V")
 
 # Instants that are searched, that judge, and that settle: more of a moving scene say more.

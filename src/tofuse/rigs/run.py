@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
@@ -37,9 +37,6 @@ from tofuse.rigs.check import Moved, compare
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import View, disagreements, refine_together
 from tofuse.rigs.walked import walked
-
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 # No place is looked for again: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
@@ -182,7 +179,7 @@ def _fixed(
     rig: Rig,
     source: RigSource,
     recording: Recording,
-    instant: Integers,
+    instant: Intp,
     T_world_frame: Float64,
     *,
     follow: bool,

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.maps.surface_map import SurfaceMap
@@ -25,8 +25,6 @@ from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import Placed, View, distances_between, refine_together
 from tofuse.rigs.placing import Placement, place
-
-Float64 = NDArray[np.float64]
 
 # Frames that tell whether a camera stands still, and the share of its pixels that then do, in so
 # many of them.

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
@@ -30,8 +30,6 @@ from tofuse.rigs.hand_eye import Track
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import disagreements_of
 
-Float64 = NDArray[np.float64]
-Integers = NDArray[np.intp]
 # Median distance between what two cameras saw, m, and the pixels compared, by pair a < b.
 Apart = dict[tuple[int, int], tuple[float, int]]
 
@@ -110,7 +108,7 @@ def _of_tracking(
     recording: Recording,
     said: Sequence[_Said],
     poses: Float64,
-    instant: Integers,
+    instant: Intp,
     used: set[int],
 ) -> list[Measured]:
     """How sure the pose of the rig is at instants that took no part in the refinement.
@@ -141,7 +139,7 @@ class _Said:
     poses: Float64
     information: Float64
 
-    def some(self, rows: Integers) -> _Said:
+    def some(self, rows: Intp) -> _Said:
         """Only some of it."""
         return _Said(self.poses[rows], self.information[rows])
 
@@ -212,7 +210,7 @@ def refined(
     recording: Recording,
     poses: Float64,
     T_rig_frame: Float64,
-    instant: Integers,
+    instant: Intp,
 ) -> Walked:
     """Refine poses (N, 4, 4) of the instants with views of all cameras.
 
@@ -249,9 +247,7 @@ def refined(
     return Walked(out, T_rig_frame, apart, measured)
 
 
-def _chosen(
-    cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Integers
-) -> Integers:
+def _chosen(cameras: Sequence[Camera], recording: Recording, poses: Float64, instant: Intp) -> Intp:
     """Instants spaced by the motion of the rig, of no more views than are refined together."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     frame = _image(recording, int(np.flatnonzero(instant == known[0])[0]))

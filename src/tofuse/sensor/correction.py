@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.arrays import read_npz
 from tofuse.files.atomic import replacing
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 _MAX_BYTES = 1 << 30
 KEYS = ("range_m", "bias_m", "pixel_bias_m")

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
+from tofuse.arrays import Float32, Float64
 
 # Share of the shortest period by which frequencies may differ, rms, about one range.
 DISAGREEMENT = 0.1

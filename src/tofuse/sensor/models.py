@@ -12,12 +12,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import BrownConrady, Pinhole, Rational
-
-Float64 = NDArray[np.float64]
 
 SPEED_OF_LIGHT = 299_792_458.0
 

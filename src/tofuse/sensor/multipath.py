@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Complex128, Float32, Float64
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import W, X, Y
 from tofuse.kernels.threads import run_chunks
@@ -34,10 +34,6 @@ from tofuse.sensor.multipath_surfaces import (
     ray_ranges,
     seen_sources,
 )
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 Bounces = Literal["one", "all"]
 
@@ -184,7 +180,7 @@ class Reflections:
         around: Around,
         *,
         at_edges: bool,
-    ) -> tuple[Float64, Complex, Surfaces] | None:
+    ) -> tuple[Float64, Complex128, Surfaces] | None:
         """Bias of the range (Hn, Wn) in m, I / D (Hn, Wn), and the surfaces that they are of.
 
         Fits planes to the corrected nodes.
@@ -227,7 +223,7 @@ def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:
     nodes[..., W] = np.where(seen, length / np.where(seen, measured - shift, 1), 0)
 
 
-def _arriving(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex:
+def _arriving(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex128:
     """I / D (Hn, Wn) at the nodes of the sources' light; 0 where no plane fits."""
     good = surfaces.good
     receivers = np.ascontiguousarray(

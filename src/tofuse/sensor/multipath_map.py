@@ -7,16 +7,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import PATCH
 from tofuse.sensor.multipath_surfaces import FALLOFF, LEAST_COSINE, Surfaces
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # The lamp is taken to light no wider than this.
 _WIDEST_LAMP = np.pi / 3

@@ -5,15 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Complex128, Float32, Float64
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import COLUMNS, A, W, X, Y
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Complex = NDArray[np.complex128]
 
 # Light in a pixel falls as the cosine of its angle to the axis to this power, in the lens and from
 # the lamp together, and half of it in each.
@@ -124,7 +119,7 @@ class Surfaces:
         return float(albedo[order][np.searchsorted(share, 0.9 * share[-1])])
 
 
-def seen_sources(surfaces: Surfaces, radiosity: Complex) -> Float32:
+def seen_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
     """Sources (S, 9) as `kernels.multipath.exchange` takes them: 2 x 2 nodes, one where alike.
 
     Parameters

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_text
@@ -32,8 +32,6 @@ from tofuse.kernels.threads import run_chunks
 from tofuse.parts import from_dict, to_dict
 from tofuse.sensor.models import CAMERAS, SPEED_OF_LIGHT, CameraModel
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Law = Literal["range", "amplitude", "confidence", "camera"]
 
 SCHEMA = 1
@@ -64,7 +62,7 @@ class NoisyImage(Protocol):
     @property
     def amplitude_kind(self) -> Literal["raw", "range_compensated", "ir"]: ...  # noqa: D102
     @property
-    def confidence_image(self) -> NDArray[np.uint8] | None: ...  # noqa: D102
+    def confidence_image(self) -> UInt8 | None: ...  # noqa: D102
     @property
     def sigma_image(self) -> Float32 | None: ...  # noqa: D102
     @property

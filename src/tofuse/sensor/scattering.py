@@ -17,12 +17,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-Float64 = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Bool = NDArray[np.bool_]
+from tofuse.arrays import Bool, Complex128, Float64
 
 # The blur is computed on an image of about so many columns.
 _COLUMNS = 44
@@ -51,7 +48,7 @@ class Scattering:
     widths: tuple[float, ...]
     shares: tuple[float, ...]
 
-    def removed(self, measured: Complex) -> Complex:
+    def removed(self, measured: Complex128) -> Complex128:
         """Return the measured light (H, W) without what was scattered onto each pixel.
 
         What is scattered varies slowly over the image, so it is computed on a coarse grid.
@@ -68,7 +65,7 @@ class Scattering:
         return measured - _enlarged(scattered, step, measured.shape)
 
 
-def blurred(light: Complex, width: float) -> Complex:
+def blurred(light: Complex128, width: float) -> Complex128:
     """Blur an image (H, W) by a Gaussian of `width` times its width; beyond it there is no light.
 
     Fine detail is lost in a wide blur, so that it is computed on a coarse grid.
@@ -83,7 +80,7 @@ def _coarse_step(columns: int, width: float) -> int:
     return max(1, min(columns // _COLUMNS, int(width * columns / 2)))
 
 
-def _reduced(light: Complex, step: int) -> Float64:
+def _reduced(light: Complex128, step: int) -> Float64:
     """Block means (h, w, 2): real and imaginary part."""
     rows, columns = light.shape
     h, w = -(-rows // step), -(-columns // step)
@@ -100,13 +97,15 @@ def _blurred(small: Float64, sigma: float) -> Float64:
     return np.asarray(cv2.sepFilter2D(small, cv2.CV_64F, kernel, kernel, borderType=border))
 
 
-def _enlarged(small: Float64, step: int, shape: tuple[int, ...]) -> Complex:
+def _enlarged(small: Float64, step: int, shape: tuple[int, ...]) -> Complex128:
     size = (small.shape[1] * step, small.shape[0] * step)
     large = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
     return np.ascontiguousarray(large).view(np.complex128)[..., 0]
 
 
-def learn_shares(light: Complex, source: Bool, still: Bool, widths: tuple[float, ...]) -> Float64:
+def learn_shares(
+    light: Complex128, source: Bool, still: Bool, widths: tuple[float, ...]
+) -> Float64:
     """Find the shares of light that a lens scatters from what moves onto what does not.
 
     Of each still pixel the change over time is compared with that of the blurred images of what
@@ -133,7 +132,7 @@ def learn_shares(light: Complex, source: Bool, still: Bool, widths: tuple[float,
     seen = light[:, still]
     mean = seen.mean(0)
 
-    def own_change(values: Complex) -> Float64:
+    def own_change(values: Complex128) -> Float64:
         change = values - values.mean(0)
         common = (change * mean.conj()).sum(1) / (np.abs(mean) ** 2).sum()
         change = change - common[:, None] * mean

@@ -25,13 +25,9 @@ from scipy.ndimage import label, uniform_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tofuse.arrays import Bool, Float32, Float64, Int32, Intp
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.unwrap import pass_messages
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 # Of an image's pixels so many are taken to be brighter than white: gloss, noise.
 _GLOSSY = 0.01
@@ -248,8 +244,8 @@ def _steps(range_m: Float32, period: float) -> Float32:
 
 
 def _with_surfaces_moved(
-    blocks: _Blocks, unary: Float32, best: NDArray[np.intp], period: float, options: UnwrapOptions
-) -> NDArray[np.intp]:
+    blocks: _Blocks, unary: Float32, best: Intp, period: float, options: UnwrapOptions
+) -> Intp:
     """Move whole surfaces by periods while that makes the state likelier.
 
     Messages that go round in loops may settle with a part of a surface a period off. A surface is
@@ -306,9 +302,7 @@ def _with_surfaces_moved(
     return periods.reshape(best.shape)
 
 
-def _entered(
-    blocks: _Blocks, best: NDArray[np.intp], period: float, options: UnwrapOptions
-) -> NDArray[np.intp]:
+def _entered(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
     """Put back what was moved though no surface leads into it across the period."""
     moved = (best > 0) & blocks.valid
     pieces, count = label(moved)
@@ -329,7 +323,7 @@ def _entered(
 def _of_pixels(
     radial_range: Float32,
     blocks: _Blocks,
-    best: NDArray[np.intp],
+    best: Intp,
     period: float,
     side: int,
     most: int,

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.simulation.scene import Sequence
-
-Float64 = NDArray[np.float64]
 
 GRAVITY = 9.81
 RATE_HZ = 100.0

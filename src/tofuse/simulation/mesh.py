@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, Int64
 from tofuse.geometry import se3
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # Edges flatter than this are shaded as one curved surface.
 CREASE_RAD = np.deg2rad(48.0)

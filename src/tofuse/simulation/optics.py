@@ -6,18 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from tofuse.arrays import Bool, Float64, Int32
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import phasor
 from tofuse.kernels.threads import run_chunks
 from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
 from tofuse.simulation.scene import Scene
-
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Complex = NDArray[np.complex128]
 
 # Paths start this far off a surface, so as not to hit it again.
 _LIFT = 1e-4
@@ -132,7 +128,7 @@ def trace(
     """
     origin = T_room_camera[:3, 3]
     rays = directions @ T_room_camera[:3, :3].T
-    seen: NDArray[np.bool_] = np.isfinite(rays @ np.ones(3))
+    seen: Bool = np.isfinite(rays @ np.ones(3))
     rays[~seen] = (0.0, 0.0, 1.0)
     hits = scene.cast(origin, rays, T_room_bodies)
     distance: Float64 = np.where(seen, hits.distance.astype(float), np.inf)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.sensor.models import CameraModel
@@ -24,7 +24,6 @@ from tofuse.simulation.scene import Body, Scene, Sequence
 from tofuse.simulation.scenes.torso import HAIR, SHIRT, SKIN, TROUSERS
 from tofuse.simulation.texture import Material
 
-Float64 = NDArray[np.float64]
 Kind = Literal["person", "box"]
 
 CARTON = Material("carton", 0.45, 0.25, "print", (0.2, 0.2, 0.2))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 
-Float64 = NDArray[np.float64]
 Path = Callable[[float], Float64]
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.recordings.frames import CloudFrame
-
-Float64 = NDArray[np.float64]
 
 CAMERAS = 20
 RADIUS_M = 10.0
@@ -65,7 +64,7 @@ def peaks_cameras() -> Float64:
     return T
 
 
-def peaks_seen() -> list[NDArray[np.intp]]:
+def peaks_seen() -> list[Intp]:
     """Rows of `peaks_points` that each camera sees: the 2500 nearest to it, ascending."""
     points = peaks_points()
     distances = [np.linalg.norm(points - T[:3, 3], axis=1) for T in peaks_cameras()]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder
 from tofuse.files.images import write_png
@@ -26,8 +26,6 @@ from tofuse.simulation.effects import Effects
 from tofuse.simulation.passing import Passing, enter
 from tofuse.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.simulation.render import Rendered, render
-
-Float64 = NDArray[np.float64]
 
 # Is told how many frames are done, and of how many.
 Progress = Callable[[int, int], None]
@@ -50,7 +48,7 @@ class Plan:
     model: CameraModel
     effects: Effects
     seed: int
-    raw: NDArray[np.intp]
+    raw: Intp
 
     @property
     def poses(self) -> Float64:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt16
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import INVALID_DEPTH, depth_from_counts
@@ -14,10 +14,6 @@ from tofuse.sensor.models import CameraModel
 from tofuse.simulation import optics, sensor
 from tofuse.simulation.effects import Effects, Flag
 from tofuse.simulation.scene import Scene, Sequence
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt16 = NDArray[np.uint16]
 
 _DEFAULT = Effects()
 _NOTABLE_M = 0.003
@@ -163,7 +159,7 @@ class _PhaseImages:
     lit: Float64
     total: Float64
     albedo: Float64
-    unsmeared: sensor.Complex | None
+    unsmeared: Complex128 | None
 
     def scattered(self, model: CameraModel, effects: Effects, images: Float64) -> Float64:
         camera = model.camera
@@ -199,13 +195,13 @@ class _PhaseImages:
         return out
 
 
-def _bit(mask: NDArray[np.bool_], flag: Flag) -> UInt16:
+def _bit(mask: Bool, flag: Flag) -> UInt16:
     return np.where(mask, np.uint16(flag), np.uint16(0))
 
 
 def _apart(
-    model: CameraModel, a: sensor.Complex, b: sensor.Complex, limit_m: float = _NOTABLE_M
-) -> NDArray[np.bool_]:
+    model: CameraModel, a: Complex128, b: Complex128, limit_m: float = _NOTABLE_M
+) -> Bool:
     """Where two phasors differ in range by more than a limit; nowhere if one has no light."""
     turn = np.abs(np.angle(a * np.conj(b))) / (2 * np.pi) * model.period_m
     return (turn > limit_m) & (np.abs(a) > 0) & (np.abs(b) > 0)

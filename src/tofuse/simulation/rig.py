@@ -6,8 +6,8 @@ from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import RangeFrame
@@ -18,8 +18,6 @@ from tofuse.simulation import scene as scenes
 from tofuse.simulation.effects import Effects
 from tofuse.simulation.paths import Path, look_at, rotation
 from tofuse.simulation.record import Plan
-
-Float64 = NDArray[np.float64]
 
 _DEFAULT = Effects()
 

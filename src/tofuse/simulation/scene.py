@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels import bvh
@@ -25,11 +26,6 @@ from tofuse.simulation import texture
 from tofuse.simulation.mesh import Mesh
 from tofuse.simulation.paths import Path
 from tofuse.simulation.texture import Material
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
 
 # Small enough for every thread to get some, large enough that starting one does not count.
 _RAYS_PER_CHUNK = 4096

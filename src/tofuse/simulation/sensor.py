@@ -14,18 +14,12 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt8
 from tofuse.recordings.frames import SATURATED_AMPLITUDE
 from tofuse.sensor.correction import DepthCorrection
 from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
 from tofuse.simulation.effects import Effects
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Bool = NDArray[np.bool_]
-UInt8 = NDArray[np.uint8]
 
 TAPS = 4
 
@@ -39,7 +33,7 @@ def correlate(light: Float64, tap: int, harmonics: tuple[float, float]) -> Float
     return light[..., 1] * cosine + light[..., 2] * sine + third + fifth
 
 
-def phasor_of(differences: Float64) -> Complex:
+def phasor_of(differences: Float64) -> Complex128:
     """Phasor (...) of the bucket differences (4, ...)."""
     return (differences[0] - differences[2] + 1j * (differences[1] - differences[3])) / 2
 
@@ -112,7 +106,7 @@ def expose(
     return Measurement(unwrapped(model, phasors), amplitude, saturated)
 
 
-def unwrapped(model: CameraModel, phasors: Complex) -> Float64:
+def unwrapped(model: CameraModel, phasors: Complex128) -> Float64:
     """Range (H, W) in m of phasors (F, H, W): the fine one's, in the period of the coarse one."""
     turns = np.mod(np.angle(phasors) / (2 * np.pi), 1)
     fine = turns[0] * model.period_m

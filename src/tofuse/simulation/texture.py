@@ -7,12 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Int32
 from tofuse.kernels import texture as kernels
-
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
 
 Pattern = Literal["plain", "noise", "wood", "tiles", "print", "speckle"]
 _KINDS: dict[Pattern, int] = {

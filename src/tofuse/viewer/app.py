@@ -8,8 +8,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.glb import linear, unlit_glb
 from tofuse.geometry.quaternion import from_matrix
@@ -28,8 +28,6 @@ from tofuse.viewer.tone import before_tone_mapping
 if TYPE_CHECKING:
     from viser import GuiEvent, SceneClickEvent, ViserServer
 
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (255, 225, 90)
 FOV = 2 * float(np.arctan(0.5))  # of the cameras as they are drawn
@@ -370,7 +368,7 @@ class ResultView:
 
 def _drawn(
     poses: dict[int, Float64], edge: float, color: tuple[int, int, int], of: Result | None
-) -> tuple[NDArray[np.float32], Any]:
+) -> tuple[Float32, Any]:
     """Ends (L, 2, 3) of the lines of cameras, and their colours: of a rig one for each camera."""
     rig = None if of is None else of.rig
     if of is None or rig is None:
@@ -433,7 +431,7 @@ def _place_camera(server: ViserServer, result: Result) -> float:
     return size
 
 
-def _point_size(points: NDArray[np.float32]) -> float:
+def _point_size(points: Float32) -> float:
     from scipy.spatial import cKDTree
 
     if len(points) < 2:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+from tofuse.arrays import Float32, Float64, Int64
 
 _REACH = 1 << 20  # cells to each side of the origin
 

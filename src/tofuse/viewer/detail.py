@@ -6,11 +6,9 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.files.tileset import Tile
-
-Float64 = NDArray[np.float64]
 
 # 60 million triangles a second at 30 pictures a second: by their data sheets a tenth or less of
 # what the graphics inside of processors draw.

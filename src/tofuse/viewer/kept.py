@@ -9,14 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.arrays import read_npz
 from tofuse.report.pictures import KINDS, Pictures
 from tofuse.results.types import Reconstruction
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 NAME = "view.npz"
 _POINTS = 60_000  # of the model before

@@ -7,8 +7,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.geometry import se3
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.report.fields import OF_95_PERCENT
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
     from viser import ViserServer
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 _POINTS = 4000  # of each view shown
 _CLOUDS = 120  # views shown; then every second one goes

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64
 from tofuse.viewer.result import Layer
-
-Float64 = NDArray[np.float64]
 
 _NEAR, _FAR = 0.006, 0.02  # rad off the ray: as good as on it, and too far
 

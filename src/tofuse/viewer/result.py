@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, Int32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.glb import read_glb
 from tofuse.files.ply import Ply, read_ply
@@ -26,10 +27,6 @@ from tofuse.results.folder import TILES, TILESET, is_result, settle
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.viewer.detail import OVERVIEW_FACES, chosen
 from tofuse.viewer.kept import read_kept
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 MAX_FACES = 500_000  # of a surface that a browser turns smoothly
 
@@ -52,7 +49,7 @@ class Layer:
 
     points: Float32
     normals: Float32 | None
-    faces: NDArray[np.int32] | None
+    faces: Int32 | None
     color: UInt8 | None
     sigma: Float64 | None
     views: Float64 | None

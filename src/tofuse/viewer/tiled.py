@@ -8,8 +8,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.glb import unlit_glb
 from tofuse.geometry.quaternion import to_matrix
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
     from tofuse.files.tileset import Tile
 
-Float64 = NDArray[np.float64]
-UInt8 = NDArray[np.uint8]
 
 # Something is seen at once, and gets finer.
 _SHARES = (0.1, 0.3, 1.0)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32
 from tofuse.live.device import TIMEOUT_S, Settings, Stream, no_frame, not_started, vendor
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
@@ -108,7 +109,7 @@ class IfmO3rStream(Stream):
     def _buffer(self, frame: Any, name: str) -> NDArray[Any]:
         return np.asarray(frame.get_buffer(getattr(self._id, name)))
 
-    def _metres(self, image: NDArray[Any]) -> NDArray[np.float32]:
+    def _metres(self, image: NDArray[Any]) -> Float32:
         """Return counts in m; some versions of the package have done that already."""
         out = image.astype(np.float32)
         return out if image.dtype.kind == "f" else out * np.float32(self._info.distance_unit_m)

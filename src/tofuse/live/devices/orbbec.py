@@ -7,8 +7,8 @@ from time import monotonic
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32
 from tofuse.geometry.cameras import DISTORTION_ORDER, Camera
 from tofuse.live.device import (
     TIMEOUT_S,
@@ -127,7 +127,7 @@ def _add_infrared(ob: Any, pipeline: Any, config: Any, size: tuple[int, int]) ->
     return True
 
 
-def _image(frame: Any) -> NDArray[np.float32]:
+def _image(frame: Any) -> Float32:
     height, width = int(frame.get_height()), int(frame.get_width())
     data = np.frombuffer(frame.get_data(), np.uint8)
     if data.size == 2 * height * width:

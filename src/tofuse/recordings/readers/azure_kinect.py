@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.matroska import MAGIC, Block, Matroska, Track
@@ -23,13 +24,10 @@ from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.camera_file import ColorCamera, load_camera
 from tofuse.recordings.color import sampled_color
-from tofuse.recordings.frames import DepthKind, RangeFrame, UInt8
+from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FileSource
-
-Float64 = NDArray[np.float64]
-UInt16 = NDArray[np.uint16]
 
 DEPTH_UNIT_M = 0.001
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.pcd import read_pcd
 from tofuse.files.ply import read_ply
@@ -29,9 +29,6 @@ from tofuse.recordings.organised import (
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FARTHEST_M
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")

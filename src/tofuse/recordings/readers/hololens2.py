@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32
 from tofuse.errors import InputError
 from tofuse.files.pgm import parse_pgm
 from tofuse.files.reading import input_error, is_file, is_folder, list_folder, read_bytes
@@ -18,13 +19,11 @@ from tofuse.files.tables import read_numbers
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import RayTable
 from tofuse.parts import part
-from tofuse.recordings.frames import Float32, RangeFrame
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.phones import POSES_BY, refuse_replacement
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import FileSource, read_matrix_pose
-
-Float64 = NDArray[np.float64]
 
 # The streams in the order in which they are taken, and after what range they repeat, m.
 _STREAMS: dict[str, float | None] = {"Depth Long Throw": None, "Depth AHaT": 1.0}

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_head
 from tofuse.parts import part
@@ -113,7 +114,7 @@ class IfmH5Source(FileSource):
                 remedy="check the file",
             )
 
-    def _times(self) -> NDArray[np.float64]:
+    def _times(self) -> Float64:
         """Seconds: of the first exposure, or else when the data were taken; else the number."""
         for name, unit in (("timestamp_ns", 1e-9), ("_data_timestamp", 1e-6)):
             if name in self.fields:
@@ -174,7 +175,7 @@ class IfmH5Source(FileSource):
         return image
 
     @staticmethod
-    def _metres(counts: NDArray[Any], unit: float) -> NDArray[np.float32]:
+    def _metres(counts: NDArray[Any], unit: float) -> Float32:
         """Whole numbers are counts of the unit; floats are in metres."""
         scale = unit if counts.dtype.kind in "ui" else 1.0
         return counts.astype(np.float32) * np.float32(scale)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.pcic import BEGIN, Chunk, chunk_image, pcic_frames
 from tofuse.files.reading import read_bytes, read_head
@@ -18,8 +19,6 @@ from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FileSource
-
-Float64 = NDArray[np.float64]
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
 INVALID = 1  # bit of the confidence

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_named, is_file, is_folder, list_folder, read_text
 from tofuse.geometry.cameras import Pinhole
@@ -110,7 +110,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> Pinhole:
     return checked_lens(Pinhole, size, {k: float(v) for k, v in values.items()}, path)
 
 
-def _numbers(text: str) -> NDArray[np.float64]:
+def _numbers(text: str) -> Float64:
     try:
         return np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.images import read_color, read_image
 from tofuse.files.reading import is_file, name_order, read_head
@@ -17,14 +17,11 @@ from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, number_in, read_json
-from tofuse.recordings.frames import RangeFrame, UInt8
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.phones import refuse_replacement, resized
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import FARTHEST_M, FileSource, read_matrix_pose
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 NAME = "transforms.json"
 _DEPTH = ("depth_file_path", "depth_path")

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.arrays import read_npz
 from tofuse.files.reading import read_head
@@ -25,8 +26,6 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FARTHEST_M, FileSource, check_timestamps, read_matrix_pose
-
-Float64 = NDArray[np.float64]
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.geometry.se3 import check_pose, orthonormalise
@@ -21,8 +21,6 @@ from tofuse.recordings.lenses import plainest_lens
 from tofuse.recordings.maker_bags import BagSource, topics
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import GREY
-
-Float64 = NDArray[np.float64]
 
 # The order in which Orbbec writes them.
 _ORBBEC = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.pcd import Pcd, read_pcd
 from tofuse.geometry.cameras import Camera
@@ -18,9 +16,6 @@ from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @part("reader", "pcd", label="validated")

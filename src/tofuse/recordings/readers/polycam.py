@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, if_file, is_file, is_folder
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import read_json
-from tofuse.recordings.frames import UInt8
 from tofuse.recordings.phones import (
     CONFIDENCE_MAX,
     POSES_BY,
@@ -26,8 +25,6 @@ from tofuse.recordings.phones import (
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import poses_beside
-
-Float64 = NDArray[np.float64]
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255

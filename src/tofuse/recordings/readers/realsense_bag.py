@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Pinhole, RayTable
 from tofuse.geometry.quaternion import to_matrix
@@ -21,8 +21,6 @@ from tofuse.recordings.lenses import forward_brown, inverse_brown
 from tofuse.recordings.maker_bags import BagSource, topics
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import Info, camera_info
-
-Float64 = NDArray[np.float64]
 
 
 @part("reader", "realsense-bag")

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.exr import parse_exr
 from tofuse.files.images import as_color, parse_image
@@ -22,7 +22,7 @@ from tofuse.geometry import quaternion
 from tofuse.geometry.cameras import Pinhole
 from tofuse.parts import part
 from tofuse.recordings.camera_file import read_json
-from tofuse.recordings.frames import RangeFrame, UInt8
+from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.phones import (
     ARKIT_AXES,
     CONFIDENCE_MAX,
@@ -34,9 +34,6 @@ from tofuse.recordings.phones import (
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import FARTHEST_M, FileSource
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 MAX_MEMBER_BYTES = 1 << 26
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
@@ -198,7 +195,7 @@ class _Archive:
             np.frombuffer(raw, "<f4").reshape(size[1], size[0]), size, f"{self.path}: {name}"
         )
 
-    def confidence(self, number: int, size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    def confidence(self, number: int, size: tuple[int, int]) -> UInt8 | None:
         name = f"rgbd/{number}.conf"
         if name not in self.names:
             return None

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_text
 from tofuse.files.trajectory_formats import read_poses
@@ -18,8 +18,6 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens, read_json
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import UNSURE, ReaderOptions, Sniff
-
-Float64 = NDArray[np.float64]
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
 PRIMESENSE = Pinhole(640, 480, 525.0, 525.0, 319.5, 239.5)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera, Pinhole
@@ -41,9 +41,6 @@ from tofuse.recordings.ros_messages import (
     lens,
 )
 from tofuse.recordings.sources import FARTHEST_M, FileSource, cloud_frame
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_named, if_file, is_file
 from tofuse.geometry.cameras import Pinhole
@@ -24,8 +24,6 @@ from tofuse.recordings.phones import (
     refuse_replacement,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff
-
-Float64 = NDArray[np.float64]
 
 _DEPTH = re.compile(r"depth_([0-9]{1,9})\.png", re.IGNORECASE)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_head
 from tofuse.geometry.quaternion import to_matrix
@@ -27,8 +27,6 @@ from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
-
-Float64 = NDArray[np.float64]
 
 MAX_POINTS = 100_000_000
 _MISSING = "give `pip install 'tofuse[scan]'`"

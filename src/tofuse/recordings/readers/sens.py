@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import BinaryIO, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, UInt8, UInt16
 from tofuse.errors import InputError
 from tofuse.files.images import as_color, parse_image
 from tofuse.files.reading import input_error, read_head
@@ -25,8 +25,6 @@ from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.single_files import file_of, needed_file
 from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
-
-Float64 = NDArray[np.float64]
 
 VERSION = 4
 RAW, ZLIB, OCCI = 0, 1, 2  # how depth is compressed
@@ -202,7 +200,7 @@ class SensSource(FileSource):
             self.warnings.append(f"{self.path}: {wrong} poses are no rigid motions, and left out")
         return poses if np.isfinite(poses[:, 0, 0]).any() else None
 
-    def _depth(self, packed: bytes, where: str) -> NDArray[np.uint16]:
+    def _depth(self, packed: bytes, where: str) -> UInt16:
         width, height = self.depth_size
         expected = 2 * width * height
         if self.depth_packing == ZLIB:
@@ -221,7 +219,7 @@ class SensSource(FileSource):
             )
         return np.frombuffer(packed, "<u2").reshape(height, width)
 
-    def _color(self, packed: bytes, where: str) -> NDArray[np.uint8]:
+    def _color(self, packed: bytes, where: str) -> UInt8:
         assert self.color is not None
         size = (self.color.camera.width, self.color.camera.height)
         if self.color_packing != RAW:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import is_file, is_folder, list_folder
 from tofuse.files.tables import read_numbers
@@ -73,7 +73,7 @@ class SevenScenes:
         return source
 
 
-def read_pose(path: Path) -> NDArray[np.float64]:
+def read_pose(path: Path) -> Float64:
     """T_world_camera (4, 4) of a .pose.txt; NaN where the tracker was lost."""
     return read_matrix_pose(read_numbers(path), str(path))
 

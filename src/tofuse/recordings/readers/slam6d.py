@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.files.tables import parse_numbers, read_numbers
@@ -17,8 +17,6 @@ from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_c
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame, poses_beside
-
-Float64 = NDArray[np.float64]
 
 # x right, y up, z forward, left-handed, cm; turning y over makes it the camera's convention.
 FLIP = np.diag([1.0, -1.0, 1.0])

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head, read_text
 from tofuse.geometry.cameras import RayTable
@@ -17,8 +17,6 @@ from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import FileSource
-
-Float64 = NDArray[np.float64]
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, as the maker ships it.

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder
 from tofuse.files.tables import read_columns, read_numbers
 from tofuse.files.video import Video
 from tofuse.geometry import quaternion
 from tofuse.parts import part
-from tofuse.recordings.frames import UInt8
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.phones import (
     IMAGE_SIZE,
@@ -25,8 +24,6 @@ from tofuse.recordings.phones import (
     refuse_replacement,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff
-
-Float64 = NDArray[np.float64]
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -162,9 +159,7 @@ class StraySource(PhoneSource):
         self.reference = poses if good.any() else None
         self._read_lenses(folder, columns, row)
 
-    def _read_lenses(
-        self, folder: Path, columns: dict[str, Float64], row: NDArray[np.intp]
-    ) -> None:
+    def _read_lenses(self, folder: Path, columns: dict[str, Float64], row: Intp) -> None:
         size = first_size(self.files)
         image = IMAGE_SIZE if self.video is None else (self.video.width, self.video.height)
         if is_file(folder / "camera_matrix.csv"):

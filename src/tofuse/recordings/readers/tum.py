@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.reading import is_file, is_folder, read_text
 from tofuse.files.trajectory import associate
@@ -18,8 +18,6 @@ from tofuse.parts import part
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.sources import check_timestamps, tum_poses
-
-Float64 = NDArray[np.float64]
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1

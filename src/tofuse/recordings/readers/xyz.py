@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.tables import read_numbers
 from tofuse.parts import part
@@ -16,8 +16,6 @@ from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_c
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame
-
-Float64 = NDArray[np.float64]
 
 _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
 
@@ -68,7 +66,7 @@ def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     )
 
 
-def _float32(values: Float64) -> NDArray[np.float32]:
+def _float32(values: Float64) -> Float32:
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation import paths
 from tofuse.simulation.mesh import Mesh
@@ -41,7 +41,7 @@ class Assembly:
         return meshes.joined(self._parts)
 
 
-def placed(position: tuple[float, float], yaw: float) -> NDArray[np.float64]:
+def placed(position: tuple[float, float], yaw: float) -> Float64:
     """Pose of furniture on the floor, turned about z."""
     T = paths.rotation([0, 0, yaw])
     T[:2, 3] = position

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation import paths
@@ -12,8 +12,6 @@ from tofuse.simulation.paths import Path
 from tofuse.simulation.scene import Plan, SceneOptions
 from tofuse.simulation.scenes.assembly import Assembly
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
 
 # Inner corners, and the side of a square in m.
 COLUMNS, ROWS, SQUARE_M = 8, 6, 0.1

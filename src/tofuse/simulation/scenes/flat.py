@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation import paths
@@ -21,8 +21,6 @@ from tofuse.simulation.scene import Plan, SceneOptions
 from tofuse.simulation.scenes import furniture, household
 from tofuse.simulation.scenes.assembly import Assembly, placed
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
 
 HALF, HEIGHT, WALL = 2.2, 2.5, 0.12
 DOOR, DOOR_TOP = 0.90, 2.05

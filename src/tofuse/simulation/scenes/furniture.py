@@ -5,14 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation.mesh import Mesh
 from tofuse.simulation.scenes.assembly import Assembly
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
 
 PLASTIC = Material("chair frame", 0.16, 0.0, "plain", gloss=0.05)
 CHROME = Material("chair column", 0.3, 0.0, "plain", gloss=0.35)

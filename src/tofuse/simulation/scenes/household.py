@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation.mesh import Mesh
 from tofuse.simulation.scenes.assembly import Assembly
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
 
 OAK = Material("oak", 0.46, 0.2, "wood", (0.9, 0.9, 0.05))
 BIRCH = Material("birch", 0.62, 0.12, "wood", (0.7, 0.7, 0.06))

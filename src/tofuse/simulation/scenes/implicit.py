@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofuse.arrays import Bool, Float64, Int64
 from tofuse.simulation.mesh import Mesh
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Shape = Callable[[Float64], Float64]
 
 
@@ -106,7 +105,7 @@ def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> M
     return Mesh.of(vertices, np.concatenate([first, second]))
 
 
-def _quads(cut: NDArray[np.bool_], inside: NDArray[np.bool_], index: Int64, axis: int) -> Int64:
+def _quads(cut: Bool, inside: Bool, index: Int64, axis: int) -> Int64:
     """(Q, 4) cells around each cut edge along an axis, counter-clockwise seen from outside."""
     j, k = (axis + 1) % 3, (axis + 2) % 3
     window: list[slice] = [slice(None)] * 3

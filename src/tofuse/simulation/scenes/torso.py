@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofuse.arrays import Float64
 from tofuse.simulation import mesh as meshes
 from tofuse.simulation import paths
 from tofuse.simulation.mesh import Mesh
@@ -13,8 +13,6 @@ from tofuse.simulation.scenes import furniture, implicit
 from tofuse.simulation.scenes.assembly import Assembly, studio
 from tofuse.simulation.scenes.implicit import Shape, ellipsoid, limb
 from tofuse.simulation.texture import Material
-
-Float64 = NDArray[np.float64]
 
 DISTANCE = 1.45
 GRID = 0.018
