@@ -149,7 +149,7 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
 
 def surroundings(most: int, base: Path) -> Iterator[tuple[str, int, Work]]:
     """Runs that lack something."""
-    from tofuse.simulation.record import simulate
+    from tofuse.lab.simulation.record import simulate
 
     chosen = ENVIRONMENTS[:: max(1, len(ENVIRONMENTS) // most)][:most]
     recording = base / "rec"

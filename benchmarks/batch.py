@@ -58,7 +58,7 @@ def tofuse(*words: object) -> list[str]:
 
 def make_recordings(folder: Path, count: int, frames: int) -> list[Path]:
     """Simulate those that are missing."""
-    from tofuse.simulation.record import simulate
+    from tofuse.lab.simulation.record import simulate
 
     paths = [folder / f"{frames}-frames" / f"room-{k:03d}" for k in range(count)]
     for k, path in enumerate(paths):

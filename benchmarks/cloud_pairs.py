@@ -36,13 +36,13 @@ from peers import kiss_global, o3d_global
 from sequences import DATA
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.lab.simulation import scene as scenes
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import follow_clouds, register_clouds
 from tofuse.registration.confidence import CloudEvidence
 from tofuse.registration.viewpoint import viewpoint_of
-from tofuse.simulation import scene as scenes
 
 POINTS = 20_000
 RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.1, 0.05, 4.0

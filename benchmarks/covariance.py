@@ -26,6 +26,10 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.filters.multipath import Multipath
 from tofuse.geometry import se3
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import build
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
@@ -33,10 +37,6 @@ from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, ali
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit
 from tofuse.sensor.models import camera_model
-from tofuse.simulation import sensor
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import build
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
 PAIRS = ((0, 1), (1, 2), (0, 2))

@@ -31,16 +31,16 @@ from tofuse.arrays import Bool, Float64
 from tofuse.filters.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import Scene, build
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.native import corrected_depth
 from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import covariance
 from tofuse.sensor.models import CameraModel, camera_model
 from tofuse.sensor.noise import of_camera
-from tofuse.simulation import sensor
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import Scene, build
 
 SUBPIXELS = 3
 AWAY = 3.0  # in units of 1 cm and 1 degree

@@ -51,13 +51,13 @@ from tofuse.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.fusion.views import RangeView
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import Plan, plan
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import Plan, plan
 
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
 _NOISE_SHARE = 0.01  # of the range

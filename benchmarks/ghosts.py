@@ -34,6 +34,8 @@ from tofuse.fusion.tsdf import fuse_surface
 from tofuse.fusion.views import RangeView
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import Plan, plan, write
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.learn import learnt
@@ -42,8 +44,6 @@ from tofuse.pipeline.reconstruct import fitted, reconstruct
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import Plan, plan, write
 
 OUT = sequences.OUT / "recordings" / "ghosts"
 WALKS = (

@@ -38,16 +38,16 @@ from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.simulation import paths
+from tofuse.lab.simulation.scene import Scene
+from tofuse.lab.simulation.scenes import furniture, household
+from tofuse.lab.simulation.scenes.assembly import Assembly, placed
+from tofuse.lab.simulation.texture import Material
 from tofuse.recordings.convert import convert
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
-from tofuse.simulation import mesh as meshes
-from tofuse.simulation import paths
-from tofuse.simulation.scene import Scene
-from tofuse.simulation.scenes import furniture, household
-from tofuse.simulation.scenes.assembly import Assembly, placed
-from tofuse.simulation.texture import Material
 
 OUT = Path(__file__).parent / "out"
 COLUMNS, ROWS = 128, 96

@@ -107,7 +107,7 @@ def drawn(views: Sequence[Frame], k: int) -> tuple[Float64, Float64]:
 def filtered_views(path: str | None, frames: int) -> tuple[list[Frame], Float64 | None]:
     """Return the views after the thesis's filters, and their true poses if known."""
     if path is None:
-        from tofuse.simulation.record import simulate_recording
+        from tofuse.lab.simulation.record import simulate_recording
 
         recording = simulate_recording("room", frames=frames)
     else:

@@ -18,17 +18,17 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import evaluate_trajectory
-from tofuse.experiments import measures
-from tofuse.experiments.cases import CHEST
-from tofuse.experiments.recorded import Recorded
 from tofuse.geometry import se3
+from tofuse.lab.experiments import measures
+from tofuse.lab.experiments.cases import CHEST
+from tofuse.lab.experiments.recorded import Recorded
+from tofuse.lab.simulation.record import plan, simulate_recording
+from tofuse.lab.simulation.scenes import box
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
 from tofuse.recordings.recording import Recording
 from tofuse.results.types import Reconstruction
-from tofuse.simulation.record import plan, simulate_recording
-from tofuse.simulation.scenes import box
 
 CASES = {
     "rail": ("rail", {}),

@@ -34,6 +34,9 @@ from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.filters.multipath import Multipath, MultipathCorrector
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation import record
+from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.render import render
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.reconstruct import fitted, reconstruct
@@ -42,9 +45,6 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-from tofuse.simulation import record
-from tofuse.simulation.effects import Effects, Flag
-from tofuse.simulation.render import render
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "sr4000_corridor"
 SCENES = ("corner", "room", "empty-room", "corridor", "box", "torso")

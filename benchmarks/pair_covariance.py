@@ -41,14 +41,14 @@ import tofuse
 from cloud_pairs import Pair, _any_motion
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.registration.base import Registration
 from tofuse.sensor.models import camera_model
-from tofuse.simulation import scene as scenes
-from tofuse.simulation import sensor
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
 
 OUT = Path(__file__).resolve().parent / "out" / "pair_covariance"
 POINTS = 20_000

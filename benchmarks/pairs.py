@@ -40,6 +40,7 @@ from peers import o3d_global
 from sequences import DATA, OUT, kinect_loop
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.lab.simulation.record import simulate
 from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
@@ -50,7 +51,6 @@ from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import register_clouds
 from tofuse.registration.confidence import BELIEVED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
 from tofuse.registration.view_pair import follow, register_pair
-from tofuse.simulation.record import simulate
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
 # Shrinks coefficients a little, so that few pairs that are told apart exactly make no certainty.

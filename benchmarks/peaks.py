@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.experiments.peaks import (
+from tofuse.lab.experiments.peaks import (
     peaks_bound,
     peaks_bound_of_one,
     reconstruct_peaks,

@@ -23,6 +23,10 @@ from scipy.stats import chi2
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.paths import rotation
+from tofuse.lab.simulation.rig import Mount, around, relative, simulate_rig, wander
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig, RigCamera
 from tofuse.rigs.calibrate import calibrate_cameras
@@ -30,10 +34,6 @@ from tofuse.rigs.check import compare
 from tofuse.rigs.hand_eye import Track, hand_eye
 from tofuse.rigs.inputs import Camera
 from tofuse.sensor.models import CameraModel, camera_model
-from tofuse.simulation import scene as scenes
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.paths import rotation
-from tofuse.simulation.rig import Mount, around, relative, simulate_rig, wander
 
 STILL = Effects(multipath=False, scatter=0.0, smear=False)
 MOVING = Effects(multipath=False, smear=False)

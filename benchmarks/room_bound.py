@@ -5,8 +5,8 @@
 `noise` has the noise of the electrons, mixed pixels and ranges that wrap; `direct` has every error
 but light by way of other surfaces. Printed are the rms error of the positions after rigid alignment
 of the tracker and of the final poses, and the Cramer-Rao bound of the same figure, from distances
-alone and with albedo, which knows nothing of the surface (`experiments/recording_bound.py`), with
-its range from 5 to 95 % of single recordings; and the ratio of the final error to both.
+alone and with albedo, which knows nothing of the surface (`lab/experiments/recording_bound.py`),
+with its range from 5 to 95 % of single recordings; and the ratio of the final error to both.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import argparse
 import numpy as np
 
 from tofuse.evaluation.trajectory import evaluate_trajectory
-from tofuse.experiments.recording_bound import trajectory_bounds
+from tofuse.lab.experiments.recording_bound import trajectory_bounds
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan, simulate_recording
 from tofuse.pipeline.methods import default
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import plan, simulate_recording
 
 EFFECTS = {
     "noise": Effects.none(shot_noise=True, ambient=1.0, mixed_pixels=True, wrap=True),

@@ -21,12 +21,12 @@ from tofuse.evaluation.consistency import poses_of_frames
 from tofuse.files.trajectory import read_tum
 from tofuse.filters.base import Filter, apply_filters
 from tofuse.filters.foreground import Foreground
+from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.methods import default
 from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.simulation.record import simulate
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE / "out"

@@ -27,15 +27,15 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align, displacement
 from tofuse.geometry import se3
+from tofuse.lab.simulation import paths
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import Plan, plan, write
+from tofuse.lab.simulation.scenes import flat, furniture
+from tofuse.lab.simulation.scenes.assembly import Assembly, placed
 from tofuse.pipeline.merging import MergeOptions, merge_files
 from tofuse.pipeline.run import Options, run
 from tofuse.results.sessions import probability
 from tofuse.results.types import Reconstruction
-from tofuse.simulation import paths
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import Plan, plan, write
-from tofuse.simulation.scenes import flat, furniture
-from tofuse.simulation.scenes.assembly import Assembly, placed
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
 RUNS = Path(__file__).resolve().parent / "out" / "sessions"

@@ -18,14 +18,14 @@ from time import perf_counter
 import numpy as np
 
 from tofuse.files.images import read_image
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
 from tofuse.recordings.open import open_recording
 from tofuse.sensor.models import CAMERAS, camera_model
-from tofuse.simulation import scene as scenes
-from tofuse.simulation import sensor
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OUT = Path(__file__).resolve().parent / "out"

@@ -32,6 +32,7 @@ import numpy as np
 from hours import there_and_back
 from scaling import LENGTH, made_frames
 from tofuse.files.memory import give_back
+from tofuse.lab.simulation.record import simulate
 from tofuse.live.device import DeviceError, Settings, Stream
 from tofuse.live.recorder import record
 from tofuse.pipeline.config import Config, changed, from_method
@@ -41,7 +42,6 @@ from tofuse.pipeline.run import Options, run
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
-from tofuse.simulation.record import simulate
 
 FRAME_BYTES = 6000  # of its record, how it was tracked, and the list that holds them
 RUN_BYTES = 10_000  # 1 MB for 100 runs

@@ -21,9 +21,9 @@ import numpy as np
 
 from tofuse.filters.unwrap import Unwrap
 from tofuse.geometry.cameras import range_from_z
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
 from tofuse.recordings.frames import RangeFrame
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import plan
 
 PERIOD_M = 5.0
 SHORTER_M = (2.8, 3.2, 3.6, 4.0)

@@ -30,14 +30,14 @@ from stress import farther
 from tofuse.arrays import Float64
 from tofuse.errors import TofuseError
 from tofuse.evaluation.trajectory import displacement
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.checks import tolerance_of
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.run import Options, resolve
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate
 
 OUT = sequences.OUT / "recordings" / "verdict"
 # Stride among the raw frames of each scene.

@@ -19,8 +19,8 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def room_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated native recording of 8 frames; tests copy it where they change it."""
-    from tofuse.simulation.effects import Effects
-    from tofuse.simulation.record import simulate
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import simulate
 
     folder = tmp_path_factory.mktemp("simulated") / "room"
     return simulate("room", folder, frames=8, effects=Effects.none(shot_noise=True))

@@ -60,8 +60,8 @@ def failing(k: int) -> int:
 def test_a_run_on_a_cluster_gives_the_same_bytes(
     measured, cluster: str, tmp_path: Path, monkeypatch
 ) -> None:
-    from tofuse.simulation.effects import Effects
-    from tofuse.simulation.record import simulate
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import simulate
 
     recording = simulate(
         "room", tmp_path / "room", frames=24, effects=Effects.none(shot_noise=True)

@@ -14,15 +14,15 @@ from tofuse.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
+from tofuse.lab.simulation.scenes import checkerboard
+from tofuse.lab.simulation.sensor import calibrated
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.correction import DepthCorrection
 from tofuse.sensor.models import camera_model
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate_recording
-from tofuse.simulation.scenes import checkerboard
-from tofuse.simulation.sensor import calibrated
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 CAMERA = Pinhole(64, 48, 60.0, 60.0, 31.5, 23.5)

@@ -15,6 +15,10 @@ from tofuse.calibration.noise import estimate_noise
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import build
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.noise import noise_model_for
@@ -22,10 +26,6 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.sensor.models import camera_model
 from tofuse.sensor.noise import NOISE, NoiseModel
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate_recording
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import build
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
 

@@ -14,7 +14,7 @@ from tofuse.cli import main, told
 from tofuse.cli.streams import Outlet, outlets
 from tofuse.errors import Ended
 from tofuse.kernels import cores
-from tofuse.simulation.record import simulate
+from tofuse.lab.simulation.record import simulate
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))

@@ -24,6 +24,8 @@ from tofuse.errors import TofuseError
 from tofuse.files.images import read_image, write_png
 from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
 from tofuse.parts import name_of
 from tofuse.pipeline import run as run_module
 from tofuse.pipeline.config import from_method
@@ -35,8 +37,6 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.folder import LOCK, STAGING
 from tofuse.results.types import Component, Reason, Reconstruction
 from tofuse.results.verdict import ADVICE, REASONS
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate
 from tofuse.viewer.result import read_result
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tofuse.experiments import measures
-from tofuse.experiments.recorded import record_scene, sample_surface
 from tofuse.geometry import se3
-from tofuse.simulation.record import simulate_recording
+from tofuse.lab.experiments import measures
+from tofuse.lab.experiments.recorded import record_scene, sample_surface
+from tofuse.lab.simulation.record import simulate_recording
 
 
 def turning(step_deg: float, count: int) -> np.ndarray:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError, OutputError
-from tofuse.experiments.page import run_experiments
-from tofuse.experiments.peaks import PeaksSweep
-from tofuse.experiments.statements import STATEMENTS, Results, graded, judge_all
-from tofuse.experiments.statements import _straighter as straighter
+from tofuse.lab.experiments.page import run_experiments
+from tofuse.lab.experiments.peaks import PeaksSweep
+from tofuse.lab.experiments.statements import STATEMENTS, Results, graded, judge_all
+from tofuse.lab.experiments.statements import _straighter as straighter
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.experiments.recording_bound import phase_noise, seen_by, trajectory_bounds
+from tofuse.lab.experiments.recording_bound import phase_noise, seen_by, trajectory_bounds
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
 from tofuse.sensor.models import camera_model
-from tofuse.simulation import sensor
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import plan
 
 NOISE = Effects.none(shot_noise=True, ambient=1.0)
 

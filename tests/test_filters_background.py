@@ -16,12 +16,12 @@ from tofuse.errors import InputError
 from tofuse.filters.background import Background
 from tofuse.filters.mask import Mask
 from tofuse.filters.scattering import LensScattering
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
+from tofuse.lab.simulation.scenes import box
 from tofuse.parts import to_dict
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import plan
-from tofuse.simulation.scenes import box
 
 OF_OBJECT = {"torso": ("skin", "hair", "shirt", "trousers", "seat"), "box": ("box",)}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.kernels import texture as kernels
-from tofuse.simulation.texture import Material, noise_tables, parameter_rows
+from tofuse.lab.simulation.texture import Material, noise_tables, parameter_rows
 
 
 def noise_twin(table, points):

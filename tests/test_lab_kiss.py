@@ -8,7 +8,7 @@ import pytest
 from registration_scenes import box_walls, rng
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.kiss import AdaptiveThreshold, Kiss, first_of_voxels
+from tofuse.lab.methods.kiss import AdaptiveThreshold, Kiss, first_of_voxels
 from tofuse.recordings.frames import CloudFrame
 
 

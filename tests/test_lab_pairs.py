@@ -13,13 +13,13 @@ from tofuse import parts
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.comprehensive import Cicp, Comprehensive
-from tofuse.lab.implicit import Implicit
-from tofuse.lab.least_squares_matching import LeastSquaresMatching
-from tofuse.lab.ndt import Ndt
-from tofuse.lab.neighbourhoods import neighbourhood
-from tofuse.lab.robust_metrics import Adaptive, Graduated, shape_of
-from tofuse.lab.squared_distance import SquaredDistance, approximant
+from tofuse.lab.methods.comprehensive import Cicp, Comprehensive
+from tofuse.lab.methods.implicit import Implicit
+from tofuse.lab.methods.least_squares_matching import LeastSquaresMatching
+from tofuse.lab.methods.ndt import Ndt
+from tofuse.lab.methods.neighbourhoods import neighbourhood
+from tofuse.lab.methods.robust_metrics import Adaptive, Graduated, shape_of
+from tofuse.lab.methods.squared_distance import SquaredDistance, approximant
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Alignment, Matches, Points
@@ -181,7 +181,7 @@ def test_ndt_finds_motions_from_which_point_to_plane_does_not_return():
 
 
 def test_ndt_climbs_by_the_derivatives_of_its_score():
-    from tofuse.lab.ndt import _cells, _score
+    from tofuse.lab.methods.ndt import _cells, _score
 
     cells = _cells(stone(3000, 0), 0.2)
     p = stone(300, 1)

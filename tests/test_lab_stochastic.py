@@ -9,7 +9,7 @@ import pytest
 
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.lab.stochastic import Stochastic
+from tofuse.lab.methods.stochastic import Stochastic
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt

@@ -11,10 +11,10 @@ from registration_scenes import MIDDLE, directions, relief, rng, turn, view
 from tofuse import parts
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.lab.bergevin import Bergevin
-from tofuse.lab.multiview import Cloud, Pairs, relaxed, squared_error
-from tofuse.lab.pulli import Pulli, spread
-from tofuse.lab.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
+from tofuse.lab.methods.bergevin import Bergevin
+from tofuse.lab.methods.multiview import Cloud, Pairs, relaxed, squared_error
+from tofuse.lab.methods.pulli import Pulli, spread
+from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
 from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.refinement import Refining
 from tofuse.posegraph.views import Spacing, ViewStore

@@ -11,15 +11,15 @@ import pytest
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.odometry import attempts, keyframe_map
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.config import changed, from_method
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.open import open_recording
 from tofuse.sensor.models import camera_model
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import FRAME_RATE_HZ, build
 
 MODEL = camera_model("sr4000")
 BAD = 4  # which frame is spoilt

@@ -13,6 +13,9 @@ from tofuse.geometry.cameras import Pinhole, ray_lengths
 from tofuse.kernels import moving as kernels
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.moving import (
     Moving,
@@ -26,9 +29,6 @@ from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import agreement
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.sensor.models import camera_model
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import FRAME_RATE_HZ, build
 
 FRAMES = 18
 NEAR = 1.3  # m

@@ -112,11 +112,11 @@ def test_a_new_component_goes_on_as_the_camera_moved() -> None:
 def test_a_view_that_slips_off_along_a_wall_is_searched(tmp_path) -> None:
     """Steps of 26 cm: a wall fits anywhere, and what stands before it is out of reach."""
     from tofuse.evaluation.trajectory import displacement
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import simulate
     from tofuse.pipeline.config import changed, from_method
     from tofuse.pipeline.reconstruct import reconstruct
     from tofuse.recordings.open import open_recording
-    from tofuse.simulation.effects import Effects
-    from tofuse.simulation.record import simulate
 
     folder = simulate(
         "rail",

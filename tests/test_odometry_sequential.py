@@ -12,12 +12,12 @@ from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.odometry.base import Odometry
 from tofuse.odometry.sequential import SEED_STAGE, Sequential
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1
-from tofuse.simulation.peaks import peaks_views
 
 
 def cloud(index, points=50):

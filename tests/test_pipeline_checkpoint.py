@@ -22,6 +22,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files import spill as spill_module
 from tofuse.files.arrays import read_npz, write_npz
 from tofuse.files.spill import Spill
+from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline import checkpoint, reconstruct, run
 from tofuse.pipeline.checkpoint import Checkpoints, Stages, digest
 from tofuse.pipeline.config import changed, from_method
@@ -30,7 +31,6 @@ from tofuse.results.folder import CHECKPOINT, STAGING
 from tofuse.results.output import run_json
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import FrameRecord
-from tofuse.simulation.record import simulate
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 

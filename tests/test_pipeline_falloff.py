@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from tofuse.geometry.cameras import ray_lengths
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import build
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.falloff import estimate_falloff
@@ -16,9 +19,6 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.sensor.models import camera_model
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import build
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from tofuse.filters.base import Filter
 from tofuse.filters.temporal import TemporalDeviation
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
+from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.parts import part
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.mapper import Mapper
@@ -23,7 +24,6 @@ from tofuse.posegraph.graph import Optimisation, Optimiser
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.simulation.peaks import peaks_views
 
 # Fine enough for few frames, and quick.
 CONFIG = changed(

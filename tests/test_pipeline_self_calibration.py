@@ -10,6 +10,8 @@ import pytest
 from tofuse.evaluation.trajectory import displacement
 from tofuse.filters.camera_errors import CameraErrors
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.reconstruct import reconstruct
@@ -21,8 +23,6 @@ from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.output import run_json
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate
 
 CAMERA = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5)
 

@@ -10,14 +10,14 @@ import pytest
 
 import tofuse
 from tofuse.filters.multipath import Multipath
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.trial import Trial, trial
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate_recording
 
 
 class Listener(Silent):

@@ -11,6 +11,8 @@ import tofuse
 from tofuse.evaluation.trajectory import displacement
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph import accuracy
 from tofuse.posegraph.accuracy import (
@@ -26,8 +28,6 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import RangeFrame
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate_recording
 from walks import round_walk, true_poses
 
 N = 14

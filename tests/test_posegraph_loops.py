@@ -11,6 +11,7 @@ from tofuse import parts
 from tofuse.arrays import Float64
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
+from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
 from tofuse.posegraph.given import read_loops
 from tofuse.posegraph.loops import Confirmation, GivenLoop, LoopDetector, mean_error
@@ -19,7 +20,6 @@ from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.icp import algorithm_1
-from tofuse.simulation.peaks import peaks_views
 
 
 def pose(x: float = 0.0, z: float = 0.0, *, heading: float = 0.0, pitch: float = 0.0) -> Float64:

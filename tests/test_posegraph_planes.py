@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.experiments.bound import mean_distance, mean_distances, pose_covariances
-from tofuse.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_of_one, run_peaks
 from tofuse.geometry import se3
 from tofuse.kernels import planes as kernels
 from tofuse.kernels.threads import threads
+from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_covariances
+from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_of_one, run_peaks
+from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.posegraph.common_planes import PlaneOptions, refine_clouds
 from tofuse.posegraph.planes import Planes
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
-from tofuse.simulation.peaks import peaks_views
 
 
 def nudged(poses, size, seed=0):

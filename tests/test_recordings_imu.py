@@ -88,8 +88,8 @@ def test_a_native_recording_and_selections_of_it_know_what_is_down(tmp_path: Pat
 
 
 def test_the_simulated_accelerometer_tells_the_tilt_of_the_camera(tmp_path: Path):
-    from tofuse.simulation.accelerometer import accelerations
-    from tofuse.simulation.record import plan
+    from tofuse.lab.simulation.accelerometer import accelerations
+    from tofuse.lab.simulation.record import plan
 
     made = plan("room", frames=40)
     rate = made.sequence.frame_rate_hz

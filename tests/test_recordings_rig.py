@@ -9,9 +9,9 @@ import pytest
 
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.lab.simulation.paths import rotation
 from tofuse.recordings.rig import Disagreement, Rig, RigCamera, read_rig, write_rig
 from tofuse.recordings.rig_source import with_range_added
-from tofuse.simulation.paths import rotation
 
 
 def made() -> Rig:

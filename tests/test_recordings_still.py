@@ -13,6 +13,7 @@ from tofuse.cli import main
 from tofuse.errors import UnreadableFrameError
 from tofuse.files.images import read_image
 from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation.record import simulate_recording
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.noise import noise_model_for
@@ -20,7 +21,6 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.recordings.still import average_of, average_still, motion_between, still_stretches
 from tofuse.sensor.noise import NoiseModel, RangeLaw
-from tofuse.simulation.record import simulate_recording
 
 CAMERA = Pinhole(120, 96, 100.0, 100.0, 59.5, 47.5)
 SIGMA = 0.02

@@ -14,6 +14,9 @@ from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.peaks import peaks_views
+from tofuse.lab.simulation.record import plan
 from tofuse.odometry.pairwise import Pairwise
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration import cloud_pair
@@ -22,9 +25,6 @@ from tofuse.registration.cloud_agreement import CloudMap, cloud_agreement
 from tofuse.registration.cloud_pair import register_clouds
 from tofuse.registration.reduce import averaged
 from tofuse.registration.viewpoint import RangeSphere, as_image, rendered, viewpoint_of
-from tofuse.simulation import scene as scenes
-from tofuse.simulation.peaks import peaks_views
-from tofuse.simulation.record import plan
 
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import build
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.registration.likeness import look_of, mutual_unlikeness, unlikeness
 from tofuse.sensor.models import camera_model
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import build
 
 
 @pytest.fixture(scope="module")

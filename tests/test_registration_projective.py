@@ -9,12 +9,12 @@ import pytest
 
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align, points_of
 from tofuse.sensor.models import camera_model
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
-from tofuse.simulation.scene import FRAME_RATE_HZ, build
 
 OPTIONS = ProjectiveOptions()
 MODEL = camera_model("sr4000")

@@ -12,6 +12,8 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import simulate_recording
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.recordings.frames import RangeFrame
@@ -20,8 +22,6 @@ from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.floor import FloorOptions, find_floor, find_floors
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import Candidate, SearchOptions, _distinct, search
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import simulate_recording
 
 CAMERA = Pinhole(160, 120, 130.0, 130.0, 79.5, 59.5)
 # Boxes (centre, half size, turned about y by rad) on a floor 1 m below the origin, y down.

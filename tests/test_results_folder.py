@@ -15,7 +15,7 @@ from made_results import contents, result, torn
 from tofuse.errors import InputError, OutputError
 from tofuse.files import locking
 from tofuse.files.locking import Claim
-from tofuse.pipeline.demo import _replacing_recording
+from tofuse.lab.demo import _replacing_recording
 from tofuse.results.folder import LOCK, STAGING, OutputFolder, is_result, settle
 from tofuse.results.output import write_result
 from tofuse.results.pair import pair_folder

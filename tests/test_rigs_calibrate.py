@@ -13,6 +13,7 @@ from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
+from tofuse.lab.simulation.rig import around, relative
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
@@ -22,7 +23,6 @@ from tofuse.report.scene import CAMERA_COLORS
 from tofuse.report.section_rig import upright
 from tofuse.rigs.calibrate import calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
-from tofuse.simulation.rig import around, relative
 from tofuse.viewer.result import read_result
 
 # A room: floor, three walls, and boards in front of these.

@@ -5,10 +5,10 @@ import pytest
 
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
+from tofuse.lab.simulation.paths import rotation
+from tofuse.lab.simulation.rig import wander
 from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.hand_eye import Track, clock_of, hand_eye
-from tofuse.simulation.paths import rotation
-from tofuse.simulation.rig import wander
 
 OFFSET = 0.0123
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
+from tofuse.lab.simulation.rig import around, relative
 from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph.views import KeptView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.rigs.joint import View, disagreements, refine_together
-from tofuse.simulation.rig import around, relative
 
 CAMERA = Pinhole(128, 96, 90.0, 90.0, 63.5, 47.5)
 # Planes n . x = d of a heap of tilted boards on a floor, nearest hit counts: normal, offset, and

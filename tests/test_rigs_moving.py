@@ -7,6 +7,7 @@ import numpy as np
 from test_rigs_calibrate import ROOM
 from test_rigs_joint import CAMERA, looked_at
 from tofuse.geometry import se3
+from tofuse.lab.simulation.paths import look_at, rotation
 from tofuse.pipeline.config import from_method
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
@@ -15,7 +16,6 @@ from tofuse.rigs.calibrate import Calibration, calibrate_cameras
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.run import reconstruct_rig
 from tofuse.rigs.walked import refined
-from tofuse.simulation.paths import look_at, rotation
 
 CLOCK = 0.012
 COUNT = 50

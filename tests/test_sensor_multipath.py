@@ -10,13 +10,13 @@ import pytest
 from tofuse.filters.multipath import Multipath, light_image
 from tofuse.geometry.cameras import Pinhole, ray_lengths
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation import record
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.render import render
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.sensor.multipath import GainEstimator, Interference, LightImage, Reflections
-from tofuse.simulation import record
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.render import render
 
 CAMERA = Pinhole(60, 48, 54.0, 54.0, 29.5, 23.5)
 PERIOD_M = 5.0

@@ -16,6 +16,8 @@ from tofuse.filters.unwrap import Unwrap
 from tofuse.geometry.cameras import Pinhole, range_from_z
 from tofuse.kernels.threads import threads
 from tofuse.kernels.unwrap import STEPS, pass_messages
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
 from tofuse.recordings.frames import RangeFrame
 from tofuse.sensor.frequencies import combined
 from tofuse.sensor.models import SPEED_OF_LIGHT
@@ -26,8 +28,6 @@ from tofuse.sensor.unwrap import (
     count_periods,
     on_surface,
 )
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import plan
 
 PERIOD = 5.0
 

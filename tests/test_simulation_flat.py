@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.simulation.scene import build
-from tofuse.simulation.scenes.flat import DOOR, HALF, ROOMS, T_flat_room, room_of
+from tofuse.lab.simulation.scene import build
+from tofuse.lab.simulation.scenes.flat import DOOR, HALF, ROOMS, T_flat_room, room_of
 
 ALL_AROUND = np.random.default_rng(30).normal(size=(40000, 3))
 ALL_AROUND /= np.linalg.norm(ALL_AROUND, axis=1, keepdims=True)
@@ -68,8 +68,8 @@ def test_rooms_alike_differ_less_than_the_others() -> None:
 
 
 def test_the_flat_is_recorded_from_any_frame_on() -> None:
-    from tofuse.simulation.effects import Effects
-    from tofuse.simulation.record import plan, simulate_recording
+    from tofuse.lab.simulation.effects import Effects
+    from tofuse.lab.simulation.record import plan, simulate_recording
 
     effects = Effects.none()
     late = simulate_recording("flat", first=300, frames=2, effects=effects)

@@ -7,9 +7,9 @@ import pytest
 
 from tofuse.errors import InputError
 from tofuse.files.images import read_image
-from tofuse.simulation.effects import Effects, Flag
-from tofuse.simulation.passing import Passing
-from tofuse.simulation.record import plan, simulate, simulate_recording
+from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.passing import Passing
+from tofuse.lab.simulation.record import plan, simulate, simulate_recording
 
 
 def covered(made, step=3):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.experiments.peaks import PoseErrors, run_peaks, sweep_peaks
 from tofuse.geometry import se3
-from tofuse.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
+from tofuse.lab.experiments.peaks import PoseErrors, run_peaks, sweep_peaks
+from tofuse.lab.simulation.peaks import peaks, peaks_cameras, peaks_points, peaks_views
 
 
 def test_peaks_is_matlabs():

@@ -8,9 +8,9 @@ import pytest
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
-from tofuse.simulation.scene import SCENES, Scene, build
-from tofuse.simulation.scenes import furniture
-from tofuse.simulation.scenes.assembly import Assembly
+from tofuse.lab.simulation.scene import SCENES, Scene, build
+from tofuse.lab.simulation.scenes import furniture
+from tofuse.lab.simulation.scenes.assembly import Assembly
 
 
 def sr4000_rays(step=4):
@@ -186,7 +186,7 @@ def test_points_seen_at_any_time_lie_on_the_true_surface_of_the_world(built, nam
 
 
 def _mesh(vertices, faces):
-    from tofuse.simulation.mesh import Mesh
+    from tofuse.lab.simulation.mesh import Mesh
 
     return Mesh.of(vertices, faces)
 

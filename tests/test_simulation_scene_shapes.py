@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tofuse.geometry import se3
-from tofuse.simulation import mesh as meshes
-from tofuse.simulation.scene import Scene
-from tofuse.simulation.scenes import implicit, torso
-from tofuse.simulation.texture import Material
+from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.simulation.scene import Scene
+from tofuse.lab.simulation.scenes import implicit, torso
+from tofuse.lab.simulation.texture import Material
 
 
 def directed_edges(faces):

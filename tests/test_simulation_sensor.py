@@ -11,12 +11,12 @@ from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.render import Rendered, render
+from tofuse.lab.simulation.scene import Hits, Sequence, build
 from tofuse.recordings.native import corrected_depth
 from tofuse.sensor.models import CAMERAS, camera_model
-from tofuse.simulation import sensor
-from tofuse.simulation.effects import Effects, Flag
-from tofuse.simulation.render import Rendered, render
-from tofuse.simulation.scene import Hits, Sequence, build
 
 SMALL = Pinhole(44, 36, 57.0, 57.0, 21.5, 17.5)
 # Sharp, so that sums over sub-rays can be told exactly.
@@ -304,7 +304,7 @@ def test_scattered_light_pulls_the_background_to_a_bright_foreground() -> None:
 
 
 def test_scattering_keeps_the_light_of_a_uniform_image_inside() -> None:
-    from tofuse.simulation.optics import LensScatter
+    from tofuse.lab.simulation.optics import LensScatter
 
     spread = LensScatter(176, 144, 0.02)
     point = np.zeros((144, 176))
@@ -348,7 +348,7 @@ def test_a_single_wall_has_no_multipath() -> None:
 
 def test_bounced_light_is_what_two_facing_walls_exchange() -> None:
     """A lit patch is seen by a small one: compared with the integral over the patch."""
-    from tofuse.simulation.optics import bounced_light
+    from tofuse.lab.simulation.optics import bounced_light
 
     # A floor 1 m below the lens, a lit wall 3 m ahead; no shadows between.
     scene = Boards(

@@ -10,10 +10,10 @@ from tofuse.files.images import read_image
 from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan, simulate, simulate_recording
+from tofuse.lab.simulation.scene import build
 from tofuse.recordings.native import NativeSource
-from tofuse.simulation.effects import Effects
-from tofuse.simulation.record import plan, simulate, simulate_recording
-from tofuse.simulation.scene import build
 
 
 @pytest.fixture(scope="module")

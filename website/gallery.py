@@ -23,7 +23,7 @@ from tofuse.evaluation.trajectory import evaluate_trajectory
 from tofuse.files.ply import read_ply
 from tofuse.files.trajectory import read_tum
 from tofuse.geometry import se3
-from tofuse.pipeline.demo import simulate_to
+from tofuse.lab.demo import simulate_to
 from tofuse.pipeline.run import Options, run
 from tofuse.results.output import frames_in_main_model, read_run_json
 

@@ -389,8 +389,8 @@ def _check_overwrite(arguments: argparse.Namespace) -> None:
 def demo(arguments: argparse.Namespace) -> int:
     """``tofuse demo``."""
     from tofuse.kernels.threads import threads
-    from tofuse.pipeline.demo import FAILURE
-    from tofuse.pipeline.demo import demo as run_demo
+    from tofuse.lab.demo import FAILURE
+    from tofuse.lab.demo import demo as run_demo
     from tofuse.pipeline.run import exit_status
 
     with progress_for(as_json=arguments.json) as progress, threads(arguments.threads):
@@ -468,8 +468,8 @@ def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
 def simulate(arguments: argparse.Namespace) -> int:
     """``tofuse simulate``."""
     from tofuse.kernels.threads import threads
-    from tofuse.pipeline.demo import simulate_to
-    from tofuse.simulation.passing import Passing
+    from tofuse.lab.demo import simulate_to
+    from tofuse.lab.simulation.passing import Passing
 
     passing = None
     if arguments.with_person is not None:
@@ -760,8 +760,8 @@ def export(arguments: argparse.Namespace) -> int:
 
 def experiments(arguments: argparse.Namespace) -> int:
     """``tofuse experiments``."""
-    from tofuse.experiments.page import run_experiments
     from tofuse.kernels.threads import threads
+    from tofuse.lab.experiments.page import run_experiments
 
     with progress_for(as_json=False) as progress, threads(arguments.threads):
         page = run_experiments(

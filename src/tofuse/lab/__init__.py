@@ -1,4 +1,4 @@
-"""Methods of the literature that no named configuration uses.
+"""What experiments with the program need, and its use does not: nothing outside imports it.
 
-Each is a part like any other: a `--config` file names it, and a test shows what its paper claims.
+The simulator, the thesis's experiments, the demo, and methods of the literature for comparison.
 """

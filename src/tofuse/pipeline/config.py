@@ -103,7 +103,7 @@ ROOMS = (
     "tofuse.registration",
     "tofuse.odometry",
     "tofuse.posegraph",
-    "tofuse.lab",
+    "tofuse.lab.methods",
 )
 
 

@@ -36,7 +36,7 @@ _ROOMS = (
     "filters",
     "fusion",
     "geometry",
-    "lab",
+    "lab.methods",
     "maps",
     "odometry",
     "pipeline.backend",

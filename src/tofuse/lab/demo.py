@@ -1,0 +1,214 @@
+"""``tofuse demo`` and ``tofuse simulate``: a recording made here, and what becomes of it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tofuse.errors import OutputError
+from tofuse.files.atomic import UNFINISHED, sync_tree, write_text
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.passing import Passing
+from tofuse.lab.simulation.record import simulate
+from tofuse.pipeline.checkpoint import discard_states
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.pipeline.run import Options, resolve, run
+from tofuse.results.folder import RECORDING, OutputFolder
+from tofuse.results.types import Reconstruction
+
+# What the thesis set differently for a scene (section 4.1): points beyond the object are cut.
+_SCENE_OPTIONS: dict[str, dict[str, Any]] = {
+    "torso": {"object": True, "max_depth": 2.2},
+    "box": {"object": True, "max_depth": 1.8},
+}
+# Along a corridor of one albedo every view is alike: the motion can't be observed. Without phase
+# wrapping there is nothing else to find.
+FAILURE = "corridor"
+
+
+def demo(
+    scene: str,
+    out: Path,
+    *,
+    method: str | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Simulate a scene into ``out/recording`` and reconstruct it into `out`.
+
+    Raises
+    ------
+    InputError, OutputError
+        If nothing could be written; see the message for the remedy.
+    """
+    progress = progress or Silent()
+    options = Options(
+        out=out,
+        method=method,
+        seed=seed,
+        threads=threads,
+        overwrite=True,
+        **_SCENE_OPTIONS.get(scene, {}),
+    )
+    # Whatever is wrong with the options or the folder is said before the work begins.
+    resolve(options)
+    with (
+        OutputFolder(out, overwrite=overwrite) as folder,
+        _replacing_recording(out / RECORDING) as fresh,
+    ):
+        discard_states(out)  # of a recording that is made anew
+        fails = scene == FAILURE
+        simulate_to(
+            scene,
+            fresh,
+            seed=seed,
+            texture=not fails,
+            without=("wrap",) if fails else (),
+            progress=progress,
+        )
+        if scene == "peaks":
+            thesis = options.method == "thesis"
+            write_text(fresh / "peaks.toml", PEAKS_CONFIG + (PEAKS_ICP if thesis else ""))
+            options = replace(options, config=out / RECORDING / "peaks.toml")
+        sync_tree(fresh)
+        os.replace(fresh, out / RECORDING)
+        return run([out / RECORDING], options, progress, folder)
+
+
+@contextmanager
+def _replacing_recording(path: Path) -> Iterator[Path]:
+    """Give a path to make a recording at, to be moved to `path`; a failure puts the old one back.
+
+    Only a simulated recording is ever replaced.
+    """
+    fresh, old = path.parent / f"{UNFINISHED}simulating", path.parent / f"{UNFINISHED}replaced"
+    for folder in (path, fresh, old):
+        if os.path.lexists(folder) and not _is_simulated(folder):
+            raise OutputError(
+                "is no simulated recording, or holds something else as well",
+                where=folder,
+                remedy="move it away, or give another --out",
+            )
+    shutil.rmtree(fresh, ignore_errors=True)
+    if not path.exists() and old.exists():  # it was stopped in between
+        os.replace(old, path)
+    shutil.rmtree(old, ignore_errors=True)
+    if path.exists():
+        os.replace(path, old)
+    try:
+        yield fresh
+    except BaseException:
+        for made in (fresh, path):
+            shutil.rmtree(made, ignore_errors=True)
+        if old.exists():
+            os.replace(old, path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+# All that a simulated recording holds, in the end and while it is written.
+_SIMULATED = re.compile(
+    r"(truth/)?[a-z_]+/\.?\d{6}\.[\w.-]+|truth/[\w.-]+\.ply"
+    r"|\.?(camera|correction|rays|timestamps|groundtruth|odometry|frames|imu|peaks)\.[\w.-]+"
+)
+
+
+def _is_simulated(folder: Path) -> bool:
+    """Whether a folder holds a simulated recording, or a part of it, and nothing else."""
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    for here, folders, names in os.walk(folder):
+        if any((Path(here) / name).is_symlink() for name in (*folders, *names)):
+            return False
+        inside = Path(here).relative_to(folder)
+        if not all(_SIMULATED.fullmatch((inside / name).as_posix()) for name in names):
+            return False
+    return folder.name.startswith(UNFINISHED) or (folder / "truth").is_dir()
+
+
+# Section 4.1.6: all points, no filters; and a resolution of 1 m. Loops would be 3 m apart.
+PEAKS_CONFIG = """\
+filters = []
+"""
+PEAKS_ICP = """
+[odometry]
+guess = "previous"
+
+[odometry.registration]
+resolution = 1.0
+source.part = "all"
+target.part = "all"
+"""
+
+
+def simulate_to(
+    scene: str,
+    out: Path,
+    *,
+    camera: str = "sr4000",
+    seed: int = 0,
+    every: int | None = None,
+    frames: int | None = None,
+    first: int = 0,
+    texture: bool = True,
+    passing: Passing | None = None,
+    without: tuple[str, ...] = (),
+    correction: bool = True,
+    imu: bool = False,
+    sigma: float | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Write a simulated recording; returns how many frames it has.
+
+    `without` names effects to switch off, or is ("all",); see `Effects.without`.
+
+    Raises
+    ------
+    InputError
+        For an unknown scene, camera or effect.
+    OutputError
+        If the folder can't be written, or holds something already.
+    """
+    progress = progress or Silent()
+    effects = Effects().without(*without)
+    seen = 0
+
+    def tell(done: int, total: int) -> None:
+        nonlocal seen
+        if done == 1:
+            progress.stage("simulating", total)
+        seen = done
+        progress.advance()
+
+    ours = not out.exists() or (out.is_dir() and not any(out.iterdir()))
+    options: dict[str, Any] = {} if sigma is None else {"sigma_m": sigma}
+    try:
+        simulate(
+            scene,
+            out,
+            camera=camera,
+            seed=seed,
+            effects=effects,
+            every=every,
+            frames=frames,
+            first=first,
+            passing=passing,
+            correction=correction,
+            texture=texture,
+            imu=imu,
+            progress=tell,
+            **options,
+        )
+    except BaseException:
+        if ours:
+            shutil.rmtree(out, ignore_errors=True)
+        raise
+    return seen or len(list(out.glob("cloud/*.ply")))

@@ -1,0 +1,390 @@
+"""The five cases of chapter 4 that a camera sees: every stride, method, guess and draw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from tofuse.arrays import Bool, Float32, Float64
+from tofuse.geometry import se3
+from tofuse.lab.experiments import measures
+from tofuse.lab.experiments.measures import BoxFit, PathScore
+from tofuse.lab.experiments.recorded import Recorded, record_scene
+from tofuse.lab.simulation.scene import SCENES
+from tofuse.lab.simulation.scenes import box
+from tofuse.pipeline.config import Config, changed, from_method
+from tofuse.pipeline.progress import Progress
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.loops import GivenLoop
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.recordings.recording import Recording
+
+METHODS = ("thesis", "default")
+GUESSES = ("identity", "previous")
+# Which 1000 points a registration draws decides much, so that one draw says little.
+DRAWS = 3
+_MODEL_POINTS = 200_000
+CHEST = (0.88, 0.94)  # heights of a band around the torso, m above the floor
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case of section 4.1.
+
+    Attributes
+    ----------
+    scene
+        Of the simulator.
+    section
+        Where the thesis gives its result.
+    strides
+        Every how manieth raw frame is taken.
+    """
+
+    scene: str
+    title: str
+    section: str
+    text: str
+    strides: tuple[int, ...]
+
+    @property
+    def stride(self) -> int:
+        """The stride of the thesis."""
+        return SCENES[self.scene].stride
+
+
+CASES = (
+    Case(
+        "rail",
+        "Translation of the camera",
+        "5.1",
+        "The camera slides 0.90 m to its right along a rail, facing an office desk, a chair and a "
+        "plastic plant, and more slowly back again.",
+        (3, 5, 7),
+    ),
+    Case(
+        "room",
+        "Room with reference objects",
+        "5.2",
+        "The camera turns once on its stand in the middle of a room of 6.0 x 3.2 m, in which seven "
+        "office chairs stand evenly spaced.",
+        (2, 3, 4),
+    ),
+    Case(
+        "empty-room",
+        "Empty room",
+        "5.3",
+        "The same turn in the same room without the chairs.",
+        (2, 3, 4),
+    ),
+    Case(
+        "torso",
+        "Rotating torso",
+        "5.4",
+        "A person on a rotating chair turns once in front of a still camera; everything beyond the "
+        "person is cut off by distance. The world is the person, whom the camera seems to orbit.",
+        (3, 6, 9),
+    ),
+    Case(
+        "box",
+        "Rotating box",
+        "5.5",
+        "A box of 300 x 300 x 400 mm turns once on its stand in front of a still camera that sees "
+        "its top as well; everything beyond is cut off by distance.",
+        (5, 10, 15),
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Points of all frames put together by some poses, and what is measured on them.
+
+    Attributes
+    ----------
+    points
+        (N, 3) float32 in the frame of the true surface, m; thinned.
+    sizes
+        By name, m and degrees.
+    box
+        The fit, where the case is the box.
+    """
+
+    points: Float32
+    sizes: dict[str, float]
+    box: BoxFit | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One reconstruction.
+
+    Attributes
+    ----------
+    draw
+        Which draw of the random points: the seed above that of the scene.
+    truth, before, after
+        (N, 4, 4) T_world_camera: true, chained, and optimised; NaN where lost.
+    loop
+        Whether the loop that was given by hand was confirmed, and why.
+    model_before, model_after
+        Models of the two; their points are kept of the first draw alone.
+    """
+
+    case: str
+    method: str
+    guess: str
+    stride: int
+    draw: int
+    truth: Float64
+    before: Float64
+    after: Float64
+    loop: tuple[bool, str]
+    objective: tuple[float, ...]
+    verdict: str
+    score_before: PathScore
+    score_after: PathScore
+    model_before: Model
+    model_after: Model
+    seconds: float
+
+    @property
+    def posed(self) -> int:
+        """How many frames have a pose."""
+        return int(np.isfinite(self.before[:, 0, 0]).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class CaseResult:
+    """Everything that came out of one case.
+
+    Attributes
+    ----------
+    perfect
+        The filtered frames of the thesis's stride put together by the true poses: what a perfect
+        registration would give.
+    samples
+        Three of the frames, to look at.
+    T_truth_world
+        (4, 4) from the world to the frame of the true surface.
+    surface
+        (K, 3) points on the true surface.
+    facts
+        Numbers of the case that no run changes.
+    """
+
+    case: Case
+    runs: tuple[Run, ...]
+    perfect: Model
+    samples: tuple[RangeFrame, ...]
+    T_truth_world: Float64
+    surface: Float64
+    facts: dict[str, Any]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def select(
+        self, method: str, guess: str = "previous", stride: int | None = None
+    ) -> tuple[Run, ...]:
+        """Return all draws of one method, guess and stride (that of the thesis if not given)."""
+        stride = self.case.stride if stride is None else stride
+        return tuple(
+            r for r in self.runs if (r.method, r.guess, r.stride) == (method, guess, stride)
+        )
+
+
+def run_case(
+    case: Case, seed: int, progress: Progress, *, limit: int | None = None, draws: int = DRAWS
+) -> CaseResult:
+    """Simulate a case once and reconstruct it in every way.
+
+    Parameters
+    ----------
+    seed
+        Of the simulation, and of the first draw.
+    limit
+        Stop after so many raw frames.
+    draws
+        How often each run with the previous guess, and each at the thesis's stride, is repeated
+        with other random points.
+    """
+    start = perf_counter()
+
+    def tell(done: int, total: int) -> None:
+        if done == 1:
+            progress.stage(f"{case.scene}: simulating", total)
+        progress.advance()
+
+    recorded = record_scene(case.scene, case.strides, seed, limit=limit, progress=tell)
+    simulated = perf_counter()
+    plans = [
+        (method, stride, guess, draw)
+        for method in METHODS
+        for stride in case.strides
+        for guess in GUESSES
+        for draw in range(draws if guess == "previous" or stride == case.stride else 1)
+    ]
+    progress.stage(f"{case.scene}: registering", len(plans))
+    configs = {method: configuration(method, recorded) for method in METHODS}
+    filtered = {method: recorded.filtered(config) for method, config in configs.items()}
+    runs = []
+    for method, stride, guess, draw in plans:
+        source, config = filtered[method]
+        config = changed(config, {"odometry": {"guess": guess}}, where="experiments")
+        runs.append(_run(case, source, config, stride, seed, draw))
+        progress.advance()
+    thesis, _ = filtered["thesis"]
+    recording = thesis.every(case.stride)
+    facts = _facts(case, thesis, recording, {m: c.to_dict() for m, c in configs.items()})
+    middle = [round(k * (len(recording) - 1)) for k in (0.0, 1 / 3, 2 / 3)]
+    samples = [recorded.every(case.stride)[k] for k in middle]
+    return CaseResult(
+        case,
+        tuple(runs),
+        build_model(case, thesis, list(recording), recording.reference, keep=True),
+        tuple(f for f in samples if isinstance(f, RangeFrame)),
+        thesis.T_truth_world,
+        thesis.surface,
+        facts,
+        {"simulation": simulated - start, "registration": perf_counter() - simulated},
+    )
+
+
+def configuration(method: str, recorded: Recorded) -> Config:
+    """Return a method with the settings of chapter 4: loops by hand, background cut off."""
+    config = from_method(method)
+    filters = config.to_dict()["filters"]
+    depth = recorded.made.scene.max_depth_m
+    if depth is not None:
+        filters = [{"part": "distance", "maximum": depth}, *filters]
+    changes = {
+        "filters": filters,
+        "loops": {"per_frame" if method == "thesis" else "per_view": 0},
+        # The fused cloud is not looked at; coarse, it costs little.
+        "fusion": {"voxel_m": 0.1},
+    }
+    return changed(config, changes, where="experiments")
+
+
+def _run(case: Case, recorded: Recorded, config: Config, stride: int, seed: int, draw: int) -> Run:
+    recording = recorded.every(stride)
+    first, last = int(recording.indices[0]), int(recording.indices[-1])
+    loops = [GivenLoop(first, last)] if last > first else []
+    start = perf_counter()
+    result = reconstruct(recording, config, seed=seed + draw, loops=loops)
+    seconds = perf_counter() - start
+    assert recording.reference is not None
+    truth = recording.reference
+    before, after = result.diagnostics.sequential, result.trajectory
+    frames = list(recording)
+    keep = draw == 0 and stride == case.stride
+    record = next(iter(result.diagnostics.loops), None)
+    return Run(
+        case.scene,
+        result.config["method"],
+        result.config["odometry"]["guess"],
+        stride,
+        draw,
+        truth,
+        before,
+        after,
+        (False, "too short") if record is None else (record.accepted, record.reason),
+        result.diagnostics.objective,
+        result.diagnostics.verdict,
+        measures.score_path(before, truth),
+        measures.score_path(after, truth),
+        build_model(case, recorded, frames, before, keep=keep),
+        build_model(case, recorded, frames, after, keep=keep),
+        seconds,
+    )
+
+
+def build_model(
+    case: Case, recorded: Recorded, frames: list[Frame], poses: Float64 | None, *, keep: bool
+) -> Model:
+    """Put frames together by poses (N, 4, 4), NaN where lost, and measure the model."""
+    assert poses is not None
+    total = sum(len(f) for f in frames)
+    step = max(1, -(-total // _MODEL_POINTS))
+    parts = [
+        se3.transform(recorded.T_truth_world @ T, frame.points[::step])
+        for frame, T in zip(frames, poses, strict=True)
+        if np.isfinite(T[0, 0])
+    ]
+    points = np.concatenate(parts)
+    sizes = {"surface_error_m": measures.surface_error_m(points, recorded.surface_tree)}
+    fit = None
+    if case.scene in ("room", "empty-room"):
+        extent = measures.extent_m(points)
+        sizes |= {"length_m": float(extent[0]), "width_m": float(extent[1])}
+    elif case.scene == "torso":
+        sizes["girth_m"] = measures.girth_m(points, *CHEST)
+    elif case.scene == "box" and len(points) > 100:
+        fit = measures.fit_box(points, box.BOTTOM, box.HEIGHT, box.WIDTH)
+        sizes |= {
+            "width_a_m": float(fit.widths_m[0]),
+            "width_b_m": float(fit.widths_m[1]),
+            "height_m": fit.height_m,
+            "worst_angle_deg": float(np.abs(fit.angles_deg - 90).max()),
+        }
+    return Model(points.astype(np.float32) if keep else np.zeros((0, 3), np.float32), sizes, fit)
+
+
+_Facts = Callable[[Recorded, Recording], dict[str, Any]]
+
+
+def _facts(
+    case: Case, recorded: Recorded, recording: Recording, configs: dict[str, Any]
+) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "frames": {stride: len(recorded.every(stride)) for stride in case.strides},
+        "configurations": configs,
+    }
+    more: dict[str, _Facts] = {
+        "room": lambda a, b: {"door": _door(a, b)},
+        "empty-room": lambda a, b: {"corners": {s: corner_in_view(a, s) for s in case.strides}},
+        "torso": lambda a, b: {"girth_m": measures.girth_m(a.surface, *CHEST)},
+    }
+    return found | (more[case.scene](recorded, recording) if case.scene in more else {})
+
+
+def corner_in_view(recorded: Recorded, stride: int) -> Bool:
+    """(N,) mask: which frames of a stride see a corner of the room, by the true poses."""
+    from tofuse.lab.simulation.scenes import room
+
+    recording = recorded.every(stride)
+    frame = recording[0]
+    assert isinstance(frame, RangeFrame)
+    assert recording.reference is not None
+    T = recorded.T_truth_world @ recording.reference
+    half = np.arctan(np.nanmax(np.abs(frame.camera.rays()[..., 0])))
+    x, y = room.LENGTH / 2, room.WIDTH / 2
+    seen = np.zeros(len(T), bool)
+    for corner in ((x, y), (-x, y), (-x, -y), (x, -y)):
+        towards = np.array(corner) - T[:, :2, 3]
+        ahead = T[:, :2, 2]
+        cosine = (towards * ahead).sum(1) / (
+            np.linalg.norm(towards, axis=1) * np.linalg.norm(ahead, axis=1)
+        )
+        # A few degrees inside the image, so that there is something to see of both walls.
+        seen |= np.arccos(np.clip(cosine, -1, 1)) < half - np.radians(4)
+    return seen
+
+
+def _door(recorded: Recorded, recording: Recording) -> dict[str, float]:
+    """Points per frame on the glossy door, and on the same wall as far to the other side."""
+    from tofuse.lab.simulation.scenes import room
+
+    counts = {"door": 0, "wall": 0}
+    frames = list(recording)
+    for frame in frames:
+        T = recorded.T_truth_world @ recorded.poses[frame.index]
+        p = se3.transform(T, frame.points)
+        on_wall = (np.abs(p[:, 1] + room.WIDTH / 2) < 0.15) & (p[:, 2] < 2.0)
+        for name, side in (("door", 1), ("wall", -1)):
+            at = side * p[:, 0]
+            counts[name] += int((on_wall & (at > 1.4) & (at < 2.2)).sum())
+    return {name: count / len(frames) for name, count in counts.items()}

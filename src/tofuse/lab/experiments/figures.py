@@ -1,0 +1,210 @@
+"""Figures of chapters 4 and 5 as inline SVG in the page's colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.lab.experiments.peaks import AXES, PeaksRun, PeaksSweep
+from tofuse.report import plots
+from tofuse.report.plots import AFTER, BAD, BEFORE, GRID, INK, MUTED, REFERENCE, framed, svg
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+_POINTS_RGB = (112, 138, 176)
+_MARGINS = (50.0, 36.0, 12.0, 26.0)  # left, bottom, right, top, in pixels
+
+
+def plan_limits(*groups: Float64) -> Float64:
+    """(2, 2) low and high corners around the bulk of groups of (N, 2) points."""
+    return plots.limits(*groups, outer=0.5)
+
+
+def plan(
+    points: Float64,
+    cameras: Float64,
+    box: Float64,
+    *,
+    title: str,
+    label: str,
+    true: Sequence[Float64] = (),
+    measured: Sequence[Float64] = (),
+    names: tuple[str, str] = ("x, m", "y, m"),
+    width: int = 380,
+) -> str:
+    """Draw a model from above as density of points (figures 5.4, 5.7, 5.8, 5.10).
+
+    Parameters
+    ----------
+    points, cameras
+        (N, 2) points and camera positions in the plan, m; lost cameras are NaN.
+    box
+        (2, 2) corners of the picture, so that pictures compare.
+    true, measured
+        Closed outlines (K, 2) as they are, and as they were measured.
+    """
+    extent = box[1] - box[0]
+    inner = width - 62.0
+    height = float(np.clip(inner * extent[1] / extent[0], 120, 1.15 * inner))
+    figure, axes = framed(width, height + 62, _MARGINS)
+    scale = max(extent[0] / inner, extent[1] / height)
+    middle = box.mean(0)
+    x0, x1 = middle[0] - scale * inner / 2, middle[0] + scale * inner / 2
+    y0, y1 = middle[1] - scale * height / 2, middle[1] + scale * height / 2
+    columns = int(0.75 * inner)
+    rows = max(2, int(columns * height / inner))
+    density, _, _ = np.histogram2d(
+        points[:, 1], points[:, 0], bins=(rows, columns), range=((y0, y1), (x0, x1))
+    )
+    top = np.percentile(density[density > 0], 99) if (density > 0).any() else 1.0
+    image = np.zeros((rows, columns, 4), np.uint8)
+    image[..., :3] = _POINTS_RGB
+    shade = (np.log1p(density) / np.log1p(top)).clip(0, 1)
+    # In few steps, which keeps the picture small.
+    image[..., 3] = np.where(density > 0, 60 + 13 * np.round(15 * shade), 0).astype(np.uint8)
+    axes.imshow(image, extent=(x0, x1, y0, y1), origin="lower", interpolation="none", aspect="auto")
+    for outline, color, style in (
+        *((o, BAD, "dashed") for o in true),
+        *((o, AFTER, "solid") for o in measured),
+    ):
+        closed = np.vstack([outline, outline[:1]])
+        axes.plot(closed[:, 0], closed[:, 1], color=color, linestyle=style, linewidth=1.5)
+    axes.plot(cameras[:, 0], cameras[:, 1], color=INK, linewidth=1)
+    axes.plot(cameras[:1, 0], cameras[:1, 1], "o", color=INK, markersize=4)
+    axes.set_xlim(x0, x1)
+    axes.set_ylim(y0, y1)
+    for axis, size in ((axes.xaxis, inner), (axes.yaxis, height)):
+        axis.set_major_locator(_locator(size / 45))
+    _label(axes, names[0], f"{title} — {names[1]}")
+    return svg(figure, label)
+
+
+def _locator(most: float) -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=int(np.clip(most, 2, 6)), steps=[1, 2, 5, 10])
+
+
+def _label(axes: Axes, x: str, title: str) -> None:
+    axes.set_xlabel(x, color=MUTED, fontsize=10.5, labelpad=2)
+    axes.set_title(title, color=INK, fontsize=11, loc="left", pad=6, x=-0.1)
+
+
+def drift(
+    before: Float64, after: Float64, axis: str, *, beside: tuple[Float64, Float64], label: str
+) -> str:
+    """Plot the error of the position along one axis (figures 5.2, 5.6).
+
+    `beside` is the same of the other method, drawn with dots.
+    """
+    return plots.lines(
+        np.arange(len(before), dtype=float),
+        [
+            (100 * beside[0], BEFORE, ":"),
+            (100 * beside[1], AFTER, ":"),
+            (100 * before, BEFORE, "-"),
+            (100 * after, AFTER, "-"),
+        ],
+        label=label,
+        ylabel=f"error in {axis}, cm",
+        zero=True,
+        size=(330, 200),
+    )
+
+
+def objective(values: Sequence[float], *, label: str) -> str:
+    """Plot the optimiser's objective at every step (figure 5.3)."""
+    return plots.lines(
+        np.arange(len(values), dtype=float),
+        [(np.array(values), AFTER, "-")],
+        label=label,
+        ylabel="objective (eq 2.10)",
+        xlabel="step",
+        log=True,
+        size=(380, 220),
+    )
+
+
+def cameras(before: Float64, after: Float64, truth: Float64) -> tuple[str, str]:
+    """Draw the cameras before and after at the same scale (figure 5.5); poses (N, 4, 4)."""
+    known = np.isfinite(before[:, 0, 0])
+    before, after = before[known], after[known]
+    flat = [plots.project(p[:, :3, 3], "above") for p in (before, after, truth)]
+    box = plots.limits(*flat)
+    drawn = [
+        plots.cameras(
+            poses,
+            box,
+            "above",
+            color=color,
+            label=f"Cameras {name} optimisation, from above",
+            reference=truth,
+            width=380,
+        )
+        for poses, color, name in ((before, BEFORE, "before"), (after, AFTER, "after"))
+    ]
+    return drawn[0], drawn[1]
+
+
+def sweep(found: PeaksSweep) -> list[str]:
+    """Draw figure 5.12: error of each parameter over the noise, with the spread of the seeds."""
+    drawn = []
+    for k, name in enumerate(AXES):
+        figure, axes = framed(330, 220, _MARGINS)
+        unit, factor = ("m", 1.0) if k < 3 else ("°", 180 / np.pi)
+        for which, color in ((0, BEFORE), (1, AFTER)):
+            mean = factor * found.axes[:, which, k]
+            spread = factor * found.axes_spread[:, which, k]
+            axes.fill_between(
+                found.sigmas,
+                np.maximum(mean - spread, 0),
+                mean + spread,
+                color=color,
+                alpha=0.18,
+                linewidth=0,
+            )
+            axes.plot(found.sigmas, mean, color=color, linewidth=1.6, marker="o", markersize=3)
+        axes.set_ylim(bottom=0)
+        axes.locator_params(axis="y", nbins=5)
+        axes.locator_params(axis="x", nbins=6)
+        _label(axes, "sigma, m", f"mean error in {name}, {unit}")
+        drawn.append(svg(figure, f"Mean error in {name} over the noise"))
+    return drawn
+
+
+def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
+    """Draw figure 5.11 from above: the chain, and true, chained and optimised cameras.
+
+    `clouds` are the (N, 3) points of the views in their cameras' frames, m.
+    """
+    drawn = []
+    shown = (run.poses_sequential, run.poses_optimised)
+    flat = [plots.project(p[:, :3, 3], "above") for p in (*shown, run.truth)]
+    box = plots.limits(*flat)
+    for k, (poses, name) in enumerate(zip(shown, ("before", "after"), strict=True)):
+        points = np.concatenate(
+            [c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)]
+        )
+        figure, axes = framed(400, 400 * 0.95, _MARGINS)
+        some = points[:: max(1, len(points) // 3000)]
+        axes.plot(
+            some[:, 0], some[:, 2], ".", color=MUTED, markersize=1.2, alpha=0.5, rasterized=True
+        )
+        if k == 1:
+            for true, estimate in zip(flat[2], flat[1], strict=True):
+                ends = np.stack([true, estimate])
+                axes.plot(ends[:, 0], ends[:, 1], color=GRID, linewidth=1)
+            axes.plot(flat[2][:, 0], flat[2][:, 1], "s", color=REFERENCE, markersize=4)
+            axes.plot(flat[1][:, 0], flat[1][:, 1], "o-", color=AFTER, markersize=4, linewidth=1)
+        axes.plot(flat[0][:, 0], flat[0][:, 1], "o-", color=BEFORE, markersize=4, linewidth=1)
+        axes.set_xlim(box[0, 0], box[1, 0])
+        axes.set_ylim(box[0, 1], box[1, 1])
+        axes.set_aspect("equal", "box")
+        _label(axes, "x, m", f"{name} optimisation — z, m")
+        drawn.append(svg(figure, f"The synthetic case {name} optimisation, from above"))
+    return drawn[0], drawn[1]

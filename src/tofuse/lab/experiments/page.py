@@ -1,0 +1,258 @@
+"""`tofuse experiments`: run the cases, judge the statements, write one page and the numbers."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tofuse._version import __version__
+from tofuse.errors import InputError
+from tofuse.files.moving import Names
+from tofuse.lab.experiments import sections
+from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run, run_case
+from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
+from tofuse.lab.experiments.statements import Judged, Results, judge_all
+from tofuse.pipeline.progress import Progress, Silent
+from tofuse.results.folder import Contract, OutputFolder, json_of
+from tofuse.results.output import plain
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+KIND = "experiments"
+_MARKER = "results.json"
+NAMES = (*(case.scene for case in CASES), "peaks")
+
+
+def run_experiments(
+    out: Path,
+    *,
+    cases: tuple[str, ...] = (),
+    seeds: int = 20,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    limit: int | None = None,
+    draws: int = DRAWS,
+) -> Path:
+    """Run chapters 4 and 5 of the thesis again, and write ``index.html`` and ``results.json``.
+
+    Parameters
+    ----------
+    cases
+        Some of `NAMES`; all if empty.
+    seeds
+        How many noise seeds the synthetic case gets.
+    seed
+        The first of them, and the seed of the other cases.
+    overwrite
+        Replace the result of earlier experiments in `out`.
+    limit
+        Stop simulated sequences after so many raw frames.
+    draws
+        See `run_case`.
+
+    Returns
+    -------
+    The path of the page.
+
+    Raises
+    ------
+    InputError
+        For a case that there is not.
+    OutputError
+        If the folder is not empty and not ours, or can't be written.
+    """
+    progress = progress or Silent()
+    for name in cases:
+        if name not in NAMES:
+            raise InputError(
+                f"there is no case {name!r}", where="--cases", remedy=f"use some of {list(NAMES)}"
+            )
+    chosen = cases or NAMES
+    start = perf_counter()
+    with OutputFolder(out, overwrite=overwrite, contract=_CONTRACT) as folder:
+        # BLAS sums differ with its number of threads; ours don't.
+        with threadpool_limits(1):
+            results = _run_all(chosen, seeds, seed, progress, limit, draws)
+            judged = judge_all(results, METHODS)
+        parameters = {"cases": list(chosen), "seeds": seeds, "seed": seed, "draws": draws}
+        parameters |= {} if limit is None else {"limit": limit}
+        progress.stage("drawing")
+        seconds = perf_counter() - start
+        page = render(results, judged, parameters, seconds)
+        data = results_json(results, judged, parameters, seconds)
+        with folder.staging() as staging:
+            (staging / "index.html").write_text(page, encoding="utf-8")
+            text = json.dumps(plain(data), indent=1, allow_nan=False)
+            (staging / _MARKER).write_text(text + "\n", encoding="utf-8")
+    return out / "index.html"
+
+
+def is_experiments(folder: Path) -> bool:
+    """Say whether a folder holds the result of earlier experiments."""
+    data = json_of(folder / _MARKER)
+    return data is not None and data.get("kind") == KIND
+
+
+_CONTRACT = Contract(Names(frozenset({"index.html", _MARKER})), _MARKER, is_experiments)
+
+
+def _run_all(
+    chosen: tuple[str, ...],
+    seeds: int,
+    seed: int,
+    progress: Progress,
+    limit: int | None,
+    draws: int,
+) -> Results:
+    found = {
+        case.scene: run_case(case, seed, progress, limit=limit, draws=draws)
+        for case in CASES
+        if case.scene in chosen
+    }
+    peaks = None
+    if "peaks" in chosen:
+        progress.stage("peaks: registering", seeds * len(SIGMAS_M))
+        peaks = sweep_peaks(range(seed, seed + seeds), told=progress.advance)
+    return Results(found, peaks)
+
+
+def results_json(
+    results: Results,
+    judged: tuple[Judged, ...],
+    parameters: Mapping[str, Any],
+    seconds: float,
+) -> dict[str, Any]:
+    """Return the content of ``results.json``: SI units, and degrees where a name says so."""
+    return {
+        "kind": KIND,
+        "schema": 1,
+        "version": __version__,
+        "parameters": dict(parameters),
+        "seconds": {
+            "total": round(seconds, 2),
+            **{
+                name: {k: round(v, 2) for k, v in case.seconds.items()}
+                for name, case in results.cases.items()
+            },
+        },
+        "statements": [
+            {
+                "name": j.statement.name,
+                "section": j.statement.section,
+                "text": j.statement.quote,
+                "findings": {
+                    method: {"outcome": f.outcome, "numbers": f.numbers}
+                    for method, f in j.findings.items()
+                },
+            }
+            for j in judged
+        ],
+        "cases": {name: _case_json(case) for name, case in results.cases.items()},
+        "peaks": None if results.peaks is None else _peaks_json(results.peaks),
+    }
+
+
+def _case_json(result: CaseResult) -> dict[str, Any]:
+    return {
+        "section": result.case.section,
+        "thesis_stride": result.case.stride,
+        "facts": {str(k): _keyed(v) for k, v in result.facts.items()},
+        "true_poses": result.perfect.sizes,
+        "runs": [_run_json(run) for run in result.runs],
+    }
+
+
+def _keyed(value: Any) -> Any:
+    return {str(k): _keyed(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+def _run_json(run: Run) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "method": run.method,
+        "guess": run.guess,
+        "stride": run.stride,
+        "draw": run.draw,
+        "frames": len(run.truth),
+        "with_pose": run.posed,
+        "loop": {"accepted": run.loop[0], "reason": run.loop[1]},
+        "verdict": run.verdict,
+        "objective": run.objective,
+        "seconds": round(run.seconds, 3),
+    }
+    for name, score, model in (
+        ("before", run.score_before, run.model_before),
+        ("after", run.score_after, run.model_after),
+    ):
+        data[name] = {
+            "ate_rms_m": score.ate_m,
+            "rotation_rms_deg": score.rotation_deg,
+            "end_error_m": score.end_m,
+            "end_error_deg": score.end_deg,
+            "axes_rms_m": score.axes_rms_m,
+            "drift_m": np.round(score.drift, 5),
+            "model": model.sizes,
+        }
+        if model.box is not None:
+            data[name]["box_angles_deg"] = model.box.angles_deg
+    return data
+
+
+def _peaks_json(sweep: PeaksSweep) -> dict[str, Any]:
+    def both(values: Any) -> dict[str, Any]:
+        return {"sequential": values[:, 0], "optimised": values[:, 1]}
+
+    return {
+        "sigma_m": sweep.sigmas,
+        "position_m": both(sweep.position),
+        "rotation_rad": both(sweep.rotation),
+        "axes": list(AXES),
+        "axes_mean": both(sweep.axes),
+        "axes_spread": both(sweep.axes_spread),
+    }
+
+
+def render(
+    results: Results,
+    judged: tuple[Judged, ...],
+    parameters: Mapping[str, Any],
+    seconds: float,
+) -> str:
+    """Return the page as HTML, without outside resources."""
+    counts = Counter(j.findings[METHODS[0]].outcome for j in judged)
+    return _template().render(
+        version=__version__,
+        style=_text("tofuse.report", "style.css") + _text("tofuse.lab.experiments", "style.css"),
+        judged=judged,
+        methods=METHODS,
+        counts=counts,
+        cases=[sections.case_section(case) for case in results.cases.values()],
+        peaks=None if results.peaks is None else sections.peaks_section(results.peaks),
+        parameters=parameters,
+        strides={case.scene: case.stride for case in CASES},
+        minutes=f"{seconds / 60:.1f}",
+    )
+
+
+def _text(package: str, name: str) -> str:
+    return (resources.files(package) / "templates" / name).read_text(encoding="utf-8")
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_text("tofuse.lab.experiments", "experiments.html.j2"))

@@ -1,0 +1,232 @@
+"""The noise sweep on synthetic data (sections 4.1.6 and 5.6, figure 5.12)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.arrays import Bool, Float64
+from tofuse.geometry import se3
+from tofuse.lab.experiments.bound import (
+    joint_covariance,
+    mean_distance,
+    mean_distances,
+    pose_covariances,
+)
+from tofuse.lab.simulation.peaks import (
+    peaks_cameras,
+    peaks_normals,
+    peaks_points,
+    peaks_seen,
+    peaks_views,
+)
+from tofuse.odometry.sequential import Sequential
+from tofuse.pipeline.methods import default
+from tofuse.pipeline.reconstruct import reconstruct
+from tofuse.posegraph.build import Measured, chain
+from tofuse.posegraph.castellani import Castellani
+from tofuse.posegraph.graph import Optimiser
+from tofuse.posegraph.planes import Planes
+from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.registration.coarse_to_fine import CoarseToFine
+from tofuse.registration.icp import algorithm_1
+
+SIGMAS_M = tuple(k / 100 for k in range(1, 11))
+AXES = ("x", "y", "z", "yaw", "pitch", "roll")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """How far estimated cameras are from the true ones.
+
+    Attributes
+    ----------
+    position
+        (N,) distances, m.
+    rotation
+        (N,) screw angles, rad.
+    axes
+        (N, 6) signed errors along x, y, z of the world (m), and in yaw, pitch, roll (rad), which
+        turn the true camera into the estimated one about its own y, then x, then z axis.
+    """
+
+    position: Float64
+    rotation: Float64
+    axes: Float64
+
+    @classmethod
+    def of(cls, estimate: Float64, truth: Float64) -> PoseErrors:
+        """Compare (N, 4, 4) poses in the same world frame; nothing is aligned."""
+        shift = estimate[:, :3, 3] - truth[:, :3, 3]
+        R = np.swapaxes(truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
+        angles = np.stack(
+            [
+                np.arctan2(R[:, 0, 2], R[:, 2, 2]),
+                np.arcsin(np.clip(-R[:, 1, 2], -1, 1)),
+                np.arctan2(R[:, 1, 0], R[:, 1, 1]),
+            ],
+            axis=1,
+        )
+        return cls(np.linalg.norm(shift, axis=1), se3.angle(R), np.hstack([shift, angles]))
+
+
+@dataclass(frozen=True, eq=False)
+class PeaksRun:
+    """One sequence at one level of noise: the 20 cameras before and after, and their errors.
+
+    `poses_sequential`, `poses_optimised` and `truth` are (20, 4, 4) T_world_camera.
+    """
+
+    sigma: float
+    seed: int
+    sequential: PoseErrors
+    optimised: PoseErrors
+    objective: tuple[float, ...]
+    poses_sequential: Float64
+    poses_optimised: Float64
+    truth: Float64
+
+
+def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> PeaksRun:
+    """Register the 20 views in sequence, and close the loop by its true motion.
+
+    All points are used, with a resolution of 1 m and the previous motion as guess; Algorithm 1
+    stops at a change of 1e-4 over 3 iterations, or after 100. The last motion, T_1_n, is the true
+    one, as in the thesis.
+    """
+    views, truth = peaks_views(sigma, seed)
+    icp = algorithm_1(resolution=1.0, points=None, epsilon=1e-4, k=3, max_iterations=100)
+    tracker = Sequential(registration=icp, guess="previous").start(seed)
+    steps = [tracker.push(view) for view in views]
+    relative = np.array([s.registration.T_target_source for s in steps[1:] if s.registration])
+    last = len(views) - 1
+    graph = chain(relative, [Measured(0, last, truth[last], np.eye(6))])
+    optimisation = (optimiser or Castellani()).optimise(graph)
+    return PeaksRun(
+        sigma,
+        seed,
+        PoseErrors.of(graph.poses, truth),
+        PoseErrors.of(optimisation.graph.poses, truth),
+        optimisation.objective,
+        graph.poses,
+        optimisation.graph.poses,
+        truth,
+    )
+
+
+def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
+    """Errors after registration from coarse to fine, and after the refinement of all views.
+
+    Nothing is told of the closing motion.
+    """
+    views, truth = peaks_views(sigma, seed)
+    tracker = Sequential(registration=CoarseToFine(), guess="previous").start(seed)
+    refiner = Planes().start(ViewStore(Spacing()))
+    poses: list[Float64] = []
+    for view in views:
+        step = tracker.push(view)
+        T = step.T_component_camera
+        poses.append(poses[-1] if T is None else T)
+        refiner.push(view, poses[-1])
+    start = np.array(poses)
+    refined = refiner.finish([view.index for view in views], start).poses
+    return PoseErrors.of(start, truth), PoseErrors.of(refined, truth)
+
+
+def reconstruct_peaks(sigma: float, seed: int) -> tuple[PoseErrors, int]:
+    """Errors of what `tofuse run` makes of a folder of the views, and how many have a pose.
+
+    Beside the first of these, whose pose is taken to be the true one.
+    """
+    views, truth = peaks_views(sigma, seed)
+    recording = Recording.of(ArraySource(views, truth), "peaks", "simulated")
+    found = reconstruct(recording, default("cloud"), seed=seed)
+    has = found.has_pose
+    first = truth[has][0] @ se3.inverse(found.trajectory[has][0])
+    return PoseErrors.of(first @ found.trajectory[has], truth[has]), int(has.sum())
+
+
+def peaks_bound(sigma: float) -> float:
+    """Lowest mean error (m) of the 20 positions that the surface alone allows; see `bound`."""
+    C = pose_covariances(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
+    return mean_distance(C[:, :3, :3])
+
+
+def peaks_bound_of_one(sigma: float, shares: Sequence[float]) -> Float64:
+    """Quantiles (m) of the mean error of a single recording by a method that is at the bound."""
+    C = joint_covariance(peaks_points(), peaks_normals(), _seen(), peaks_cameras(), sigma)
+    return np.asarray(np.quantile(mean_distances(C), shares), np.float64)
+
+
+def _seen() -> Bool:
+    """(points, cameras) what each camera sees."""
+    seen = np.zeros((len(peaks_points()), len(peaks_cameras())), bool)
+    for k, rows in enumerate(peaks_seen()):
+        seen[rows, k] = True
+    return seen
+
+
+@dataclass(frozen=True, eq=False)
+class PeaksSweep:
+    """Mean errors over all cameras and seeds, a row for each sigma.
+
+    Attributes
+    ----------
+    sigmas
+        (S,) standard deviations of the noise, m.
+    position
+        (S, 2) mean distance of the cameras from the truth, sequential and optimised, m.
+    rotation
+        (S, 2) mean angle, rad.
+    axes
+        (S, 2, 6) mean absolute error for each of `AXES`, m and rad: the panels of figure 5.12.
+    axes_spread
+        (S, 2, 6) standard deviation over the seeds of what `axes` is the mean of.
+    runs
+        Every run.
+    """
+
+    sigmas: Float64
+    position: Float64
+    rotation: Float64
+    axes: Float64
+    axes_spread: Float64
+    runs: tuple[PeaksRun, ...]
+
+
+def sweep_peaks(
+    seeds: Sequence[int],
+    sigmas: Sequence[float] = SIGMAS_M,
+    told: Callable[[], None] = lambda: None,
+) -> PeaksSweep:
+    """Run every sigma with every seed, and take means; calls `told` after every run."""
+    runs = []
+    for sigma in sigmas:
+        for seed in seeds:
+            runs.append(run_peaks(sigma, seed))
+            told()
+    position, rotation, axes = (
+        _by_seed(runs, len(sigmas), name) for name in ("position", "rotation", "axes")
+    )
+    return PeaksSweep(
+        np.array(sigmas, float),
+        position.mean(1),
+        rotation.mean(1),
+        axes.mean(1),
+        axes.std(1),
+        tuple(runs),
+    )
+
+
+def _by_seed(runs: Sequence[PeaksRun], sigmas: int, name: str) -> Float64:
+    """Mean absolute error over the cameras, (sigmas, seeds, 2, ...)."""
+    means = np.array(
+        [
+            [np.abs(getattr(errors, name)).mean(0) for errors in (run.sequential, run.optimised)]
+            for run in runs
+        ]
+    )
+    return means.reshape(sigmas, -1, *means.shape[1:])

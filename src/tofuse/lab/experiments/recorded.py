@@ -1,0 +1,119 @@
+"""A simulated scene in memory: just the raw frames that some strides need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.filters.base import apply_filters
+from tofuse.geometry import se3
+from tofuse.lab.simulation.record import Plan, plan
+from tofuse.pipeline.config import Config
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.recordings.native import corrected_depth
+from tofuse.recordings.recording import ArraySource, Recording
+
+# About 1 cm apart in a room, so that distances from them are good to half of that.
+_SURFACE_POINTS = 500_000
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Some raw frames of a simulated scene, numbered from 0 in the order of the raw sequence.
+
+    Attributes
+    ----------
+    made
+        What was recorded; `made.raw` are the numbers of the raw frames.
+    frames
+        What the camera gave, after its factory correction.
+    poses
+        (N, 4, 4) true T_world_camera; the first is the identity.
+    """
+
+    made: Plan
+    frames: tuple[Frame, ...]
+    poses: Float64
+
+    def every(self, stride: int) -> Recording:
+        """Return every so manieth raw frame as a recording."""
+        chosen = np.flatnonzero(self.made.raw % stride == 0)
+        source = ArraySource(self.frames, self.poses)
+        return Recording(source, f"simulated {self.made.scene.name}", "simulated", chosen)
+
+    def filtered(self, config: Config) -> tuple[Recorded, Config]:
+        """Filter all frames once, for runs that share the filters; return what is left to do.
+
+        A filter that looks at the frames before is left in the configuration.
+        """
+        if config.window > 1:
+            return self, config
+        frames = tuple(apply_filters(config.filters, frame)[0] for frame in self.frames)
+        return replace(self, frames=frames), replace(config, filters=())
+
+    @cached_property
+    def T_truth_world(self) -> Float64:
+        """(4, 4) from the recording's world to the frame of the true surface, which has z up."""
+        return se3.inverse(self.made.sequence.T_world_truth(0.0))
+
+    @cached_property
+    def surface(self) -> Float64:
+        """(K, 3) random points on the true surface, in its own frame (z up), m."""
+        vertices, faces = self.made.scene.truth_mesh()
+        return sample_surface(vertices[faces], _SURFACE_POINTS)
+
+    @cached_property
+    def surface_tree(self) -> Any:
+        """`surface` as a SciPy cKDTree."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.surface)
+
+
+def record_scene(
+    scene: str,
+    strides: Sequence[int],
+    seed: int,
+    *,
+    limit: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Recorded:
+    """Simulate the raw frames of a scene that the strides need; a frame is taken once only.
+
+    Parameters
+    ----------
+    scene
+        One of the simulator's, all effects switched on.
+    limit
+        Stop after so many raw frames.
+    progress
+        Is told how many frames are done, and of how many.
+    """
+    made = plan(scene, seed=seed, every=1, frames=limit)
+    needed = np.any([made.raw % stride == 0 for stride in strides], axis=0)
+    made = replace(made, raw=made.raw[needed])
+    factory = made.correction
+
+    def corrected(frame: RangeFrame) -> Frame:
+        depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
+        return replace(frame, depth=depth)
+
+    frames = tuple(corrected(rendered.frame) for rendered in made.frames(progress))
+    return Recorded(made, frames, made.poses)
+
+
+def sample_surface(triangles: Float64, count: int) -> Float64:
+    """Draw points (count, 3) evenly from triangles (F, 3, 3); always the same ones."""
+    a, b, c = np.swapaxes(triangles, 0, 1)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    rng = np.random.default_rng([0, count])
+    face = rng.choice(len(triangles), count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    return a[face] + u * (b - a)[face] + v * (c - a)[face]

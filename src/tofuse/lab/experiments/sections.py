@@ -1,0 +1,273 @@
+"""What the page shows of each case: tables and figures, ready for the template."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.geometry import se3
+from tofuse.lab.experiments import figures
+from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Run
+from tofuse.lab.experiments.peaks import PeaksSweep
+from tofuse.lab.simulation.peaks import peaks_views
+from tofuse.lab.simulation.scenes import box, room
+from tofuse.report import images
+
+_EXAMPLE_SIGMA = 0.09
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawing and what it says."""
+
+    svg: str
+    caption: str = ""
+
+
+def case_section(result: CaseResult) -> dict[str, Any]:
+    """Return what the template needs for one case of the simulator."""
+    case = result.case
+    shown = {m: result.select(m)[0] for m in METHODS}
+    crude = {m: result.select(m, "identity")[0] for m in METHODS}
+    first, beside = (shown[m] for m in METHODS)
+    drifts = [
+        Figure(
+            figures.drift(
+                first.score_before.drift[:, k],
+                first.score_after.drift[:, k],
+                axis,
+                beside=(beside.score_before.drift[:, k], beside.score_after.drift[:, k]),
+                label=f"Error of the position in {axis}, {case.title}",
+            )
+        )
+        for k, axis in enumerate("xyz")
+    ]
+    before, after = figures.cameras(first.before, first.after, first.truth)
+    return {
+        "name": case.scene,
+        "title": case.title,
+        "section": case.section,
+        "text": case.text,
+        "stride": case.stride,
+        "frames": result.facts["frames"][case.stride],
+        "pictures": [_picture(frame) for frame in result.samples],
+        "rows": _rows(result),
+        "sizes": _sizes(result),
+        "plans": _plans(result, crude, shown),
+        "drifts": drifts,
+        "cameras": [
+            Figure(before, "thesis, before optimisation"),
+            Figure(after, "thesis, after optimisation"),
+        ],
+        "objective": Figure(
+            figures.objective(first.objective, label=f"Objective, {case.title}"),
+            "The objective at every step of the optimiser (figure 5.3), method thesis.",
+        )
+        if first.objective
+        else None,
+    }
+
+
+def _picture(frame: Any) -> str:
+    image = images.amplitude_image(frame)
+    if image is None:
+        image = images.depth_image(frame, images.depth_limits(frame), None)
+    return images.data_uri(image, jpeg=True)
+
+
+def _rows(result: CaseResult) -> list[dict[str, Any]]:
+    """One row of the table for each method, stride and guess: medians over the draws."""
+    rows = []
+    for method in METHODS:
+        for stride in result.case.strides:
+            for guess in GUESSES:
+                runs = result.select(method, guess, stride)
+                rows.append(
+                    {
+                        "method": method,
+                        "stride": stride,
+                        "thesis": stride == result.case.stride,
+                        "guess": guess,
+                        "draws": len(runs),
+                        "posed": f"{_mid(r.posed for r in runs):.0f} of {len(runs[0].truth)}",
+                        "ate": _pair(
+                            [100 * r.score_before.ate_m for r in runs],
+                            [100 * r.score_after.ate_m for r in runs],
+                        ),
+                        "rotation": _pair(
+                            [r.score_before.rotation_deg for r in runs],
+                            [r.score_after.rotation_deg for r in runs],
+                        ),
+                        "end": _pair(
+                            [100 * r.score_before.end_m for r in runs],
+                            [100 * r.score_after.end_m for r in runs],
+                        ),
+                        "model": _pair(
+                            [100 * r.model_before.sizes["surface_error_m"] for r in runs],
+                            [100 * r.model_after.sizes["surface_error_m"] for r in runs],
+                        ),
+                        "loop": _agreed([r.loop[0] for r in runs]),
+                        "verdict": _most([r.verdict for r in runs]),
+                    }
+                )
+    return rows
+
+
+def _mid(values: Any) -> float:
+    return float(np.median(list(values)))
+
+
+def _pair(before: Sequence[float], after: Sequence[float]) -> str:
+    return f"{_mid(before):.1f} → {_mid(after):.1f}"
+
+
+def _agreed(flags: Sequence[bool]) -> str:
+    if len(set(flags)) == 1:
+        return "yes" if flags[0] else "no"
+    return f"{sum(flags)} of {len(flags)}"
+
+
+def _most(values: Sequence[str]) -> str:
+    return ", ".join(sorted(set(values), key=lambda v: (-values.count(v), v)))
+
+
+_SIZES = {
+    "length_m": ("Length of the room, m", 1.0, "{:.2f}"),
+    "width_m": ("Width of the room, m", 1.0, "{:.2f}"),
+    "girth_m": ("Girth of the chest, cm", 100.0, "{:.1f}"),
+    "width_a_m": ("First width of the box, mm", 1000.0, "{:.0f}"),
+    "width_b_m": ("Second width of the box, mm", 1000.0, "{:.0f}"),
+    "height_m": ("Height of the box, mm", 1000.0, "{:.0f}"),
+    "worst_angle_deg": ("Worst of the four angles, off 90° by", 1.0, "{:.1f}°"),
+    "surface_error_m": ("Distance from the true surface (median), cm", 100.0, "{:.1f}"),
+}
+
+
+def _sizes(result: CaseResult) -> list[list[str]]:
+    """Rows of what is measured on the models: true, by the true poses, then each method."""
+    true = {
+        "length_m": room.LENGTH,
+        "width_m": room.WIDTH,
+        "girth_m": result.facts.get("girth_m"),
+        "width_a_m": box.WIDTH,
+        "width_b_m": box.DEPTH,
+        "height_m": box.HEIGHT,
+        "worst_angle_deg": 0.0,
+        "surface_error_m": 0.0,
+    }
+    rows = []
+    for name, (text, factor, form) in _SIZES.items():
+        if name not in result.perfect.sizes:
+            continue
+        cells = [true[name], result.perfect.sizes[name]]
+        for method in METHODS:
+            runs = result.select(method)
+            cells.append(_mid(r.model_before.sizes[name] for r in runs))
+            cells.append(_mid(r.model_after.sizes[name] for r in runs))
+        rows.append([text, *(form.format(factor * float(c or 0)) for c in cells)])
+    return rows
+
+
+def _plans(
+    result: CaseResult, crude: dict[str, Run], shown: dict[str, Run]
+) -> list[dict[str, Any]]:
+    """Top views: a row of three for each method, and one by the true poses."""
+    T = result.T_truth_world
+
+    def flat(poses: Float64) -> Float64:
+        return (T @ poses)[:, :2, 3]
+
+    def about(model: Model) -> Float64:
+        return model.points[:, :2].astype(float)
+
+    truth = flat(shown[METHODS[0]].truth)
+    outlines = _outlines(result)
+    groups = [about(r.model_after) for r in shown.values()]
+    groups += [about(r.model_before) for r in shown.values()]
+    # Cameras around an object stay outside the picture, or the object would be small in it.
+    seen = [] if shown[METHODS[0]].case in ("torso", "box") else [truth]
+    frame = figures.plan_limits(*groups, about(result.perfect), *outlines, *seen)
+
+    def draw(model: Model, cameras: Float64, title: str, method: str) -> Figure:
+        label = f"{result.case.title} from above, {method}, {title}"
+        measured = [model.box.corners] if model.box and np.isfinite(model.box.corners).all() else []
+        drawn = figures.plan(
+            about(model), cameras, frame, title=title, label=label, true=outlines,
+            measured=measured,
+        )  # fmt: skip
+        return Figure(drawn)
+
+    rows = []
+    for method in METHODS:
+        a, b = crude[method], shown[method]
+        rows.append(
+            {
+                "title": f"Method {method}",
+                "figures": [
+                    draw(a.model_before, flat(a.before), "identity guess", method),
+                    draw(b.model_before, flat(b.before), "previous guess", method),
+                    draw(b.model_after, flat(b.after), "optimised", method),
+                ],
+            }
+        )
+    perfect = draw(result.perfect, truth, "true poses", "true poses")
+    rows.append(
+        {"title": "What a perfect registration makes of the same frames", "figures": [perfect]}
+    )
+    return rows
+
+
+def _outlines(result: CaseResult) -> list[Float64]:
+    """True outlines in the plan, where the thesis drew them or they say something."""
+    name = result.case.scene
+    if name in ("room", "empty-room"):
+        return [_rectangle(room.LENGTH, room.WIDTH)]
+    if name == "box":
+        return [_rectangle(box.WIDTH, box.DEPTH)]
+    if name == "torso":
+        return [_hull(result.surface[:, :2])]
+    return []
+
+
+def _rectangle(length: float, width: float) -> Float64:
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [length / 2, width / 2]
+
+
+def _hull(points: Float64) -> Float64:
+    from scipy.spatial import ConvexHull
+
+    return points[ConvexHull(points).vertices]
+
+
+def peaks_section(sweep: PeaksSweep) -> dict[str, Any]:
+    """Return what the template needs for the synthetic case."""
+    sigma = sweep.sigmas[np.abs(sweep.sigmas - _EXAMPLE_SIGMA).argmin()]
+    run = next(r for r in sweep.runs if r.sigma == sigma)
+    views, _ = peaks_views(run.sigma, run.seed)
+    before, after = figures.example(run, [v.points.astype(float) for v in views])
+    rows = []
+    for k, s in enumerate(sweep.sigmas):
+        angle = np.degrees(sweep.rotation[k])
+        rows.append(
+            [
+                f"{s:.2f}",
+                *(f"{v:.3f}" for v in sweep.position[k]),
+                *(f"{v:.2f}" for v in angle),
+            ]
+        )
+    return {
+        "rows": rows,
+        "seeds": len(sweep.runs) // len(sweep.sigmas),
+        "example": [Figure(before), Figure(after)],
+        "example_sigma": f"{sigma:.2f}",
+        "sweep": [Figure(s) for s in figures.sweep(sweep)],
+        "objective": Figure(
+            figures.objective(run.objective, label="Objective, synthetic data"),
+            "The objective at every step of the optimiser.",
+        ),
+        "gap_m": float(np.linalg.norm(se3.inverse(run.truth[-1])[:3, 3])),
+    }

@@ -1,0 +1,969 @@
+"""What the thesis states about its results, and whether it came out here, decided by the numbers.
+
+A statement is graded for every draw of the random points (every noise seed for the synthetic
+data), as the share of its parts that hold, and the mean grade decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tofuse.arrays import Bool, Float64
+from tofuse.geometry import se3
+from tofuse.lab.experiments import measures
+from tofuse.lab.experiments.cases import CaseResult, Run
+from tofuse.lab.experiments.peaks import PeaksRun, PeaksSweep
+from tofuse.lab.simulation.peaks import RADIUS_M
+from tofuse.lab.simulation.scenes import box, rail, room, torso
+
+Outcome = Literal["agrees", "partly", "disagrees"]
+
+_AGREES, _DISAGREES = 0.8, 0.2
+_EXAMPLE_SIGMA = 0.09  # of figure 5.11
+Y_DOWN = np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Finding:
+    """How a statement came out, and the numbers behind it."""
+
+    outcome: Outcome
+    numbers: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """What there is to judge by; a statement about a case that was not run is left out."""
+
+    cases: Mapping[str, CaseResult]
+    peaks: PeaksSweep | None
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One statement of the thesis.
+
+    Attributes
+    ----------
+    name
+        Short identifier, in results.json.
+    section
+        Of the thesis.
+    needs
+        Cases that it is about.
+    quote
+        The words of the thesis, shortened.
+    judge
+        Decides from the results of one method.
+    """
+
+    name: str
+    section: str
+    needs: tuple[str, ...]
+    quote: str
+    judge: Callable[[Results, str], Finding]
+
+    def possible(self, results: Results) -> bool:
+        """Say whether all cases that it needs were run."""
+        return all(
+            results.peaks is not None if case == "peaks" else case in results.cases
+            for case in self.needs
+        )
+
+
+def graded(grades: Iterable[float], numbers: str, what: str = "draw") -> Finding:
+    """Decide by the mean of grades between 0 (does not hold) and 1 (holds)."""
+    given = [float(g) for g in grades]
+    mean = float(np.mean(given))
+    outcome: Outcome = "partly"
+    if mean >= _AGREES:
+        outcome = "agrees"
+    elif mean <= _DISAGREES:
+        outcome = "disagrees"
+    if len(given) > 1:
+        full = sum(g == 1 for g in given)
+        numbers += f" Holds in {full} of {len(given)} {what}s."
+    return Finding(outcome, numbers)
+
+
+def _parts(*parts: bool) -> float:
+    return float(np.mean(parts))
+
+
+def _mid(values: Iterable[float]) -> float:
+    return float(np.median(list(values)))
+
+
+def _cm(values: Iterable[float]) -> str:
+    return f"{100 * _mid(values):.1f} cm"
+
+
+def _deg(values: Iterable[float]) -> str:
+    return f"{_mid(values):.1f}°"
+
+
+# 5.1, the rail
+
+
+def _legs(run: Run) -> tuple[Float64, Float64]:
+    """Length of the way out and of the way back between their ends: estimated, and true, m."""
+    known = np.flatnonzero(np.isfinite(run.before[:, 0, 0]))
+    turn = known[np.linalg.norm(run.truth[known, :3, 3], axis=1).argmax()]
+    ends = [0, turn, known[-1]]
+    return (
+        np.linalg.norm(np.diff(run.before[ends, :3, 3], axis=0), axis=1),
+        np.linalg.norm(np.diff(run.truth[ends, :3, 3], axis=0), axis=1),
+    )
+
+
+def _pushed_together(results: Results, method: str) -> Finding:
+    case = results.cases["rail"]
+    share = {
+        guess: [
+            float(estimate[0] / true[0])
+            for estimate, true in map(_legs, case.select(method, guess))
+        ]
+        for guess in ("identity", "previous")
+    }
+    return graded(
+        [s < 0.9 for s in share["identity"]],
+        f"The way out comes out {_mid(share['identity']):.0%} as long as it is "
+        f"({_mid(share['previous']):.0%} with the previous motion as guess).",
+    )
+
+
+def _slower_is_better(results: Results, method: str) -> Finding:
+    errors = []
+    for run in results.cases["rail"].select(method, "identity"):
+        turn = int(np.linalg.norm(run.truth[:, :3, 3], axis=1).argmax())
+        step = run.score_before.step_m
+        legs = [leg[np.isfinite(leg)] for leg in (step[: turn + 1], step[turn + 1 :])]
+        if all(len(leg) for leg in legs):
+            errors.append([float(leg.mean()) for leg in legs])
+    if not errors:
+        return Finding("disagrees", "The sequence ends before the way back.")
+    out, back = zip(*errors, strict=True)
+    return graded(
+        [b < o for o, b in errors],
+        f"Mean error of one motion: {1000 * _mid(out):.1f} mm on the way out, "
+        f"{1000 * _mid(back):.1f} mm on the way back.",
+    )
+
+
+def _almost_returns(results: Results, method: str) -> Finding:
+    case = results.cases["rail"]
+    ends = [r.score_before.end_m for r in case.select(method)]
+    path = 2 * rail.RAIL_LENGTH
+    return graded(
+        [1.0 if e < 0.1 * path else 0.5 if e < 0.2 * path else 0.0 for e in ends],
+        f"It ends {_cm(ends)} from where it should, {_mid(ends) / path:.0%} of the path.",
+    )
+
+
+def _mostly_in_y(results: Results, method: str) -> Finding:
+    rms = np.array([r.score_before.axes_rms_m for r in results.cases["rail"].select(method)])
+    return graded(
+        [_parts(x < y, z < y) for x, y, z in rms],
+        f"Error rms: x {_cm(rms[:, 0])}, y {_cm(rms[:, 1])}, z {_cm(rms[:, 2])}.",
+    )
+
+
+def _lowered(case: str, axes: str) -> Callable[[Results, str], Finding]:
+    def judge(results: Results, method: str) -> Finding:
+        runs = results.cases[case].select(method)
+        before, after = _axes_rms(runs)
+        columns = ["xyz".index(a) for a in axes]
+        return graded(
+            [_parts(*(a[k] < b[k] for k in columns)) for b, a in zip(before, after, strict=True)],
+            _before_after(before, after, columns),
+        )
+
+    return judge
+
+
+def _axes_rms(runs: Sequence[Run]) -> tuple[Float64, Float64]:
+    return (
+        np.array([r.score_before.axes_rms_m for r in runs]),
+        np.array([r.score_after.axes_rms_m for r in runs]),
+    )
+
+
+def _before_after(before: Float64, after: Float64, columns: Sequence[int]) -> str:
+    parts = [f"{'xyz'[k]} {_cm(before[:, k])} to {_cm(after[:, k])}" for k in columns]
+    return f"Error rms, before to after: {', '.join(parts)}."
+
+
+def _straighter(results: Results, method: str) -> Finding:
+    pairs = [
+        (measures.straightness_m(r.before[:, :3, 3]), measures.straightness_m(r.after[:, :3, 3]))
+        for r in results.cases["rail"].select(method)
+    ]
+    before, after = zip(*pairs, strict=True)
+    return graded(
+        [a < b for b, a in pairs],
+        f"Distance from a straight line, rms: {_cm(before)} before, {_cm(after)} after.",
+    )
+
+
+def _fluctuates(results: Results, method: str) -> Finding:
+    runs = [r for r in results.cases["rail"].select(method) if r.objective]
+    if not runs:
+        return Finding("disagrees", "No loop was closed, so nothing was optimised.")
+    rises = [int((np.diff(r.objective) > 0).sum()) for r in runs]
+    first, last = (_mid(r.objective[k] for r in runs) for k in (0, -1))
+    steps = _mid(len(r.objective) - 1 for r in runs)
+    return graded(
+        [
+            _parts(up > 0, r.objective[-1] < r.objective[0])
+            for r, up in zip(runs, rises, strict=True)
+        ],
+        f"Falls from {first:.3g} to {last:.3g} in {steps:.0f} steps and rises in "
+        f"{_mid(rises):.0f} of them: this optimiser keeps the constraint at every step.",
+    )
+
+
+# 5.2, the room with chairs
+
+
+def _keeps_shape(results: Results, method: str) -> Finding:
+    case = results.cases["room"]
+    sizes = [r.model_before.sizes for r in case.select(method)]
+    return graded(
+        [_parts(*_near_size(s)) for s in sizes],
+        f"{_room_size(sizes)} before optimisation ({_room_size([case.perfect.sizes])} when the "
+        "same frames are put together by the true poses).",
+    )
+
+
+def _near_size(sizes: Mapping[str, float]) -> tuple[bool, bool]:
+    return (
+        abs(sizes["length_m"] / room.LENGTH - 1) < 0.1,
+        abs(sizes["width_m"] / room.WIDTH - 1) < 0.1,
+    )
+
+
+def _room_size(sizes: Sequence[Mapping[str, float]]) -> str:
+    return f"{_mid(s['length_m'] for s in sizes):.2f} x {_mid(s['width_m'] for s in sizes):.2f} m"
+
+
+def _error_at_end(results: Results, method: str) -> Finding:
+    pairs = []
+    for run in results.cases["room"].select(method):
+        off = measures.displacement_m(run.before, run.truth)
+        third = len(off) // 3
+        pairs.append((np.nanmean(off[third : 2 * third]), np.nanmean(off[-max(1, third // 3) :])))
+    middle, end = zip(*pairs, strict=True)
+    return graded(
+        [e > m for m, e in pairs],
+        f"A point 2 m ahead is off by {_cm(middle)} in the middle third of the turn and by "
+        f"{_cm(end)} at its end.",
+    )
+
+
+def _every_third(results: Results, method: str) -> Finding:
+    case = results.cases["room"]
+    found = {
+        s: [r.model_before.sizes["surface_error_m"] for r in case.select(method, stride=s)]
+        for s in (2, 3, 4)
+    }
+    middle = {s: _mid(v) for s, v in found.items()}
+    numbers = "; ".join(
+        f"every {name}: {100 * middle[s]:.0f} ({100 * min(found[s]):.0f} to "
+        f"{100 * max(found[s]):.0f})"
+        for s, name in ((2, "second"), (3, "third"), (4, "fourth"))
+    )
+    return graded(
+        [_parts(middle[3] < middle[2], middle[3] < middle[4])],
+        f"Median distance of the model from the true surface, cm, with the range over the draws: "
+        f"{numbers}.",
+    )
+
+
+def _door_gap(results: Results, method: str) -> Finding:
+    counts = results.cases["room"].facts["door"]
+    ratio = counts["door"] / max(counts["wall"], 1e-9)
+    return graded(
+        [1.0 if ratio < 0.25 else 0.5 if ratio < 0.5 else 0.0],
+        f"The filters leave {ratio:.0%} as many points on the door as on as much of the same "
+        "wall on the other side.",
+    )
+
+
+def _little_change(results: Results, method: str) -> Finding:
+    moved = [
+        float(np.nanmedian(measures.displacement_m(r.before, r.after)))
+        for r in results.cases["room"].select(method)
+    ]
+    return graded(
+        [m < 0.05 * room.LENGTH for m in moved],
+        f"A point 2 m ahead moves by {_cm(moved)} (median), {_mid(moved) / room.LENGTH:.0%} of "
+        "the room's length.",
+    )
+
+
+def _closer_together(results: Results, method: str) -> Finding:
+    pairs = [(_heap(r.before), _heap(r.after)) for r in results.cases["room"].select(method)]
+    before, after = zip(*pairs, strict=True)
+    return graded(
+        [a[0] < b[0] for b, a in pairs],
+        f"Cameras are {_cm(b[0] for b in before)} from their middle before and "
+        f"{_cm(a[0] for a in after)} after (rms; true: 0).",
+    )
+
+
+def _first_in_middle(results: Results, method: str) -> Finding:
+    pairs = [(_heap(r.before), _heap(r.after)) for r in results.cases["room"].select(method)]
+    before, after = zip(*pairs, strict=True)
+    return graded(
+        [a[1] < b[1] for b, a in pairs],
+        f"The first camera is {_cm(b[1] for b in before)} from the middle before and "
+        f"{_cm(a[1] for a in after)} after.",
+    )
+
+
+def _heap(poses: Float64) -> tuple[float, float]:
+    """Root mean square distance of the cameras from their middle, and that of the first."""
+    known = poses[np.isfinite(poses[:, 0, 0]), :3, 3]
+    away = np.linalg.norm(known - known.mean(0), axis=1)
+    return float(np.sqrt(np.mean(away**2))), float(away[0])
+
+
+def _z_kept(results: Results, method: str) -> Finding:
+    before, after = _axes_rms(results.cases["room"].select(method))
+    return graded(
+        [
+            _parts(a[0] < b[0], a[1] < b[1], abs(a[2] / b[2] - 1) < 0.2)
+            for b, a in zip(before, after, strict=True)
+        ],
+        _before_after(before, after, (0, 1, 2)),
+    )
+
+
+# 5.3, the empty room
+
+
+def _flat_walls(results: Results, method: str) -> Finding:
+    case = results.cases["empty-room"]
+    pairs = []
+    for run in case.select(method):
+        off = measures.displacement_m(measures.motions(run.before), measures.motions(run.truth))
+        corner = _corner_steps(case, run)
+        pairs.append((_rms(off[~corner]), _rms(off[corner])))
+    wall, corner_error = zip(*pairs, strict=True)
+    return graded(
+        [1.0 if w > 1.5 * c else 0.5 if w > c else 0.0 for w, c in pairs],
+        f"Error of one motion 2 m ahead, rms: {_cm(wall)} facing a wall, {_cm(corner_error)} "
+        "with a corner in view.",
+    )
+
+
+def _picks_up(results: Results, method: str) -> Finding:
+    case = results.cases["empty-room"]
+    pairs = []
+    for run in case.select(method):
+        corner = _corner_steps(case, run)
+        turn, true = (np.diff(measures.turned_deg(p, Y_DOWN)) for p in (run.before, run.truth))
+        pairs.append(
+            (turn[~corner].sum() / true[~corner].sum(), turn[corner].sum() / true[corner].sum())
+        )
+    wall, seen = zip(*pairs, strict=True)
+    return graded(
+        [_parts(abs(c - 1) < abs(w - 1), abs(c - 1) < 0.2) for w, c in pairs],
+        f"Share of the turn that is found: {_mid(wall):.0%} facing a wall, {_mid(seen):.0%} with "
+        "a corner in view.",
+    )
+
+
+def _corner_steps(case: CaseResult, run: Run) -> Bool:
+    """(N - 1,) mask of the motions between frames that both see a corner."""
+    seen: Bool = case.facts["corners"][run.stride]
+    return seen[1:] & seen[:-1]
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _closes_loop(results: Results, method: str) -> Finding:
+    runs = results.cases["empty-room"].select(method)
+    return graded(
+        [
+            _parts(
+                r.score_after.end_m < 0.25 * r.score_before.end_m,
+                r.score_after.end_deg < 0.25 * r.score_before.end_deg,
+            )
+            for r in runs
+        ],
+        f"The last camera is off by {_cm(r.score_before.end_m for r in runs)} and "
+        f"{_deg(r.score_before.end_deg for r in runs)} before, "
+        f"{_cm(r.score_after.end_m for r in runs)} and "
+        f"{_deg(r.score_after.end_deg for r in runs)} after.",
+    )
+
+
+def _no_proper_shape(results: Results, method: str) -> Finding:
+    sizes = [r.model_after.sizes for r in results.cases["empty-room"].select(method)]
+    return graded(
+        [not all(_near_size(s)) for s in sizes],
+        f"{_room_size(sizes)} instead of {room.LENGTH:.1f} x {room.WIDTH:.1f} m, and the model is "
+        f"{_cm(s['surface_error_m'] for s in sizes)} from the true surface (median).",
+    )
+
+
+def _objects_matter(results: Results, method: str) -> Finding:
+    error = {
+        name: [r.model_after.sizes["surface_error_m"] for r in results.cases[name].select(method)]
+        for name in ("room", "empty-room")
+    }
+    return graded(
+        [f < e for f, e in zip(error["room"], error["empty-room"], strict=True)],
+        f"Median distance of the optimised model from the true surface: {_cm(error['room'])} with "
+        f"chairs, {_cm(error['empty-room'])} without.",
+    )
+
+
+# 5.4, the torso
+
+
+def _overlap_deg(case: CaseResult, run: Run) -> tuple[float, float]:
+    """How much further than the truth the cameras go round, before and after, degrees."""
+    axis = case.T_truth_world[:3, :3].T @ np.array([0.0, 0.0, 1.0])
+    end = [float(measures.turned_deg(p, axis)[-1]) for p in (run.before, run.after, run.truth)]
+    sign = np.sign(end[2]) or 1.0
+    return float(sign * (end[0] - end[2])), float(sign * (end[1] - end[2]))
+
+
+def _slight_overlap(results: Results, method: str) -> Finding:
+    case = results.cases["torso"]
+    over = [_overlap_deg(case, r)[0] for r in case.select(method)]
+    return graded(
+        [_parts(o > 0, abs(o) < 45) for o in over],
+        f"The cameras go {abs(_mid(over)):.1f}° {'further' if _mid(over) > 0 else 'less far'} "
+        f"round than they should ({min(over):+.0f}° to {max(over):+.0f}°).",
+    )
+
+
+def _overlap_removed(results: Results, method: str) -> Finding:
+    case = results.cases["torso"]
+    pairs = [_overlap_deg(case, r) for r in case.select(method)]
+    before, after = zip(*pairs, strict=True)
+    return graded(
+        [abs(a) < 0.25 * abs(b) for b, a in pairs],
+        f"Over or short of the turn by {_deg(map(abs, before))} before and "
+        f"{_deg(map(abs, after))} after.",
+    )
+
+
+def _pushed_out(results: Results, method: str) -> Finding:
+    case = results.cases["torso"]
+    runs = case.select(method)
+    pairs = [
+        (measures.circle_radius_m(r.before[:, :3, 3]), measures.circle_radius_m(r.after[:, :3, 3]))
+        for r in runs
+    ]
+    before, after = zip(*pairs, strict=True)
+    short = _mid(_overlap_deg(case, r)[0] for r in runs) < 0
+    return graded(
+        [a > b for b, a in pairs],
+        f"Radius of the circle through the cameras: {_mid(before):.2f} m before, "
+        f"{_mid(after):.2f} m after (true: {torso.DISTANCE:.2f} m)."
+        + (" The chain falls short of a turn, and closing a gap pulls in." if short else ""),
+    )
+
+
+def _gained_weight(results: Results, method: str) -> Finding:
+    case = results.cases["torso"]
+    runs = case.select(method)
+    before = [r.model_before.sizes["girth_m"] for r in runs]
+    after = [r.model_after.sizes["girth_m"] for r in runs]
+    perfect = case.perfect.sizes["girth_m"]
+    return graded(
+        [_parts(a > b, a > 1.02 * perfect) for b, a in zip(before, after, strict=True)],
+        f"Girth of the chest with the upper arms: {_cm(before)} before, {_cm(after)} after; by "
+        f"the true poses {100 * perfect:.1f} cm (true: {100 * case.facts['girth_m']:.1f} cm).",
+    )
+
+
+# 5.5, the box
+
+
+def _angles_corrected(results: Results, method: str) -> Finding:
+    runs = results.cases["box"].select(method)
+    before = [r.score_before.rotation_deg for r in runs]
+    after = [r.score_after.rotation_deg for r in runs]
+    return graded(
+        [a < b for b, a in zip(before, after, strict=True)],
+        f"Orientations are off by {_deg(before)} before and {_deg(after)} after (rms).",
+    )
+
+
+def _right_angles(results: Results, method: str) -> Finding:
+    case = results.cases["box"]
+    worst = [r.model_after.sizes["worst_angle_deg"] for r in case.select(method)]
+    return graded(
+        [1.0 if w < 2 else 0.5 if w < 5 else 0.0 for w in worst],
+        f"The worst of the four angles is {_deg(worst)} from 90° "
+        f"({case.perfect.sizes['worst_angle_deg']:.1f}° by the true poses).",
+    )
+
+
+def _expanded(results: Results, method: str) -> Finding:
+    case = results.cases["box"]
+    sizes = [r.model_after.sizes for r in case.select(method)]
+    true = {"width_a_m": box.WIDTH, "width_b_m": box.DEPTH, "height_m": box.HEIGHT}
+    return graded(
+        [_parts(*(s[name] > length for name, length in true.items())) for s in sizes],
+        f"{_box_size(sizes)} ({_box_size([case.perfect.sizes])} by the true poses).",
+    )
+
+
+def _box_size(sizes: Sequence[Mapping[str, float]]) -> str:
+    names = ("width_a_m", "width_b_m", "height_m")
+    return " x ".join(f"{1000 * _mid(s[n] for s in sizes):.0f}" for n in names) + " mm"
+
+
+def _white_middle(results: Results, method: str) -> Finding:
+    run = results.cases["box"].select(method)[0]
+    fit = run.model_after.box
+    if fit is None:
+        return Finding("disagrees", "There is no model.")
+    away = np.abs(run.model_after.points[:, :2] - fit.corners.mean(0)).max(1)
+    half = fit.widths_m.mean() / 2
+    middle = (away < 0.5 * half).sum() / (0.5 * half) ** 2
+    rim = ((away > 0.8 * half) & (away < 1.2 * half)).sum() / half**2 / (1.2**2 - 0.8**2)
+    ratio = middle / max(rim, 1e-9)
+    return graded(
+        [1.0 if ratio < 0.1 else 0.5 if ratio < 0.3 else 0.0],
+        f"From above the middle is {ratio:.0%} as dense as the walls, though the camera "
+        "here sees the top face as well.",
+    )
+
+
+# 5.6, the synthetic data
+
+
+def _example(results: Results) -> list[PeaksRun]:
+    assert results.peaks is not None
+    sigmas = results.peaks.sigmas
+    sigma = sigmas[np.abs(sigmas - _EXAMPLE_SIGMA).argmin()]
+    return [r for r in results.peaks.runs if r.sigma == sigma]
+
+
+def _first_is_worst(results: Results, method: str) -> Finding:
+    pairs = []
+    for run in _example(results):
+        wrong = se3.inverse(measures.motions(run.truth)) @ measures.motions(run.poses_sequential)
+        off = np.linalg.norm(wrong[:, :3, 3], axis=1)
+        pairs.append((off[0], float(np.median(off[1:]))))
+    first, others = zip(*pairs, strict=True)
+    return graded(
+        [f > 2 * o for f, o in pairs],
+        f"Error of the first motion {_mid(first):.2f} m, of the others {_mid(others):.2f} m "
+        "(medians, sigma 0.09).",
+        "seed",
+    )
+
+
+def _overall_reduced(results: Results, method: str) -> Finding:
+    runs = _example(results)
+    before = [float(r.sequential.position.mean()) for r in runs]
+    after = [float(r.optimised.position.mean()) for r in runs]
+    return graded(
+        [a < b for b, a in zip(before, after, strict=True)],
+        f"Mean error of the positions {_mid(before):.2f} m before, {_mid(after):.2f} m after "
+        "(sigma 0.09).",
+        "seed",
+    )
+
+
+def _pushed_inwards(results: Results, method: str) -> Finding:
+    near_far = []
+    for run in _example(results):
+        centre = np.array([0.0, 0.0, RADIUS_M])
+        inwards = RADIUS_M - np.linalg.norm(run.poses_optimised[:, :3, 3] - centre, axis=1)
+        far = np.linalg.norm(run.truth[:, :3, 3], axis=1) > RADIUS_M
+        near_far.append((float(inwards[~far].mean()), float(inwards[far].mean())))
+    near, far_side = zip(*near_far, strict=True)
+    return graded(
+        [_parts(f > 0, f > n) for n, f in near_far],
+        f"On the far side they are {_mid(far_side):+.2f} m nearer to the middle than they should "
+        f"be, on the near side {_mid(near):+.2f} m (sigma 0.09).",
+        "seed",
+    )
+
+
+def _threshold(results: Results, method: str) -> Finding:
+    sweep = _sweep(results)
+    low = sweep.position[sweep.sigmas < 0.05 - 1e-9, 0]
+    high = sweep.position[sweep.sigmas > 0.05 + 1e-9, 0]
+    return graded(
+        [_parts(low.max() < 0.05 * RADIUS_M, high.min() > 0.05 * RADIUS_M)],
+        f"Mean error of the chain: at most {low.max():.2f} m below sigma 0.05, at least "
+        f"{high.min():.2f} m above.",
+    )
+
+
+def _improves_above(results: Results, method: str) -> Finding:
+    sweep = _sweep(results)
+    above = sweep.sigmas > 0.05 + 1e-9
+    position, rotation = sweep.position[above], sweep.rotation[above]
+    ratios = [p[:, 1] / p[:, 0] for p in (position, rotation)]
+    return graded(
+        [_parts(*(p[:, 1] < p[:, 0])) for p in (position, rotation)],
+        f"Above 0.05 it leaves {ratios[0].min():.0%} to {ratios[0].max():.0%} of the error of "
+        f"positions and {ratios[1].min():.0%} to {ratios[1].max():.0%} of that of rotations.",
+        "measure",
+    )
+
+
+def _y_unaltered(results: Results, method: str) -> Finding:
+    gain = _gain(results)[-1]
+    return graded(
+        [abs(gain[1]) < 0.25 * min(gain[0], gain[2])],
+        f"At the highest noise x gains {gain[0]:.2f} m, y {gain[1]:.2f} m, z {gain[2]:.2f} m.",
+    )
+
+
+def _x_z_alike(results: Results, method: str) -> Finding:
+    gain = _gain(results)
+    above = gain[_sweep(results).sigmas > 0.05 + 1e-9].mean(0)
+    ratio = above[0] / above[2] if above[2] > 0 else np.inf
+    return graded(
+        [1.0 if 2 / 3 < ratio < 1.5 else 0.5 if 0.5 < ratio < 2 else 0.0],
+        f"Above sigma 0.05 x gains {above[0]:.2f} m and z {above[2]:.2f} m (means).",
+    )
+
+
+def _more_noise_more_good(results: Results, method: str) -> Finding:
+    sweep, gain = _sweep(results), _gain(results)
+    slopes = [float(np.polyfit(sweep.sigmas, g, 1)[0]) for g in gain.T]
+    rising = sum(s > 0 for s in slopes)
+    return graded(
+        [_parts(*(s > 0 for s in slopes))],
+        f"The gain grows with sigma for {rising} of the 6 parameters.",
+    )
+
+
+def _yaw_most(results: Results, method: str) -> Finding:
+    gain = np.degrees(_gain(results)[-1, 3:])
+    return graded(
+        [gain[0] > max(gain[1], gain[2])],
+        f"At the highest noise yaw gains {gain[0]:.1f}°, pitch {gain[1]:.1f}°, "
+        f"roll {gain[2]:.1f}°.",
+    )
+
+
+def _pitch_roll_late(results: Results, method: str) -> Finding:
+    sweep, gain = _sweep(results), np.degrees(_gain(results))
+    low = gain[sweep.sigmas < 0.05 - 1e-9, 4:].max()
+    high = gain[-1, 4:]
+    return graded(
+        [_parts(low < 0.2, high.min() > 0.2)],
+        f"Pitch and roll gain at most {low:.2f}° below sigma 0.05, {high[0]:.2f}° and "
+        f"{high[1]:.2f}° at the highest noise.",
+    )
+
+
+def _sweep(results: Results) -> PeaksSweep:
+    assert results.peaks is not None
+    return results.peaks
+
+
+def _gain(results: Results) -> Float64:
+    """(S, 6) by how much optimisation lowers the mean error of each parameter."""
+    axes = _sweep(results).axes
+    return axes[:, 0] - axes[:, 1]
+
+
+# 6 and 7
+
+
+def _previous_is_better(results: Results, method: str) -> Finding:
+    better, texts = [], []
+    for name, case in results.cases.items():
+        runs = {g: case.select(method, g) for g in ("identity", "previous")}
+        error = {
+            g: _mid(r.model_before.sizes["surface_error_m"] for r in found)
+            for g, found in runs.items()
+        }
+        posed = {g: _mid(r.posed for r in found) for g, found in runs.items()}
+        # A model of the frames that were not lost flatters the guess that lost many.
+        better.append(
+            posed["previous"] > 1.1 * posed["identity"]
+            or (
+                error["previous"] < error["identity"]
+                and posed["previous"] > 0.9 * posed["identity"]
+            )
+        )
+        texts.append(
+            f"{name} {100 * error['identity']:.1f} to {100 * error['previous']:.1f} "
+            f"({posed['identity']:.0f} to {posed['previous']:.0f} frames with a pose)"
+        )
+    return graded(
+        better,
+        "Median distance of the model from the true surface, cm, identity to previous: "
+        f"{', '.join(texts)}.",
+        "case",
+    )
+
+
+def _worsened(results: Results, method: str) -> Finding:
+    shares = []
+    for case in results.cases.values():
+        for run in case.select(method):
+            truth = measures.motions(run.truth)
+            before, after = (
+                measures.displacement_m(measures.motions(p), truth) for p in (run.before, run.after)
+            )
+            good = before <= np.nanmedian(before)
+            shares.append(float(np.mean(after[good] > before[good])))
+    return graded(
+        [1.0 if s > 0.4 else 0.5 if s > 0.2 else 0.0 for s in shares],
+        f"Of the better half of the motions {_mid(shares):.0%} are worse after optimisation.",
+        "run",
+    )
+
+
+_SCENES = ("rail", "room", "empty-room", "torso", "box")
+
+STATEMENTS = (
+    Statement(
+        "rail-pushed-together", "5.1", ("rail",),
+        "Identity guess: “The camera positions have been pushed closer to each other during the "
+        "translation to the left.”",
+        _pushed_together,
+    ),
+    Statement(
+        "rail-slower-is-better", "5.1", ("rail",),
+        "“The registrations did improve on the way back … somewhat slower translation speed.”",
+        _slower_is_better,
+    ),
+    Statement(
+        "rail-almost-returns", "5.1", ("rail",),
+        "Previous guess: “the camera almost returns to the starting point.”",
+        _almost_returns,
+    ),
+    Statement(
+        "rail-mostly-y", "5.1", ("rail",),
+        "“It has deteriorated from its actual path mostly in the y-direction.”",
+        _mostly_in_y,
+    ),
+    Statement(
+        "rail-lowered", "5.1", ("rail",),
+        "“In the optimized case … the cumulative error of the cameras’ y and z-positions has been "
+        "lowered.”",
+        _lowered("rail", "yz"),
+    ),
+    Statement(
+        "rail-straighter", "5.1", ("rail",),
+        "“They now follow a straighter path, as if the camera actually was moved along a rail.”",
+        _straighter,
+    ),
+    Statement(
+        "rail-objective", "5.1", ("rail",),
+        "“The function value fluctuates strongly near the end … in the end it finds a reasonable "
+        "minimum.”",
+        _fluctuates,
+    ),
+    Statement(
+        "room-keeps-shape", "5.2", ("room",),
+        "“The room roughly keeps its shape.”",
+        _keeps_shape,
+    ),
+    Statement(
+        "room-error-at-end", "5.2", ("room",),
+        "“The accumulated error becomes visible at the end of the revolution.”",
+        _error_at_end,
+    ),
+    Statement(
+        "room-every-third", "5.2", ("room",),
+        "“Using every third frame produced better results than using every second, or every "
+        "fourth frame.”",
+        _every_third,
+    ),
+    Statement(
+        "room-door", "5.2", ("room",),
+        "“There is a gap with no points … a consequence of the glossy door.”",
+        _door_gap,
+    ),
+    Statement(
+        "room-little-change", "5.2", ("room",),
+        "“The reconstructed room did not change much after the optimization.”",
+        _little_change,
+    ),
+    Statement(
+        "room-closer", "5.2", ("room",),
+        "“The cameras have been moved a little closer to each other in the optimized case.”",
+        _closer_together,
+    ),
+    Statement(
+        "room-first-centred", "5.2", ("room",),
+        "“The first camera is now more to the center of the heap of cameras.”",
+        _first_in_middle,
+    ),
+    Statement(
+        "room-axes", "5.2", ("room",),
+        "“The translational error is kept about the same in the z-direction, but is lowered in "
+        "the x and y-directions.”",
+        _z_kept,
+    ),
+    Statement(
+        "empty-flat-walls", "5.3", ("empty-room",),
+        "“ICP has major problems when facing flat walls.”",
+        _flat_walls,
+    ),
+    Statement(
+        "empty-corner", "5.3", ("empty-room",),
+        "“When the corner finally appears …, the registration picks up momentum. Hence a small "
+        "piece of the room turns out well.”",
+        _picks_up,
+    ),
+    Statement(
+        "empty-closes", "5.3", ("empty-room",),
+        "“The optimization algorithm closes the loop …”",
+        _closes_loop,
+    ),
+    Statement(
+        "empty-shape", "5.3", ("empty-room",),
+        "“… but it is not sufficient to give the room its proper shape.”",
+        _no_proper_shape,
+    ),
+    Statement(
+        "empty-objects", "5.3", ("room", "empty-room"),
+        "“This shows the importance of having reference objects.”",
+        _objects_matter,
+    ),
+    Statement(
+        "torso-overlap", "5.4", ("torso",),
+        "“The camera positions seem to orbit the torso in a nice-looking way, though, there is a "
+        "slight overlap.”",
+        _slight_overlap,
+    ),
+    Statement(
+        "torso-overlap-removed", "5.4", ("torso",),
+        "“The optimization algorithm removes this overlap.”",
+        _overlap_removed,
+    ),
+    Statement(
+        "torso-pushed-out", "5.4", ("torso",),
+        "“The camera positions seem to have been pushed out, away from the torso.”",
+        _pushed_out,
+    ),
+    Statement(
+        "torso-weight", "5.4", ("torso",),
+        "“The model … looks like he has gained some weight.”",
+        _gained_weight,
+    ),
+    Statement(
+        "box-angles-of-view", "5.5", ("box",),
+        "“The viewing angles of the cameras seem to have been corrected for after the "
+        "optimization.”",
+        _angles_corrected,
+    ),
+    Statement(
+        "box-right-angles", "5.5", ("box",),
+        "“The angles of the box are very close to accurate.”",
+        _right_angles,
+    ),
+    Statement(
+        "box-expanded", "5.5", ("box",),
+        "“The box has expanded in every direction.”",
+        _expanded,
+    ),
+    Statement(
+        "box-white-middle", "5.5", ("box",),
+        "“The white area in the middle of the box contains almost no points since the camera was "
+        "aiming at the box from the side.”",
+        _white_middle,
+    ),
+    Statement(
+        "peaks-first", "5.6", ("peaks",),
+        "“The first transformation is not estimated very well … The remaining relative "
+        "transformations are more accurately estimated.”",
+        _first_is_worst,
+    ),
+    Statement(
+        "peaks-inwards", "5.6", ("peaks",),
+        "“The optimized camera positions have been pushed inwards, mainly at the far side.”",
+        _pushed_inwards,
+    ),
+    Statement(
+        "peaks-reduced", "5.6", ("peaks",),
+        "“The overall error has been reduced after the optimization.”",
+        _overall_reduced,
+    ),
+    Statement(
+        "peaks-threshold", "5.6", ("peaks",),
+        "“ICP does well on its own if the applied noise has a standard deviation below σ = 0.05 "
+        "meters.”",
+        _threshold,
+    ),
+    Statement(
+        "peaks-improves", "5.6", ("peaks",),
+        "“Above σ = 0.05, the optimization algorithm improves the camera positions and their "
+        "rotation angles.”",
+        _improves_above,
+    ),
+    Statement(
+        "peaks-y", "5.6", ("peaks",),
+        "“The cameras’ y-positions are not altered very much, as expected.”",
+        _y_unaltered,
+    ),
+    Statement(
+        "peaks-x-z", "5.6", ("peaks",),
+        "“The x and z-positions are improved about the same.”",
+        _x_z_alike,
+    ),
+    Statement(
+        "peaks-more-noise", "5.6", ("peaks",),
+        "“For every parameter the optimization seem to do more good in case of more applied "
+        "noise.”",
+        _more_noise_more_good,
+    ),
+    Statement(
+        "peaks-yaw", "5.6", ("peaks",),
+        "“The yaw-angle is most improved.”",
+        _yaw_most,
+    ),
+    Statement(
+        "peaks-pitch-roll", "5.6", ("peaks",),
+        "“The pitch and roll-angles are only improved significantly in the cases with high "
+        "amounts of applied noise.”",
+        _pitch_roll_late,
+    ),
+    Statement(
+        "guess", "6", _SCENES,
+        "The previous motion as guess “improved the attractiveness of the registrations quite a "
+        "bit.”",
+        _previous_is_better,
+    ),
+    Statement(
+        "worsened", "7", _SCENES,
+        "“Already well determined camera transformations are often worsened.”",
+        _worsened,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A statement with what came out of each method; peaks knows one method only."""
+
+    statement: Statement
+    findings: Mapping[str, Finding]
+
+
+def judge_all(results: Results, methods: Sequence[str]) -> tuple[Judged, ...]:
+    """Judge every statement about the cases that were run."""
+    return tuple(
+        Judged(
+            s,
+            {m: s.judge(results, m) for m in (methods[:1] if s.needs == ("peaks",) else methods)},
+        )
+        for s in STATEMENTS
+        if s.possible(results)
+    )

@@ -1,0 +1,256 @@
+"""Least squares 3D surface matching, LS3D (Gruen and Akca 2005; intensity: Akca 2007)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.arrays import Float64, Int64
+from tofuse.errors import RegistrationError
+from tofuse.geometry import se3
+from tofuse.lab.methods.neighbourhoods import neighbourhood
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame
+from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.interfaces import Points
+from tofuse.registration.selectors import All, at_most
+
+_FEWEST = 8
+# Triangles whose sides are longer than so many resolutions bridge a gap.
+_WIDEST = 5.0
+_AT_REST = 1e-4  # largest change of a parameter, in resolutions
+_SMALLEST_SIGMA = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SimilarityMatch(Registration):
+    """A registration that estimates the scale as well.
+
+    Attributes
+    ----------
+    scale
+        Sizes in the target by those in the source; 1 where it was not estimated.
+    precision
+        (7,) standard deviations: translation (m), rotation (rad), scale; of the middle of the
+        source's points.
+    """
+
+    scale: float = 1.0
+    precision: Float64 = field(default_factory=lambda: np.zeros(7))
+
+
+@dataclass(frozen=True, eq=False)
+class _Feet:
+    """Where points meet the triangles of the target: of those that do."""
+
+    point: Int64
+    distance: Float64
+    normal: Float64
+    light: Float64
+    gradient: Float64
+
+
+@part("registration", "ls3d", label="validated")
+@dataclass(frozen=True)
+class LeastSquaresMatching(Registrar):
+    """Generalised Gauss-Markoff model of the distances between two surfaces.
+
+    The target is a surface of planar triangles (the fans of neighbours round its points). Each
+    point of the source has an observation equation (eq 8 of the paper, here with the source as
+    the surface that moves)::
+
+        -e_i = n_i . (t + w x (m p_i) + dm p_i) - l_i
+
+    with l_i the distance to the triangle on which the point's foot lies and n_i its normal, the
+    numeric derivatives of the surface. The seven parameters of a similarity are observations as
+    well, with weights of their own: that of the scale decides whether it is free. Points whose
+    foot lies on no triangle are beyond the surface's boundary; observations with residuals
+    beyond `outlier` standard deviations are left out, in each iteration anew (section 2.3).
+    With `light` a second surface takes part, whose height is the intensity (Akca 2007).
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    reach
+        Largest distance of a point from its foot, in resolutions.
+    outlier
+        K of section 2.3: residuals beyond K sigma_0 are left out.
+    scale_sigma
+        Standard deviation of the scale's observation, a share; 0: the scale is one.
+    light
+        Height of the surface of intensities, m for a change by the whole of the target's median
+        amplitude; 0: not used.
+    max_iterations
+        Iterations after which it ends in any case.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    reach: float = 5.0
+    outlier: float = 4.0
+    scale_sigma: float = 0.0
+    light: float = 0.0
+    max_iterations: int = 50
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations is {self.max_iterations}, not 1 or more")
+        for name in ("resolution", "reach", "outlier"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
+        for name in ("scale_sigma", "light"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
+
+    def register(
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
+    ) -> SimilarityMatch:
+        """See `Registrar.register`.
+
+        Raises
+        ------
+        RegistrationError
+            If fewer than eight points have a foot on the target's surface.
+        """
+        data = Points.of(source, at_most(self.points).select(source, rng))
+        model = Points.of(target, All().select(target, rng))
+        light = (data.amplitude, model.amplitude) if self.light else None
+        middle = data.points.mean(0)
+        arm = data.points - middle
+        size = float(np.sqrt((arm**2).sum(1).mean()))
+        units = np.r_[1, 1, 1, size, size, size, size]
+        T, scale = se3.orthonormalise(guess), 1.0
+        errors: list[float] = []
+        converged = False
+        while not converged and len(errors) < self.max_iterations:
+            turned = scale * arm @ T[:3, :3].T
+            centre = T[:3, :3] @ middle + T[:3, 3]
+            feet = self._feet(turned + centre, model, light)
+            if len(feet.point) < _FEWEST:
+                raise RegistrationError(
+                    f"only {len(feet.point)} points lie on the target's surface, {_FEWEST} needed"
+                )
+            N, g = self._normal_equations(turned[feet.point], feet, light, scale)
+            step = np.zeros(7)
+            free = 7 if self.scale_sigma else 6
+            step[:free] = np.linalg.lstsq(N[:free, :free], g[:free], rcond=1e-12)[0]
+            T = se3.orthonormalise(se3.about(centre, se3.exp(step[:6])) @ T)
+            scale *= 1 + step[6]
+            errors.append(float(np.abs(feet.distance).sum()) / (len(data) * self.resolution))
+            converged = bool(np.abs(step * units).max() < _AT_REST * self.resolution)
+        covariance = np.zeros((7, 7))
+        covariance[:free, :free] = np.linalg.pinv(N[:free, :free])
+        return SimilarityMatch(
+            T_target_source=T,
+            converged=converged,
+            iterations=len(errors),
+            correspondences=len(feet.point),
+            points=len(data),
+            error=errors[-1],
+            rms_m=float(np.sqrt((feet.distance**2).mean())),
+            information=_in_source(N[:6, :6], T, middle),
+            errors=tuple(errors),
+            scale=scale,
+            precision=np.sqrt(np.diag(covariance)),
+        )
+
+    def _normal_equations(
+        self,
+        arm: Float64,
+        feet: _Feet,
+        light: tuple[Float64, Float64] | None,
+        scale: float,
+    ) -> tuple[Float64, Float64]:
+        """N (7, 7) and right side (7,) of the observations that are no outliers, and the scale's.
+
+        `arm` (k, 3) leads from the middle of the source to its points, in the target's frame.
+        """
+        A, height = self._equations(arm, feet, light)
+        keep = np.abs(height) <= self.outlier * _sigma(height)
+        A, height = A[keep], height[keep]
+        weight = 1 / max(_sigma(height), _SMALLEST_SIGMA * self.resolution) ** 2
+        N, g = weight * A.T @ A, -weight * A.T @ height
+        if self.scale_sigma:
+            N[6, 6] += self.scale_sigma**-2
+            g[6] -= (scale - 1) * self.scale_sigma**-2
+        return N, g
+
+    def _equations(
+        self, arm: Float64, feet: _Feet, light: tuple[Float64, Float64] | None
+    ) -> tuple[Float64, Float64]:
+        """Design matrix (k, 7) and distances (k,) in m, of the geometry and of the intensities."""
+        A = _rows(arm, feet.normal)
+        if light is None:
+            return A, feet.distance
+        unit = self.light / max(float(np.median(light[1])), 1e-12)
+        r = unit * (feet.light - light[0][feet.point])
+        return np.vstack([A, _rows(arm, unit * feet.gradient)]), np.r_[feet.distance, r]
+
+    def _feet(
+        self,
+        x: Float64,
+        model: Points,
+        light: tuple[Float64, Float64] | None,
+    ) -> _Feet:
+        """Feet of points x (n, 3) on the triangles round the nearest points of the target."""
+        surface = neighbourhood(model)
+        nearest, _ = surface.tree.nearest(x, self.reach * self.resolution)
+        point = np.flatnonzero(nearest >= 0)
+        q = nearest[point]
+        fan = surface.fans[q]
+        a = model.points[q][:, None]
+        b, c = model.points[fan], model.points[np.roll(fan, -1, axis=1)]
+        e1, e2 = b - a, c - a
+        normal = np.cross(e1, e2)
+        double = np.linalg.norm(normal, axis=2)
+        away = x[point][:, None] - a
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normal = normal / double[..., None]
+            # Coordinates of the foot in the triangle.
+            u = (np.cross(away, e2) * normal).sum(2) / double
+            v = (np.cross(e1, away) * normal).sum(2) / double
+        sides = np.maximum(np.linalg.norm(e1, axis=2), np.linalg.norm(e2, axis=2))
+        height = (away * normal).sum(2)
+        inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (sides <= _WIDEST * self.resolution)
+        height = np.where(inside & np.isfinite(height), height, np.inf)
+        best = np.argmin(np.abs(height), axis=1)
+        row = np.arange(len(point))
+        good = np.isfinite(height[row, best])
+        row, best = row[good], best[good]
+        n, d = normal[row, best], height[row, best]
+        value, gradient = np.zeros(len(row)), np.zeros((len(row), 3))
+        if light is not None:
+            A = light[1][q[row]]
+            B, C = (light[1][f[row, best]] for f in (fan, np.roll(fan, -1, axis=1)))
+            value = A + u[row, best] * (B - A) + v[row, best] * (C - A)
+            E1, E2, twice = e1[row, best], e2[row, best], double[row, best][:, None]
+            gradient = (
+                np.cross(E2, n) * (B - A)[:, None] + np.cross(n, E1) * (C - A)[:, None]
+            ) / twice
+        return _Feet(point[row], d, n, value, gradient)
+
+
+def _in_source(N: Float64, T_target_source: Float64, middle: Float64) -> Float64:
+    """Information (6, 6) about the middle, in the target's frame, as `Registration` has it."""
+    turn, shift = np.zeros((6, 6)), np.eye(4)
+    turn[:3, :3] = turn[3:, 3:] = T_target_source[:3, :3]
+    shift[:3, 3] = -middle
+    J = turn @ se3.adjoint(shift)
+    H = J.T @ N @ J
+    return np.asarray((H + H.T) / 2)
+
+
+def _rows(arm: Float64, n: Float64) -> Float64:
+    """Derivatives (k, 7) of n . x by translation, rotation and scale about the middle."""
+    return np.column_stack([n, np.cross(arm, n), (arm * n).sum(1)])
+
+
+def _sigma(residual: Float64) -> float:
+    return float(np.sqrt((residual**2).sum() / max(len(residual) - 7, 1)))

@@ -1,0 +1,415 @@
+"""From what rays hit to the light in each pixel: sub-rays, mirrors, one bounce, scattering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from scipy import ndimage
+
+from tofuse.arrays import Bool, Float64, Int32
+from tofuse.geometry.cameras import Pinhole
+from tofuse.kernels import phasor
+from tofuse.kernels.threads import run_chunks
+from tofuse.lab.simulation.scene import Scene
+from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
+
+# Paths start this far off a surface, so as not to hit it again.
+_LIFT = 1e-4
+# A surface point counts as lit if nothing is nearer than it by more than this.
+_SHADOW = 0.005
+# Light of the highlight of a full mirror, seen head-on, relative to a white wall's; and its width.
+_HIGHLIGHT, _HIGHLIGHT_RAD = 40.0, 0.03
+# So many that what is left of the sampling, as an error of the range, is about a millimetre.
+_BOUNCE_RAYS = 128
+
+
+@dataclass(frozen=True, eq=False)
+class RayGrid:
+    """Unit directions (H s + 1, W s + 1, 3) in the camera frame, s to a pixel, or (H, W, 3).
+
+    Attributes
+    ----------
+    directions
+        Unit rays in the camera frame, NaN where the lens shows nothing.
+    stride
+        Samples from one pixel to the next.
+    weights
+        Of the samples in a pixel's window, along rows and columns; their sum is 1.
+    """
+
+    directions: Float64
+    stride: int
+    weights: Float64
+
+    @property
+    def window(self) -> int:
+        """Samples along a side of a pixel's window."""
+        return len(self.weights)
+
+    @property
+    def centre(self) -> tuple[slice, slice]:
+        """Slices that pick the sample at each pixel's centre."""
+        pick = slice(self.window // 2, None, self.stride)
+        return pick, pick
+
+
+@cache
+def ray_grid(model: CameraModel, mixed: bool) -> RayGrid:
+    """Return the rays of a camera: one in each pixel's centre, or a grid of half pixels.
+
+    The grid's samples on the border between two pixels count for both, as the optics' blur does.
+    """
+    camera = model.camera
+    if not mixed:
+        return RayGrid(_directions(camera), 1, np.ones(1))
+    fine: Pinhole = replace(
+        camera,
+        width=2 * camera.width + 1,
+        height=2 * camera.height + 1,
+        fx=2 * camera.fx,
+        fy=2 * camera.fy,
+        cx=2 * camera.cx + 1,
+        cy=2 * camera.cy + 1,
+    )
+    return RayGrid(_directions(fine), 2, np.array([0.25, 0.5, 0.25]))
+
+
+def _directions(camera: Pinhole) -> Float64:
+    rays = camera.rays().astype(float)
+    out = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """What comes back along N rays: up to R returns each, and the surface that they hit.
+
+    Attributes
+    ----------
+    strength
+        (N, R), relative to a white wall at 1 m; the first is the direct one.
+    path
+        (N, R) in m, there and back.
+    diffuse
+        (N,) share of light that the surface scatters: albedo, less what it mirrors.
+    distance
+        (N,) in m, infinite without a hit.
+    points, normals
+        (N, 3) in the room's frame; points infinite without a hit.
+    surface
+        (N,) int32 id of the surface, -1 without a hit.
+    """
+
+    strength: Float64
+    path: Float64
+    diffuse: Float64
+    distance: Float64
+    points: Float64
+    normals: Float64
+    surface: Int32
+
+
+def trace(
+    scene: Scene,
+    model: CameraModel,
+    directions: Float64,
+    T_room_camera: Float64,
+    T_room_bodies: Float64 | None,
+    *,
+    gloss: bool,
+) -> Returns:
+    """Follow rays (N, 3) of the camera frame to what they hit, and on over mirroring surfaces.
+
+    The lamp is at the camera's centre. A surface that mirrors the share g sends back a highlight
+    head-on, and shows what is mirrored in it: lit through the mirror (g^2, the mirror image) and
+    lit directly (g, on a shorter path). g depends on the angle, see `_mirrored`.
+    """
+    origin = T_room_camera[:3, 3]
+    rays = directions @ T_room_camera[:3, :3].T
+    seen: Bool = np.isfinite(rays @ np.ones(3))
+    rays[~seen] = (0.0, 0.0, 1.0)
+    hits = scene.cast(origin, rays, T_room_bodies)
+    distance: Float64 = np.where(seen, hits.distance.astype(float), np.inf)
+    hit = np.isfinite(distance)
+    safe = np.where(hit, np.maximum(distance, 1e-3), 1.0)
+    normals = hits.normal.astype(float)
+    cosine = np.clip(-np.einsum("nc,nc->n", normals, rays), 0, 1)
+    mirror = np.where(hit, _mirrored(hits.gloss.astype(float), cosine), 0.0) * gloss
+    diffuse = np.where(hit, hits.albedo * (1 - mirror), 0.0)
+    direct = diffuse * cosine / safe**2
+    points = origin + safe[:, None] * rays
+    points[~hit] = np.inf
+    shiny = np.flatnonzero(mirror > 0.01)
+    if len(shiny) == 0:
+        return Returns(
+            direct[:, None], 2 * safe[:, None], diffuse, distance, points, normals, hits.surface
+        )
+    strength = np.zeros((len(rays), 3))
+    path = np.zeros((len(rays), 3))
+    strength[:, 0], path[:, 0] = direct, 2 * safe
+    g, r, n, d = mirror[shiny], safe[shiny], normals[shiny], rays[shiny]
+    tilt = np.arccos(cosine[shiny])
+    # The mirrored lamp stands at twice the distance.
+    strength[shiny, 0] += g * _HIGHLIGHT / (4 * r**2) * np.exp(-((tilt / _HIGHLIGHT_RAD) ** 2))
+    onward = d - 2 * (d * n).sum(1, keepdims=True) * n
+    start = points[shiny] + _LIFT * n
+    second = scene.cast(start, onward, T_room_bodies)
+    found = np.isfinite(second.distance)
+    s = np.where(found, second.distance, 1.0).astype(float)
+    y = start + s[:, None] * onward
+    n2 = second.normal.astype(float)
+    albedo = np.where(found, second.albedo * (1 - second.gloss), 0.0)
+    arriving = np.clip(-(n2 * onward).sum(1), 0, 1)
+    strength[shiny, 1] = g * g * albedo * arriving / (r + s) ** 2
+    path[shiny, 1] = 2 * (r + s)
+    lit, length = lit_by(scene, origin, y, n2, T_room_bodies)
+    # Lit where the lamp shines there, not along the ray.
+    lit *= _beam(model, (y - origin) @ T_room_camera[:3, :3]) / _beam(model, directions[shiny])
+    strength[shiny, 2] = g * albedo * lit
+    path[shiny, 2] = r + s + length
+    return Returns(strength, path, diffuse, distance, points, normals, hits.surface)
+
+
+def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
+    """Share of the light that a surface mirrors (Schlick 1994): gloss^2 head-on, more askance.
+
+    So a full mirror mirrors everything, and varnish (gloss 0.2) 4 % head-on and 20 % at most.
+    """
+    return gloss * (gloss + (1 - gloss) * (1 - cosine) ** 5)
+
+
+def lit_by(
+    scene: Scene,
+    lamp: Float64,
+    points: Float64,
+    normals: Float64,
+    T_room_bodies: Float64 | None,
+) -> tuple[Float64, Float64]:
+    """Light of the lamp (3,) on points (N, 3): cos / r^2, 0 in shadow; and the distances r."""
+    toward = points - lamp
+    length = np.maximum(np.linalg.norm(toward, axis=1), 1e-3)
+    toward = toward / length[:, None]
+    cosine = np.clip(-(normals * toward).sum(1), 0, 1)
+    nearest = scene.cast(lamp, toward, T_room_bodies).distance
+    clear = nearest > length - _SHADOW - 0.002 * length
+    return np.where(clear, cosine / length**2, 0.0), length
+
+
+def pixel_phasors(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
+    """Direct light in each pixel, (H, W, 7) in the channels of `kernels.phasor`."""
+    return _pooled(grid, returns.strength, returns.path, frequency)
+
+
+def bounce_weights(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
+    """What a pixel makes of light that arrives at its surface, (H, W, 7): half a path more."""
+    return _pooled(grid, returns.diffuse[:, None], returns.path[:, :1] / 2, frequency)
+
+
+def _pooled(grid: RayGrid, strength: Float64, path: Float64, frequency: float) -> Float64:
+    wave_number = 2 * np.pi * frequency / SPEED_OF_LIGHT
+    rows, columns = grid.directions.shape[:2]
+    fine = np.empty((rows * columns, phasor.CHANNELS))
+    strength, path = np.ascontiguousarray(strength), np.ascontiguousarray(path)
+    run_chunks(lambda a, b: phasor.ray_phasors(strength, path, wave_number, a, b, fine), len(fine))
+    fine = fine.reshape(rows, columns, -1)
+    height = (rows - grid.window) // grid.stride + 1
+    width = (columns - grid.window) // grid.stride + 1
+    out = np.empty((height, width, phasor.CHANNELS))
+    run_chunks(lambda a, b: phasor.pool(fine, grid.weights, grid.stride, a, b, out), height)
+    return out
+
+
+def off_plane(grid: RayGrid, returns: Returns) -> Float64:
+    """Largest distance (H, W) in m of a pixel's sub-rays from the plane at its centre."""
+    rows, columns = grid.directions.shape[:2]
+    points = returns.points.reshape(rows, columns, 3)
+    normals = returns.normals.reshape(rows, columns, 3)
+    height = (rows - grid.window) // grid.stride + 1
+    out = np.zeros((height, (columns - grid.window) // grid.stride + 1))
+    run_chunks(
+        lambda a, b: phasor.off_plane(points, normals, grid.window, grid.stride, a, b, out), height
+    )
+    return out
+
+
+def bounced_light(
+    scene: Scene,
+    model: CameraModel,
+    points: Float64,
+    normals: Float64,
+    T_room_camera: Float64,
+    T_room_bodies: Float64 | None,
+    *,
+    gloss: bool = True,
+) -> list[Float64]:
+    """Light that reaches each pixel's surface by way of another one, for each frequency.
+
+    On a coarse grid of pixels, rays leave the surface in fixed directions whose density is
+    the cosine to the normal (so the mean of what they see is the light that the surface
+    scatters), and what they hit is lit by the camera's lamp. Paths run from the lamp to the
+    pixel's surface.
+
+    The light is relative to what the lamp sends towards the pixel, as direct light is: an image
+    falls off as lens and lamp together do, but this light has not come from there.
+
+    Parameters
+    ----------
+    points, normals
+        (H, W, 3) at the pixels' centres, in the room's frame; points infinite without a hit.
+    gloss
+        Whether glossy surfaces scatter less.
+
+    Returns
+    -------
+    For each frequency (H, W, 7) in the channels of `kernels.phasor`.
+    """
+    step = max(4, points.shape[1] // 44)
+    pick = (slice(step // 2, None, step), slice(step // 2, None, step))
+    x, n = points[pick], normals[pick]
+    shape = x.shape[:2]
+    lamp = T_room_camera[:3, 3]
+    hit = np.isfinite(x[..., 0])
+    strengths = np.zeros((*shape, _BOUNCE_RAYS))
+    paths = np.zeros((*shape, _BOUNCE_RAYS))
+    if hit.any():
+        n_hit = n[hit]
+        start = x[hit] + _LIFT * n_hit
+        rays = np.einsum("kc,ncd->nkd", _hemisphere(_BOUNCE_RAYS), _frames(n_hit))
+        starts = np.repeat(start, _BOUNCE_RAYS, axis=0)
+        rays = rays.reshape(-1, 3)
+        second = scene.cast(starts, rays, T_room_bodies)
+        found = np.isfinite(second.distance)
+        s = np.where(found, second.distance, 1.0).astype(float)
+        y = starts + s[:, None] * rays
+        lit, length = lit_by(scene, lamp, y, second.normal.astype(float), T_room_bodies)
+        beam = _beam(model, (y - lamp) @ T_room_camera[:3, :3])
+        mirror = _mirrored(second.gloss.astype(float), np.clip(lit * length**2, 0, 1)) * gloss
+        albedo = np.where(found, second.albedo * (1 - mirror), 0.0)
+        strengths[hit] = (albedo * lit * beam).reshape(-1, _BOUNCE_RAYS) / _BOUNCE_RAYS
+        paths[hit] = (length + s).reshape(-1, _BOUNCE_RAYS)
+    seen = np.isfinite(points[..., 0])
+    beam = np.ones(seen.shape)
+    beam[seen] = _beam(model, (points[seen] - lamp) @ T_room_camera[:3, :3])
+    out = []
+    for frequency in model.frequencies:
+        wave_number = 2 * np.pi * frequency / SPEED_OF_LIGHT
+        coarse = np.empty((shape[0] * shape[1], phasor.CHANNELS))
+        phasor.ray_phasors(
+            strengths.reshape(-1, _BOUNCE_RAYS),
+            paths.reshape(-1, _BOUNCE_RAYS),
+            wave_number,
+            0,
+            len(coarse),
+            coarse,
+        )
+        # Points relative to the lens: the tolerance off a plane grows with the range.
+        light = _upsampled(coarse.reshape(*shape, -1), x - lamp, n, points - lamp, normals, step)
+        out.append(light / beam[..., None])
+    return out
+
+
+def _upsampled(
+    coarse: Float64, x: Float64, n: Float64, points: Float64, normals: Float64, step: int
+) -> Float64:
+    out = np.empty((*points.shape[:2], coarse.shape[2]))
+    x, n = np.ascontiguousarray(x), np.ascontiguousarray(n)
+    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
+    run_chunks(
+        lambda a, b: phasor.upsample(coarse, x, n, points, normals, step, a, b, out), len(points)
+    )
+    return out
+
+
+def _beam(model: CameraModel, directions: Float64) -> Float64:
+    """Light of the lamp in directions (N, 3) of the camera frame, relative to the axis.
+
+    Falls as half of the camera's falloff, and to nothing from 1.1 to 1.3 times the angle of
+    the image's corner.
+    """
+    cosine = directions[:, 2] / np.maximum(np.linalg.norm(directions, axis=1), 1e-9)
+    corner = float(np.nanmax(np.linalg.norm(model.camera.rays(), axis=-1)))
+    limit = np.arctan(corner)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    edge = np.clip((1.3 - angle / limit) / 0.2, 0, 1)
+    return np.maximum(cosine, 0) ** (model.falloff / 2) * edge
+
+
+@cache
+def _hemisphere(count: int) -> Float64:
+    """Fixed directions (count, 3) around z, as dense as the cosine to it (a spiral)."""
+    k = np.arange(count)
+    radius = np.sqrt((k + 0.5) / count)
+    turn = k * np.pi * (3 - np.sqrt(5))
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], -1)
+
+
+def _frames(normals: Float64) -> Float64:
+    """For each normal (N, 3) two tangents and the normal itself, as rows (N, 3, 3)."""
+    helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(helper, normals)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    return np.stack([first, np.cross(normals, first), normals], 1)
+
+
+def combine(weights: Float64, light: Float64) -> Float64:
+    """Pixel's light after a bounce, (H, W, 7): weights and arriving light, harmonic by harmonic."""
+    out = weights * light
+    for c in (1, 3, 5):
+        a = weights[..., c] + 1j * weights[..., c + 1]
+        b = light[..., c] + 1j * light[..., c + 1]
+        out[..., c], out[..., c + 1] = (a * b).real, (a * b).imag
+    return out
+
+
+def blurred(images: Float64, sigma_px: float) -> Float64:
+    """Images (..., H, W) as a lens shows them that spreads a point by sigma_px."""
+    if sigma_px == 0:
+        return images
+    radius = int(np.ceil(3 * sigma_px))
+    weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma_px) ** 2)
+    weights /= weights.sum()
+    rows = ndimage.correlate1d(images, weights, -2, mode="nearest")
+    return np.asarray(ndimage.correlate1d(rows, weights, -1, mode="nearest"))
+
+
+class LensScatter:
+    """Light scattered in the lens: a share of every image spreads widely over it.
+
+    The spread is a mixture of a Gaussian of 0.06 and one of 0.25 image widths, which are so
+    wide that a grid of every fourth pixel (or coarser) carries them.
+    """
+
+    def __init__(self, width: int, height: int, share: float) -> None:
+        self.share = share
+        step = max(4, width // 44)
+        self._parts = [
+            (mass, _spread(height, step, sigma * width), _spread(width, step, sigma * width))
+            for mass, sigma in ((0.5, 0.06), (0.5, 0.25))
+        ]
+
+    def __call__(self, image: Float64) -> Float64:
+        """Return the scattered image (H, W)."""
+        if self.share == 0:
+            return image
+        out = (1 - self.share) * image
+        for mass, (up_rows, down_rows), (up_columns, down_columns) in self._parts:
+            # einsum, not a matrix product: BLAS may sum differently with more threads.
+            small = np.einsum("iv,vu->iu", down_rows, image)
+            small = np.einsum("iu,ju->ij", small, down_columns)
+            large = np.einsum("vi,ij->vj", up_rows, small)
+            out += self.share * mass * np.einsum("vj,uj->vu", large, up_columns)
+        return out
+
+
+def _spread(size: int, step: int, sigma: float) -> tuple[Float64, Float64]:
+    """Linear interpolation (size, n) after block sums and a Gaussian (n, size)."""
+    nodes = np.arange(-(-size // step))
+    pixels = np.arange(size)
+    sums = (pixels // step == nodes[:, None]).astype(float)
+    away = (nodes[:, None] - nodes) * step
+    blur = np.exp(-0.5 * (away / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    position = np.clip((pixels - (step - 1) / 2) / step, 0, len(nodes) - 1)
+    up = np.maximum(0, 1 - np.abs(position[:, None] - nodes))
+    return up, blur @ sums

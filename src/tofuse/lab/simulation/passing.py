@@ -1,0 +1,294 @@
+"""Things that pass through the view of a moving camera: a person who walks, a box that slides.
+
+They cross the image from side to side now and then, in the middle of each pass at such a distance
+that they cover a given share of it, and are far below the floor in between. The camera's true poses
+are in the room; what passes by does not change them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.errors import InputError
+from tofuse.geometry import se3
+from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.simulation import paths
+from tofuse.lab.simulation.mesh import Mesh
+from tofuse.lab.simulation.scene import Body, Scene, Sequence
+from tofuse.lab.simulation.scenes.torso import HAIR, SHIRT, SKIN, TROUSERS
+from tofuse.lab.simulation.texture import Material
+from tofuse.sensor.models import CameraModel
+
+Kind = Literal["person", "box"]
+
+CARTON = Material("carton", 0.45, 0.25, "print", (0.2, 0.2, 0.2))
+
+# Where they are while they don't pass.
+_AWAY = np.eye(4)
+_AWAY[2, 3] = -100.0
+_NEAREST_M = 0.6
+# They keep away from what is behind them by this factor on its distance.
+_CLEAR = 0.75
+_SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2)
+_LIMB_RAD, _GAIT_HZ = 0.42, 0.9
+_MARGIN_RAD = 0.05
+_COLUMNS = 44
+
+
+@dataclass(frozen=True)
+class Passing:
+    """What passes by, how often, and how large it looks.
+
+    Attributes
+    ----------
+    kind
+        "person" walks, its limbs swinging; "box" slides.
+    share
+        Of the image that it covers in the middle of a pass, 0 to 1. It is made smaller where
+        there is no place so far away.
+    seconds
+        How long it takes to cross the image.
+    period_s
+        From the begin of one pass to that of the next.
+    start_s
+        Begin of the first pass, after the first frame.
+    """
+
+    kind: Kind = "person"
+    share: float = 0.25
+    seconds: float = 2.0
+    period_s: float = 4.0
+    start_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("person", "box"):
+            raise InputError(f"is {self.kind!r}", where="passing", remedy="use person or box")
+        if not 0 < self.share < 1:
+            raise InputError(f"is {self.share}", where="share", remedy="give one between 0 and 1")
+        if not 0 < self.seconds <= self.period_s:
+            raise InputError(
+                f"is {self.seconds} s of {self.period_s} s",
+                where="passing",
+                remedy="let a pass end before the next one begins",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One rigid part: its mesh about the joint, where the joint is, and which way it swings."""
+
+    mesh: Mesh
+    joint: Float64 = field(default_factory=lambda: np.zeros(3))
+    swing: float = 0.0
+
+    def T_thing_part(self, t: float) -> Float64:
+        """(4, 4) pose in the thing's frame at time t in s of its gait."""
+        angle = self.swing * _LIMB_RAD * np.sin(2 * np.pi * _GAIT_HZ * t)
+        T = paths.rotation([0, angle, 0])
+        T[:3, 3] = self.joint
+        return T
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """One crossing: from one border of the view over its middle to the other, on the floor."""
+
+    start: float
+    end: float
+    places: Float64  # (3, 2) in m, at the begin, the middle and the end
+
+    def T_room_thing(self, t: float) -> Float64:
+        """(4, 4) pose at time t in s; it faces where it goes."""
+        u = (t - self.start) / (self.end - self.start)
+        weights = np.array([(1 - u) * (1 - 2 * u), 4 * u * (1 - u), u * (2 * u - 1)])
+        slopes = np.array([4 * u - 3, 4 - 8 * u, 4 * u - 1])
+        along = slopes @ self.places
+        T = paths.rotation([0, 0, np.arctan2(along[1], along[0])])
+        T[:2, 3] = weights @ self.places
+        return T
+
+
+def enter(
+    scene: Scene,
+    sequence: Sequence,
+    model: CameraModel,
+    passing: Passing,
+    *,
+    first: float,
+    last: float,
+    seed: int = 0,
+    texture: bool = True,
+) -> tuple[Scene, Sequence]:
+    """Let something pass through the view.
+
+    Parameters
+    ----------
+    scene, sequence, model
+        The scene, the motion and the camera.
+    passing
+        What passes.
+    first, last
+        Times in s of the first and the last frame.
+    seed
+        Decides from which side it comes.
+    texture
+        False gives it the same albedo as all else.
+
+    Returns
+    -------
+    The scene and the sequence with it.
+    """
+    materials, whole = _person() if passing.kind == "person" else _box()
+    span = passing.seconds
+    starts = np.arange(first + passing.start_s, last, passing.period_s)
+    middles = starts + span / 2
+    view = _View.of(model)
+    farthest = [_clear(scene, sequence, view, t) for t in middles]
+    for scale in _SCALES:
+        # A box stays as high as it is, or it would slip out of view below.
+        size = np.full(3, scale) if passing.kind == "person" else np.array([scale, scale, 1.0])
+        parts = [_scaled(part, size) for part in whole]
+        bodies = [Body(part.mesh) for part in parts]
+
+        def covered(t: float, distance: float, parts: list[_Part], bodies: list[Body]) -> float:
+            place = _ahead(sequence.T_room_camera(t), distance, 0.0)
+            T = paths.rotation([0, 0, _heading(sequence.T_room_camera(t)) + np.pi / 2])
+            T[:2, 3] = place
+            return view.covered(
+                sequence.T_room_camera(t), bodies, [T @ p.T_thing_part(0) for p in parts]
+            )
+
+        least = [covered(t, far, parts, bodies) for t, far in zip(middles, farthest, strict=True)]
+        if not least or np.median(least) <= passing.share:
+            break
+    side = 1 if np.random.default_rng([seed, 5]).random() < 0.5 else -1
+    passes = []
+    for k, (t, far) in enumerate(zip(middles, farthest, strict=True)):
+        near, distance = _NEAREST_M, far
+        for _ in range(10):
+            middle = 0.5 * (near + distance)
+            if covered(t, middle, parts, bodies) < passing.share:
+                distance = middle
+            else:
+                near = middle
+        reach = max(np.hypot(*(part.mesh.vertices[:, :2].T)).max() for part in parts)
+        # Beyond the border by half its own width, so that it comes into view bit by bit.
+        out = view.half_angle + np.arctan2(reach, distance) + _MARGIN_RAD
+        places = [
+            _ahead(sequence.T_room_camera(s), distance, angle)
+            for s, angle in zip(
+                (t - span / 2, t, t + span / 2),
+                np.array([1, 0, -1]) * out * side * (-1) ** k,
+                strict=True,
+            )
+        ]
+        passes.append(_Pass(t - span / 2, t + span / 2, np.array(places)))
+
+    def path_of(part: _Part) -> paths.Path:
+        def path(t: float) -> Float64:
+            for one in passes:
+                if one.start <= t <= one.end:
+                    return one.T_room_thing(t) @ part.T_thing_part(t)
+            return _AWAY.copy()
+
+        return path
+
+    shown = materials if texture else [m.uniform() for m in materials]
+    return (
+        scene.with_passing(shown, [part.mesh for part in parts]),
+        sequence.with_passing([path_of(part) for part in parts]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Coarse rays of a camera (N, 3), unit; and half the angle that it sees across."""
+
+    rays: Float64
+    half_angle: float
+
+    @classmethod
+    def of(cls, model: CameraModel) -> _View:
+        camera = model.camera
+        step = max(1, camera.width // _COLUMNS)
+        xy = camera.rays()[step // 2 :: step, step // 2 :: step].reshape(-1, 2).astype(float)
+        xy = xy[np.isfinite(xy).all(1)]
+        rays = np.column_stack([xy, np.ones(len(xy))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        return cls(rays, float(np.arctan(np.abs(xy[:, 0]).max())))
+
+    def covered(
+        self, T_room_camera: Float64, bodies: SequenceOf[Body], poses: SequenceOf[Float64]
+    ) -> float:
+        """Share of the image that bodies at poses T_room_body cover."""
+        nearest = np.full(len(self.rays), np.inf)
+        for body, T in zip(bodies, poses, strict=True):
+            T_body_camera = se3.inverse(T) @ T_room_camera
+            origins = np.ascontiguousarray(T_body_camera[None, :3, 3])
+            body.cast(origins, np.ascontiguousarray(self.rays @ T_body_camera[:3, :3].T), nearest)
+        return float(np.isfinite(nearest).mean())
+
+
+def _clear(scene: Scene, sequence: Sequence, view: _View, t: float) -> float:
+    """How far away in m something may pass: before most of what is seen."""
+    T = sequence.T_room_camera(t)
+    hits = scene.cast(T[:3, 3], view.rays @ T[:3, :3].T, sequence.T_room_bodies(t))
+    away = hits.distance * view.rays[:, 2]
+    seen = away[np.isfinite(away)]
+    return max(_CLEAR * float(np.median(seen)), _NEAREST_M) if len(seen) else 2.0
+
+
+def _heading(T_room_camera: Float64) -> float:
+    return float(np.arctan2(T_room_camera[1, 2], T_room_camera[0, 2]))
+
+
+def _ahead(T_room_camera: Float64, distance: float, angle: float) -> Float64:
+    """Place (2,) on the floor before the camera, turned to the left by an angle in rad."""
+    heading = _heading(T_room_camera) + angle
+    return T_room_camera[:2, 3] + distance * np.array([np.cos(heading), np.sin(heading)])
+
+
+def _scaled(part: _Part, size: Float64) -> _Part:
+    return _Part(part.mesh.warped(lambda p: size * p), size * part.joint, part.swing)
+
+
+def _person() -> tuple[list[Material], list[_Part]]:
+    """A standing person of 1.76 m who faces +x: trunk and head, legs, arms."""
+    shirt, trousers, skin, hair = range(4)
+    rod, egg = meshes.rod, meshes.superellipsoid
+
+    def joined(*parts: tuple[int, Mesh]) -> Mesh:
+        return meshes.joined([part.of_surface(surface) for surface, part in parts])
+
+    trunk = joined(
+        (shirt, egg((0.25, 0.42, 0.62), (0.6, 0.8), (12, 24)).shifted(0, 0, 1.20)),
+        (trousers, egg((0.26, 0.36, 0.28), (0.7, 0.8), (10, 20)).shifted(0, 0, 0.93)),
+        (skin, rod((0, 0, 1.45), (0.01, 0, 1.58), 0.055)),
+        (skin, egg((0.20, 0.16, 0.24), (1, 1), (12, 20)).shifted(0.02, 0, 1.64)),
+        (hair, egg((0.20, 0.18, 0.18), (1, 1), (10, 18)).shifted(-0.005, 0, 1.67)),
+    )
+    leg = joined(
+        (trousers, rod((0, 0, 0.03), (0.01, 0, -0.42), 0.085, 0.06)),
+        (trousers, rod((0.01, 0, -0.42), (0, 0, -0.84), 0.06, 0.045)),
+        (hair, egg((0.28, 0.10, 0.09), (0.6, 0.6)).shifted(0.05, 0, -0.865)),
+    )
+    arm = joined(
+        (shirt, rod((0, 0, 0.04), (0, 0, -0.28), 0.055, 0.042)),
+        (shirt, rod((0, 0, -0.28), (0.05, 0, -0.52), 0.042, 0.03)),
+        (skin, egg((0.06, 0.09, 0.17)).shifted(0.07, 0, -0.60)),
+    )
+    parts = [_Part(trunk)]
+    for side in (-1, 1):
+        parts.append(_Part(leg, np.array([0, 0.095 * side, 0.91]), side))
+        parts.append(_Part(arm, np.array([0, 0.25 * side, 1.43]), -side))
+    return [SHIRT, TROUSERS, SKIN, HAIR], parts
+
+
+def _box() -> tuple[list[Material], list[_Part]]:
+    """A tall carton on the floor."""
+    return [CARTON], [_Part(meshes.box((0.5, 0.5, 1.6), (0, 0, 0.8)))]

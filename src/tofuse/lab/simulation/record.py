@@ -1,0 +1,324 @@
+"""A whole simulated recording: in memory, or as a native folder with the truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tofuse.arrays import Float64, Intp
+from tofuse.errors import InputError
+from tofuse.files.atomic import make_folder
+from tofuse.files.images import write_png
+from tofuse.files.ply import write_ply
+from tofuse.geometry import se3
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation import sensor
+from tofuse.lab.simulation.accelerometer import accelerations
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.passing import Passing, enter
+from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
+from tofuse.lab.simulation.render import Rendered, render
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import RecordingWriter, corrected_depth
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.models import CameraModel, camera_model
+
+# Is told how many frames are done, and of how many.
+Progress = Callable[[int, int], None]
+
+_DEFAULT = Effects()
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is to be recorded.
+
+    Attributes
+    ----------
+    raw
+        (N,) indices of the raw frames taken.
+    """
+
+    scene: scenes.Scene
+    sequence: scenes.Sequence
+    model: CameraModel
+    effects: Effects
+    seed: int
+    raw: Intp
+
+    @property
+    def poses(self) -> Float64:
+        """(N, 4, 4) true T_world_camera."""
+        rate = self.sequence.frame_rate_hz
+        poses = [self.sequence.T_world_camera(k / rate, self.raw[0] / rate) for k in self.raw]
+        # Exactly, whatever rounding did.
+        poses[0] = np.eye(4)
+        return np.stack(poses)
+
+    @property
+    def correction(self) -> DepthCorrection:
+        """The factory correction of the camera."""
+        return sensor.calibrated(self.model, self.effects)
+
+    def frames(self, progress: Progress | None) -> Iterator[Rendered]:
+        """Take the frames, numbered from 0."""
+        for k, raw in enumerate(self.raw):
+            rendered = render(
+                self.scene,
+                self.sequence,
+                self.model,
+                int(raw),
+                effects=self.effects,
+                seed=self.seed,
+            )
+            yield replace(rendered, frame=replace(rendered.frame, index=k))
+            if progress is not None:
+                progress(k + 1, len(self.raw))
+
+
+def plan(
+    scene: str,
+    *,
+    camera: str = "sr4000",
+    seed: int = 0,
+    effects: Effects = _DEFAULT,
+    every: int | None = None,
+    frames: int | None = None,
+    first: int = 0,
+    texture: bool = True,
+    axis_offset_m: float = 0.0,
+    passing: Passing | None = None,
+) -> Plan:
+    """Say what is to be recorded; see `simulate` for the parameters.
+
+    Raises
+    ------
+    InputError
+        For an unknown scene or camera, a stride or number of frames below 1, or a first frame
+        that is not there.
+    """
+    model = camera_model(camera)
+    built, sequence = scenes.build(scene, seed=seed, texture=texture, axis_offset_m=axis_offset_m)
+    stride = sequence.stride if every is None else every
+    for name, value in (("every", stride), ("frames", 1 if frames is None else frames)):
+        if value < 1:
+            raise InputError(f"is {value}", where=name, remedy="give 1 or more")
+    if not 0 <= first < sequence.frames:
+        raise InputError(
+            f"is {first}", where="first", remedy=f"give one from 0 to {sequence.frames - 1}"
+        )
+    raw = np.arange(first, sequence.frames, stride)[:frames]
+    if passing is not None:
+        times = raw[[0, -1]] / sequence.frame_rate_hz
+        built, sequence = enter(
+            built, sequence, model, passing, first=times[0], last=times[1], seed=seed,
+            texture=texture,
+        )  # fmt: skip
+    return Plan(built, sequence, model, effects, seed, raw)
+
+
+def simulate_recording(
+    scene: str,
+    *,
+    camera: str = "sr4000",
+    seed: int = 0,
+    effects: Effects = _DEFAULT,
+    every: int | None = None,
+    frames: int | None = None,
+    first: int = 0,
+    correction: bool = True,
+    texture: bool = True,
+    axis_offset_m: float = 0.0,
+    passing: Passing | None = None,
+    sigma_m: float = 0.05,
+    progress: Progress | None = None,
+) -> Recording:
+    """Make a recording in memory, as reading what `simulate` writes would give it.
+
+    The true poses are its reference. See `simulate` for the parameters.
+    """
+    if scene == "peaks":
+        views, poses = peaks_views(sigma_m, seed)
+        kept = slice(None, frames and frames * (every or 1), every)
+        chosen = [replace(view, index=k) for k, view in enumerate(views[kept])]
+        return Recording.of(ArraySource(chosen, poses[kept]), "simulated peaks", "simulated")
+    made = plan(
+        scene,
+        camera=camera,
+        seed=seed,
+        effects=effects,
+        every=every,
+        frames=frames,
+        first=first,
+        texture=texture,
+        axis_offset_m=axis_offset_m,
+        passing=passing,
+    )
+    factory = made.correction if correction else None
+    taken = [
+        rendered.frame if factory is None else _corrected(factory, rendered.frame)
+        for rendered in made.frames(progress)
+    ]
+    source = ArraySource(taken, made.poses, metadata=_metadata(made, correction))
+    return Recording.of(source, f"simulated {scene}", "simulated")
+
+
+def simulate(
+    scene: str,
+    out: str | Path,
+    *,
+    camera: str = "sr4000",
+    seed: int = 0,
+    effects: Effects = _DEFAULT,
+    every: int | None = None,
+    frames: int | None = None,
+    first: int = 0,
+    correction: bool = True,
+    texture: bool = True,
+    axis_offset_m: float = 0.0,
+    passing: Passing | None = None,
+    imu: bool = False,
+    sigma_m: float = 0.05,
+    progress: Progress | None = None,
+) -> Path:
+    """Make a recording and write it as a native folder, with the truth in groundtruth.txt, truth/.
+
+    Parameters
+    ----------
+    scene
+        One of `scene.SCENES`, or "peaks", which is made of clouds and has no camera.
+    out
+        The folder; made if missing, must be empty.
+    camera
+        One of `sensor.models.CAMERAS`.
+    seed
+        Of scene and noise.
+    effects
+        Which errors the camera makes.
+    every
+        Take every so manieth raw frame; the stride of the thesis if not given. A raw frame looks
+        the same whatever the stride.
+    frames
+        Stop after so many taken frames.
+    first
+        Raw frame to begin with; its camera's frame is the world.
+    correction
+        Whether the factory correction is written beside the (uncorrected) depth.
+    texture
+        False gives every surface the same albedo.
+    axis_offset_m
+        See `scene.build`.
+    passing
+        What passes through the view, if anything; its pixels are flagged in truth/flags. The
+        surface in truth/ is without it.
+    imu
+        Whether an accelerometer on the camera is recorded as well.
+    sigma_m
+        Noise of "peaks" in m.
+    progress
+        Is told how many frames are done, and of how many.
+
+    Returns
+    -------
+    The folder.
+
+    Raises
+    ------
+    InputError
+        For an unknown scene or camera, or a number that makes no sense.
+    OutputError
+        If the folder can't be written or isn't empty.
+    """
+    if scene == "peaks":
+        return _write_peaks(Path(out), seed, sigma_m, every, frames)
+    made = plan(
+        scene,
+        camera=camera,
+        seed=seed,
+        effects=effects,
+        every=every,
+        frames=frames,
+        first=first,
+        texture=texture,
+        axis_offset_m=axis_offset_m,
+        passing=passing,
+    )
+    return write(made, out, correction=correction, imu=imu, progress=progress)
+
+
+def write(
+    made: Plan,
+    out: str | Path,
+    *,
+    correction: bool = True,
+    imu: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Take what is planned and write it as a native folder; see `simulate`."""
+    model, effects, seed = made.model, made.effects, made.seed
+    writer = RecordingWriter(
+        out,
+        model.camera,
+        depth_unit_m=model.depth_unit_m,
+        depth_kind=model.depth_kind,
+        frame_rate_hz=made.sequence.frame_rate_hz,
+        ambiguity_m=model.ambiguity_m,
+        confidence_max=model.confidence_max,
+        amplitude_kind=model.amplitude_kind,
+    )
+    truth = writer.folder / "truth"
+    flags, depths = make_folder(truth / "flags"), make_folder(truth / "depth")
+    for k, rendered in enumerate(made.frames(progress)):
+        writer.add(rendered.frame)
+        write_png(flags / f"{k:06d}.png", rendered.flags)
+        counts = np.round(rendered.depth.astype(float) / model.depth_unit_m)
+        write_png(depths / f"{k:06d}.png", np.where(counts < 65535, counts, 0).astype(np.uint16))
+    vertices, faces = made.scene.truth_mesh()
+    T = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
+    write_ply(truth / "surface.ply", se3.transform(T, vertices), faces=faces)
+    times = made.raw / made.sequence.frame_rate_hz
+    return writer.finish(
+        groundtruth=made.poses,
+        correction=made.correction if correction else None,
+        imu=accelerations(made.sequence, times[0], times[-1], seed) if imu else None,
+        frames={
+            "integration_us": np.full(len(times), round(model.integration_s * 1e6)),
+            "drift_m": np.array([sensor.drift(model, t) for t in times]) * effects.thermal_drift,
+        },
+    )
+
+
+def _write_peaks(
+    out: Path, seed: int, sigma_m: float, every: int | None, frames: int | None
+) -> Path:
+    recording = simulate_recording("peaks", seed=seed, sigma_m=sigma_m, every=every, frames=frames)
+    writer = RecordingWriter(out, None)
+    for frame in recording:
+        writer.add(frame)
+    T_camera_object = se3.inverse(peaks_cameras()[0])
+    truth = make_folder(writer.folder / "truth")
+    write_ply(truth / "surface.ply", se3.transform(T_camera_object, peaks_points()))
+    return writer.finish(groundtruth=recording.reference)
+
+
+def _corrected(factory: DepthCorrection, frame: RangeFrame) -> RangeFrame:
+    depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
+    return replace(frame, depth=depth)
+
+
+def _metadata(made: Plan, correction: bool) -> dict[str, object]:
+    model = made.model
+    found = {
+        "frame_rate_hz": made.sequence.frame_rate_hz,
+        "ambiguity_m": model.ambiguity_m,
+        "confidence_max": model.confidence_max,
+        "amplitude_kind": model.amplitude_kind,
+        "depth_unit_m": model.depth_unit_m,
+        "depth_kind": model.depth_kind,
+        "corrected": correction,
+    }
+    return {key: value for key, value in found.items() if value is not None}

@@ -1,0 +1,306 @@
+"""One frame of a simulated recording, with the truth about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt16
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.lab.simulation import optics, sensor
+from tofuse.lab.simulation.effects import Effects, Flag
+from tofuse.lab.simulation.scene import Scene, Sequence
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import INVALID_DEPTH, depth_from_counts
+from tofuse.sensor.models import CameraModel
+
+_DEFAULT = Effects()
+_NOTABLE_M = 0.003
+_MIXED_M, _MIXED_SHARE = 0.02, 0.01
+_MIRROR_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A frame as the camera reports it, and what is true.
+
+    Attributes
+    ----------
+    frame
+        Its depth is not corrected.
+    depth
+        (H, W) float32, true depth in m at the pixels' centres at the frame's timestamp, 0 without
+        a surface; of the frame's depth kind.
+    flags
+        (H, W) uint16 of `Flag` bits.
+    """
+
+    frame: RangeFrame
+    depth: Float32
+    flags: UInt16
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Light of one pose: (F, H, W, 7) direct and by one bounce, and what the rays hit."""
+
+    direct: Float64
+    weights: Float64
+    returns: optics.Returns
+
+
+def tap_times(model: CameraModel, time_s: float) -> Float64:
+    """Middle (4,) in s of the exposures of the phase images of a frame, around its timestamp."""
+    return time_s + (np.arange(sensor.TAPS) - 1.5) / sensor.TAPS * model.integration_s
+
+
+def render(
+    scene: Scene,
+    sequence: Sequence,
+    model: CameraModel,
+    index: int,
+    *,
+    effects: Effects = _DEFAULT,
+    seed: int = 0,
+) -> Rendered:
+    """Take raw frame `index` of a sequence, at the time index / frame rate.
+
+    The same frame comes out whichever others are taken, and however many threads there are.
+    """
+    time_s = index / sequence.frame_rate_hz
+    grid = optics.ray_grid(model, effects.mixed_pixels)
+    poses = [
+        (sequence.T_room_camera(t), sequence.T_room_bodies(t))
+        for t in (*tap_times(model, time_s), time_s)
+    ]
+    still = not effects.smear or all(_same(pose, poses[-1]) for pose in poses)
+
+    def light(pose: tuple[Float64, Float64 | None], rays: optics.RayGrid) -> _Light:
+        returns = optics.trace(
+            scene, model, rays.directions.reshape(-1, 3), *pose, gloss=effects.gloss
+        )
+        direct = [optics.pixel_phasors(rays, returns, f) for f in model.frequencies]
+        weights = [
+            optics.bounce_weights(rays, returns, f)
+            for f in (model.frequencies if effects.multipath else model.frequencies[:1])
+        ]
+        return _Light(np.stack(direct), np.stack(weights), returns)
+
+    taps = [light(poses[-1], grid)] if still else [light(pose, grid) for pose in poses[:-1]]
+    middle = taps[0].returns if still else None
+    pick = grid
+    if middle is None:
+        pick = optics.ray_grid(model, False)
+        middle = optics.trace(
+            scene, model, pick.directions.reshape(-1, 3), *poses[-1], gloss=effects.gloss
+        )
+    shape = pick.directions.shape
+    distance = middle.distance.reshape(shape[:2])[pick.centre]
+    bounced = None
+    if effects.multipath:
+        points = middle.points.reshape(shape)[pick.centre]
+        normals = middle.normals.reshape(shape)[pick.centre]
+        bounced = optics.bounced_light(
+            scene, model, points, normals, *poses[-1], gloss=effects.gloss
+        )
+
+    parts = _phase_images(model, effects, taps, bounced)
+    exposure = parts.exposure(model, effects, scene.ambient)
+    rng = np.random.default_rng([seed, index])
+    measured = sensor.expose(model, effects, exposure, rng)
+    expected = sensor.expose(model, effects, exposure, None)
+    ranges = _offset(model, effects, measured.range_m, time_s)
+    if not effects.wrap:
+        periods = np.round(
+            (np.where(np.isfinite(distance), distance, ranges) - ranges) / model.period_m
+        )
+        ranges = np.maximum(ranges + periods * model.period_m, 0)
+
+    measured = sensor.Measurement(ranges, measured.amplitude, measured.saturated)
+    flags = parts.flags(model, effects)
+    flags |= _pixel_flags(model, grid, taps, distance, ranges, expected)
+    surface = middle.surface.reshape(shape[:2])[pick.centre]
+    flags |= _bit(np.isin(surface, list(scene.passing_surfaces)), Flag.PASSING)
+    return Rendered(
+        _frame(model, effects, measured, index, time_s),
+        _recorded(model, np.where(np.isfinite(distance), distance, 0)),
+        flags,
+    )
+
+
+def _same(a: tuple[Float64, Float64 | None], b: tuple[Float64, Float64 | None]) -> bool:
+    return all(
+        (x is None and y is None)
+        or (x is not None and y is not None and np.abs(x - y).max() < 1e-12)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _PhaseImages:
+    """Light of the phase images before scattering in the lens.
+
+    Attributes
+    ----------
+    sharp, direct, lit
+        (F, 4, H, W) correlations of direct light, before and after the lens's blur, and with what
+        came by a bounce.
+    total
+        (F, 4, H, W) all modulated light.
+    albedo
+        (H, W) what the surface scatters.
+    unsmeared
+        (H, W) phasor of direct light, had nothing moved; None where nothing did.
+    """
+
+    sharp: Float64
+    direct: Float64
+    lit: Float64
+    total: Float64
+    albedo: Float64
+    unsmeared: Complex128 | None
+
+    def scattered(self, model: CameraModel, effects: Effects, images: Float64) -> Float64:
+        camera = model.camera
+        scatter = optics.LensScatter(camera.width, camera.height, effects.scatter)
+        images = images * model.transmission
+        if effects.scatter == 0:
+            return images
+        return np.stack([[scatter(image) for image in taps] for taps in images])
+
+    def exposure(self, model: CameraModel, effects: Effects, ambient: float) -> sensor.Exposure:
+        background = ambient * self.albedo * np.sqrt(model.transmission)
+        return sensor.Exposure(
+            self.scattered(model, effects, self.lit),
+            self.scattered(model, effects, self.total),
+            background,
+        )
+
+    def flags(self, model: CameraModel, effects: Effects) -> UInt16:
+        """Bits of the effects that can be told from the light alone."""
+        out = np.zeros(self.direct.shape[2:], np.uint16)
+        lit = sensor.phasor_of(self.lit[0])
+        direct = sensor.phasor_of(self.direct[0])
+        if effects.mixed_pixels:
+            sharp = sensor.phasor_of(self.sharp[0])
+            out |= _bit(_apart(model, direct, sharp, _MIXED_M), Flag.MIXED)
+        if effects.multipath:
+            out |= _bit(_apart(model, lit, direct), Flag.MULTIPATH)
+        if self.unsmeared is not None:
+            out |= _bit(_apart(model, direct, self.unsmeared), Flag.SMEAR)
+        if effects.scatter > 0:
+            scattered = sensor.phasor_of(self.scattered(model, effects, self.lit[:1])[0])
+            out |= _bit(_apart(model, scattered, lit), Flag.SCATTER)
+        return out
+
+
+def _bit(mask: Bool, flag: Flag) -> UInt16:
+    return np.where(mask, np.uint16(flag), np.uint16(0))
+
+
+def _apart(model: CameraModel, a: Complex128, b: Complex128, limit_m: float = _NOTABLE_M) -> Bool:
+    """Where two phasors differ in range by more than a limit; nowhere if one has no light."""
+    turn = np.abs(np.angle(a * np.conj(b))) / (2 * np.pi) * model.period_m
+    return (turn > limit_m) & (np.abs(a) > 0) & (np.abs(b) > 0)
+
+
+def _phase_images(
+    model: CameraModel, effects: Effects, taps: list[_Light], bounced: list[Float64] | None
+) -> _PhaseImages:
+    harmonics = sensor.scaled_harmonics(model, effects)
+    count, (height, width) = len(model.frequencies), taps[0].direct.shape[1:3]
+    direct = np.empty((count, sensor.TAPS, height, width))
+    lit, total = np.empty_like(direct), np.empty_like(direct)
+    for f in range(count):
+        for k in range(sensor.TAPS):
+            light = taps[k if len(taps) > 1 else 0]
+            direct[f, k] = sensor.correlate(light.direct[f], k, harmonics)
+            lit[f, k], total[f, k] = direct[f, k], light.direct[f, ..., 0]
+            if bounced is not None:
+                extra = optics.combine(light.weights[f], bounced[f])
+                lit[f, k] += sensor.correlate(extra, k, harmonics)
+                total[f, k] += extra[..., 0]
+    sharp = direct
+    if effects.mixed_pixels:
+        direct, lit, total = (optics.blurred(x, model.blur_px) for x in (direct, lit, total))
+    unsmeared = None
+    if len(taps) > 1:
+        light = np.mean([tap.direct[0] for tap in taps], axis=0)
+        static = np.stack([sensor.correlate(light, k, harmonics) for k in range(sensor.TAPS)])
+        if effects.mixed_pixels:
+            static = optics.blurred(static, model.blur_px)
+        unsmeared = sensor.phasor_of(static)
+    albedo = taps[len(taps) // 2].weights[0, ..., 0]
+    return _PhaseImages(sharp, direct, lit, total, albedo, unsmeared)
+
+
+def _offset(model: CameraModel, effects: Effects, ranges: Float64, time_s: float) -> Float64:
+    """Delays of pixels and of a warm camera move the phase, and so wrap with it."""
+    ranges = ranges + effects.pixel_offsets * sensor.pixel_offsets(model)
+    ranges += effects.thermal_drift * sensor.drift(model, time_s)
+    return np.mod(ranges, model.ambiguity_m)
+
+
+def _pixel_flags(
+    model: CameraModel,
+    grid: optics.RayGrid,
+    taps: list[_Light],
+    distance: Float64,
+    ranges: Float64,
+    expected: sensor.Measurement,
+) -> UInt16:
+    hit = np.isfinite(distance)
+    out = _bit(~hit, Flag.NO_RETURN)
+    weakest = max(model.minimum_amplitude, *model.confidence_thresholds[:1], 0.0)
+    out |= _bit(expected.amplitude < weakest, Flag.UNDER_EXPOSED)
+    out |= _bit(expected.saturated, Flag.SATURATED)
+    if grid.window > 1:
+        off = np.max([optics.off_plane(grid, tap.returns) for tap in taps], axis=0)
+        limit = np.maximum(_MIXED_M, _MIXED_SHARE * np.where(hit, distance, 0))
+        out |= _bit(off > limit, Flag.MIXED)
+    # Half of the shortest period that can be mistaken for another.
+    out |= _bit(
+        hit & (np.abs(ranges - np.where(hit, distance, 0)) > model.period_m / 2), Flag.WRAPPED
+    )
+    share = np.zeros(distance.shape)
+    for tap in taps:
+        strength = tap.returns.strength
+        if strength.shape[1] > 1:
+            whole = strength.sum(1)
+            part = strength[:, 1:].sum(1) / np.where(whole > 0, whole, 1)
+            fine = part.reshape(grid.directions.shape[:2])
+            share = np.maximum(share, fine[grid.centre])
+    return out | _bit(share > _MIRROR_SHARE, Flag.MIRROR)
+
+
+def _recorded(model: CameraModel, radial: Float64) -> Float32:
+    if model.depth_kind == "z":
+        radial = radial / ray_lengths(model.camera)
+    return np.where(np.isfinite(radial), radial, 0).astype(np.float32)
+
+
+def _frame(
+    model: CameraModel,
+    effects: Effects,
+    measured: sensor.Measurement,
+    index: int,
+    time_s: float,
+) -> RangeFrame:
+    depth = np.where(measured.saturated, 0, _recorded(model, measured.range_m))
+    if effects.under_exposure:
+        depth = np.where(measured.amplitude < model.minimum_amplitude, 0, depth)
+    counts = np.round(depth / model.depth_unit_m)
+    counts = np.where(counts < INVALID_DEPTH, counts, 0).astype(np.uint16)
+    return RangeFrame(
+        index,
+        time_s,
+        model.camera,
+        depth_from_counts(counts, model.depth_unit_m),
+        model.depth_kind,
+        sensor.reported_amplitude(model, measured),
+        sensor.reported_confidence(model, measured),
+        sigma_image=sensor.reported_sigma(model, measured),
+        amplitude_kind=model.amplitude_kind,
+        ambiguity_m=model.ambiguity_m,
+    )

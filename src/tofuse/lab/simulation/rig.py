@@ -1,0 +1,158 @@
+"""Several cameras at once: on one path, or still around what moves; each with its own clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.geometry import se3
+from tofuse.geometry.cameras import ray_lengths
+from tofuse.lab.simulation import scene as scenes
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.paths import Path, look_at, rotation
+from tofuse.lab.simulation.record import Plan
+from tofuse.recordings.frames import RangeFrame
+from tofuse.recordings.native import corrected_depth
+from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.sensor.models import CameraModel, camera_model
+
+_DEFAULT = Effects()
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """A camera of a rig.
+
+    Attributes
+    ----------
+    T_rig_camera
+        (4, 4) where it is.
+    model
+        What it is.
+    frame_rate_hz
+        How fast its own clock makes it run.
+    time_offset_s
+        The rig's time is the camera's timestamp plus this.
+    depth_offset_m
+        By how much its ranges are too long.
+    """
+
+    T_rig_camera: Float64 = field(default_factory=lambda: np.eye(4))
+    model: CameraModel = field(default_factory=lambda: camera_model("pico-flexx"))
+    frame_rate_hz: float = 30.0
+    time_offset_s: float = 0.0
+    depth_offset_m: float = 0.0
+
+    def sequence(self, rig: scenes.Sequence) -> scenes.Sequence:
+        """Return how this camera sees what happens in front of the rig."""
+
+        def later(path: Path) -> Path:
+            return lambda t: path(t + self.time_offset_s)
+
+        return replace(
+            rig,
+            frame_rate_hz=self.frame_rate_hz,
+            camera_path=lambda t: rig.camera_path(t + self.time_offset_s) @ self.T_rig_camera,
+            object_path=None if rig.object_path is None else later(rig.object_path),
+            passing_paths=tuple(map(later, rig.passing_paths)),
+        )
+
+
+def around(
+    centre: SequenceOf[float], radius: float, height: float, count: int, first_rad: float = np.pi
+) -> list[Float64]:
+    """(4, 4) T_room_camera of `count` cameras evenly around a point, facing it."""
+    angles = first_rad + 2 * np.pi * np.arange(count) / count
+    at = np.asarray(centre, float)
+    offsets = [np.array([radius * np.cos(a), radius * np.sin(a), height]) for a in angles]
+    return [look_at(at + offset, at) for offset in offsets]
+
+
+def relative(T_room_camera: SequenceOf[Float64]) -> list[Float64]:
+    """T_rig_camera of cameras that stand in a room: the first is the identity."""
+    first = se3.inverse(np.asarray(T_room_camera[0]))
+    return [np.eye(4), *(np.asarray(first @ T, np.float64) for T in T_room_camera[1:])]
+
+
+def simulate_rig(
+    scene: scenes.Scene,
+    sequence: scenes.Sequence,
+    mounts: SequenceOf[Mount],
+    *,
+    first_s: float = 0.0,
+    frames: int = 1,
+    every: int = 1,
+    effects: Effects = _DEFAULT,
+    seed: int = 0,
+) -> list[Recording]:
+    """Record with every camera of a rig, in memory; noise differs between them.
+
+    Parameters
+    ----------
+    scene, sequence
+        What there is, and how the rig (the sequence's camera) and the rest move.
+    first_s
+        Begin, in s of the rig's time; timestamps are those of the cameras' own clocks.
+    frames, every
+        How many images each camera takes, and every how manieth.
+    """
+    recordings = []
+    for k, mount in enumerate(mounts):
+        own = mount.sequence(sequence)
+        begin = int(np.ceil((first_s - mount.time_offset_s) * mount.frame_rate_hz - 1e-9))
+        raw = begin + every * np.arange(frames)
+        made = Plan(scene, own, mount.model, effects, 1000 * seed + k, raw)
+        taken = [_recorded(made, mount, rendered.frame) for rendered in made.frames(None)]
+        source = ArraySource(
+            taken,
+            made.poses,
+            metadata={
+                "frame_rate_hz": mount.frame_rate_hz,
+                "ambiguity_m": mount.model.ambiguity_m,
+                "amplitude_kind": mount.model.amplitude_kind,
+                "depth_kind": mount.model.depth_kind,
+            },
+        )
+        recordings.append(Recording.of(source, f"simulated camera {k}", "simulated"))
+    return recordings
+
+
+def _recorded(made: Plan, mount: Mount, frame: RangeFrame) -> RangeFrame:
+    """Take the factory's correction off an image, and add what is wrong with this camera."""
+    depth = corrected_depth(made.correction, frame.camera, frame.depth, frame.depth_kind)
+    if mount.depth_offset_m:
+        along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
+        depth = np.where(depth > 0, depth + mount.depth_offset_m * along, 0).astype(np.float32)
+    return replace(frame, depth=depth)
+
+
+def wander(
+    centre: SequenceOf[float], radii: SequenceOf[float], seconds: float, tilt_rad: float = 0.25
+) -> Path:
+    """A rig carried round a room: along an ellipse, turning once, tilted to and fro.
+
+    Parameters
+    ----------
+    centre, radii
+        (3,) and (2,) of the ellipse, m.
+    seconds
+        Of one round.
+    tilt_rad
+        By how much it is tilted about its line of sight, and up and down.
+    """
+    middle = np.asarray(centre, float)
+
+    def path(t: float) -> Float64:
+        u = 2 * np.pi * t / seconds
+        around = [radii[0] * np.cos(u), radii[1] * np.sin(u), 0.12 * np.sin(2.3 * u)]
+        at = np.add(middle, around)
+        heading = u + 0.5 * np.sin(1.7 * u)
+        ahead = np.add(at, [np.cos(heading), np.sin(heading), 0.0])
+        T = look_at(at, ahead)
+        tilts = tilt_rad * np.array([np.sin(3.1 * u + 0.4), 0.0, np.sin(2.3 * u)])
+        return np.asarray(T @ rotation([tilts[0], 0, 0]) @ rotation([0, 0, tilts[2]]), np.float64)
+
+    return path

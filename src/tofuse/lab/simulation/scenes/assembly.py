@@ -1,0 +1,73 @@
+"""Putting meshes and materials together, and what several scenes share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.simulation import paths
+from tofuse.lab.simulation.mesh import Mesh
+from tofuse.lab.simulation.texture import Material
+
+
+class Assembly:
+    """Collects parts, each of one material."""
+
+    def __init__(self, materials: list[Material]) -> None:
+        self.materials = materials
+        self._parts: list[Mesh] = []
+
+    def add(self, material: Material, *parts: Mesh) -> None:
+        """Add parts made of a material."""
+        surface = self._id(material)
+        self._parts.extend(part.of_surface(surface) for part in parts)
+
+    def add_mixed(self, materials: Sequence[Material], part: Mesh) -> None:
+        """Add one part whose surfaces are numbered as in `materials`."""
+        ids = np.array([self._id(material) for material in materials])
+        self._parts.append(replace(part, surface=ids[part.surface]))
+
+    def _id(self, material: Material) -> int:
+        if material not in self.materials:
+            self.materials.append(material)
+        return self.materials.index(material)
+
+    def mesh(self) -> Mesh:
+        """Return everything added so far."""
+        return meshes.joined(self._parts)
+
+
+def placed(position: tuple[float, float], yaw: float) -> Float64:
+    """Pose of furniture on the floor, turned about z."""
+    T = paths.rotation([0, 0, yaw])
+    T[:2, 3] = position
+    return T
+
+
+def shell(
+    assembly: Assembly,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    walls: list[Material],
+    floor: Material,
+    ceiling: Material,
+) -> None:
+    """Add a closed room between two corners; walls in the order -x, +x, -y, +y."""
+    hull = meshes.inside_out(meshes.box_between(low, high))
+    # The order of the faces of `box`: -z, +z, -y, +y, -x, +x, two triangles each.
+    for k, material in enumerate([floor, ceiling, walls[2], walls[3], walls[0], walls[1]]):
+        assembly.add(material, Mesh(hull.vertices, hull.faces[2 * k : 2 * k + 2], hull.surface[:2]))
+
+
+BACKDROP = Material("backdrop", 0.5, 0.15, "noise", (0.6, 0.6, 0.6))
+LINOLEUM = Material("linoleum", 0.4, 0.12, "speckle", (0.1, 0.1, 0.1))
+WHITE = Material("ceiling", 0.78)
+
+
+def studio(assembly: Assembly) -> None:
+    """Add a room around an object at the origin and a camera at -x: the background is 3 m off."""
+    shell(assembly, (-2.2, -2.6, 0), (3.0, 2.6, 2.6), [BACKDROP] * 4, LINOLEUM, WHITE)

@@ -1,0 +1,98 @@
+"""A printed checkerboard on a long wall, looked at from many places, standing still at each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.arrays import Float64
+from tofuse.geometry import se3
+from tofuse.lab.simulation import mesh as meshes
+from tofuse.lab.simulation import paths
+from tofuse.lab.simulation.paths import Path
+from tofuse.lab.simulation.scene import Plan, SceneOptions
+from tofuse.lab.simulation.scenes.assembly import Assembly
+from tofuse.lab.simulation.texture import Material
+
+# Inner corners, and the side of a square in m.
+COLUMNS, ROWS, SQUARE_M = 8, 6, 0.1
+# Of white paper around the squares, m; and how far paper and print lie before the wall.
+MARGIN_M, _PAPER_M = 0.08, 0.0005
+PLACES = 32
+SECONDS_EACH = 3.0
+# Of the time at each place, spent on the way to the next one.
+_MOVING = 0.8
+_HEIGHT = 1.5
+
+WALL = Material("wall", 0.6, 0.1, "noise", (0.5, 0.5, 0.5))
+PAPER = Material("paper", 0.85)
+INK = Material("ink", 0.12)
+
+
+def plan(options: SceneOptions) -> Plan:
+    """Lay out wall and board; the board's middle is at the height of the camera's."""
+    assembly = Assembly([])
+    assembly.add(WALL, meshes.quad((-60, 0, -60), (120, 0, 0), (0, 0, 120)))
+    width, height = (COLUMNS + 1) * SQUARE_M, (ROWS + 1) * SQUARE_M
+    left, low = -width / 2, _HEIGHT - height / 2
+    y = -_PAPER_M
+    m = MARGIN_M
+    for corner, size in (  # paper all around the squares
+        ((left - m, low - m), (width + 2 * m, m)),
+        ((left - m, low + height), (width + 2 * m, m)),
+        ((left - m, low), (m, height)),
+        ((left + width, low), (m, height)),
+    ):
+        assembly.add(PAPER, _upright(*corner, y, *size))
+    for row in range(ROWS + 1):
+        for column in range(COLUMNS + 1):
+            x, z = left + column * SQUARE_M, low + row * SQUARE_M
+            material = INK if (row + column) % 2 == 0 else PAPER
+            assembly.add(material, _upright(x, z, y, SQUARE_M, SQUARE_M))
+    return Plan(assembly.materials, assembly.mesh(), _stops(places(options.seed)))
+
+
+def _upright(x: float, z: float, y: float, width: float, height: float) -> meshes.Mesh:
+    return meshes.quad((x, y, z), (width, 0, 0), (0, 0, height))
+
+
+def places(seed: int) -> Float64:
+    """(PLACES, 4, 4) poses T_room_camera: all distances, tilts and parts of the image in turn."""
+    rng = np.random.default_rng([seed, 30])
+    # A narrow lens sees the whole board from 1.4 m on; a wide one fills its image from nearer.
+    near, middle = 6, 16
+    distance = np.concatenate(
+        [
+            rng.uniform(0.9, 1.3, near),
+            rng.uniform(1.4, 2.2, middle),
+            rng.uniform(2.2, 3.6, PLACES - near - middle),
+        ]
+    )[rng.permutation(PLACES)]
+    out = []
+    for k, d in enumerate(distance):
+        tilt = np.radians(rng.uniform(10, 45))
+        around = 2 * np.pi * (k * 0.382 + rng.uniform(0, 0.1))
+        direction = np.array(
+            [np.sin(tilt) * np.cos(around), -np.cos(tilt), np.sin(tilt) * np.sin(around)]
+        )
+        position = np.array([0, 0, _HEIGHT]) + d * direction
+        T = paths.look_at(position, (0, 0, _HEIGHT))
+        # Off the middle, as far as a narrow image has room at this distance, and rolled.
+        room = np.radians([21.0, 17.0]) - np.arctan([0.45 / d, 0.35 / d])
+        off = rng.uniform(-1, 1, 2) * np.maximum(room, np.radians(3)) * 0.9
+        roll = np.radians(rng.uniform(-20, 20))
+        out.append(T @ paths.rotation([off[1], off[0], 0]) @ paths.rotation([0, 0, roll]))
+    return np.stack(out)
+
+
+def _stops(poses: Float64) -> Path:
+    """Stand still at each pose in turn; between them, move with minimal jerk."""
+    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
+
+    def path(t: float) -> Float64:
+        place = min(max(t / SECONDS_EACH, 0.0), len(poses) - 1.0)
+        k = min(int(place), len(poses) - 2)
+        # Half of the rest before the way, half of it after.
+        share = paths.smooth_step((place - k - (1 - _MOVING) / 2) / _MOVING)
+        return np.asarray(poses[k] @ se3.exp(share * steps[k]))
+
+    return path

@@ -1,0 +1,138 @@
+"""Smooth bodies as blends of simple shapes, and their triangulation.
+
+A shape is a function that gives the (approximate) signed distance of points (..., 3) in m,
+negative inside. Shapes are blended by Quilez's polynomial smooth minimum, and triangulated by
+naive surface nets (Gibson 1998), which are closed wherever the shape lies inside the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofuse.arrays import Bool, Float64, Int64
+from tofuse.lab.simulation.mesh import Mesh
+
+Shape = Callable[[Float64], Float64]
+
+
+def ellipsoid(centre: ArrayLike, radii: ArrayLike) -> Shape:
+    """Ellipsoid along the axes; the distance is exact to first order at the surface."""
+    c, r = np.asarray(centre, float), np.asarray(radii, float)
+
+    def distance(p: Float64) -> Float64:
+        q = (p - c) / r
+        k0 = np.linalg.norm(q, axis=-1)
+        k1 = np.linalg.norm(q / r, axis=-1)
+        return k0 * (k0 - 1.0) / np.maximum(k1, 1e-9)
+
+    return distance
+
+
+def limb(start: ArrayLike, end: ArrayLike, radius: float, end_radius: float) -> Shape:
+    """Capsule whose radius changes evenly from start to end."""
+    a, b = np.asarray(start, float), np.asarray(end, float)
+    axis = b - a
+
+    def distance(p: Float64) -> Float64:
+        share = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
+        nearest = a + share[..., None] * axis
+        return np.linalg.norm(p - nearest, axis=-1) - (radius + share * (end_radius - radius))
+
+    return distance
+
+
+def blend(shapes: Sequence[tuple[Shape, float]]) -> Shape:
+    """Union of (shape, m over which it is blended with those before it)."""
+
+    def distance(p: Float64) -> Float64:
+        total = shapes[0][0](p)
+        for shape, width in shapes[1:]:
+            d = shape(p)
+            h = np.maximum(width - np.abs(total - d), 0.0) / width
+            total = np.minimum(total, d) - 0.25 * width * h * h
+        return total
+
+    return distance
+
+
+def surface_net(shape: Shape, low: ArrayLike, high: ArrayLike, step: float) -> Mesh:
+    """Triangulate a shape on a grid with cells of `step` m between two corners."""
+    start = np.asarray(low, float)
+    size = np.ceil((np.asarray(high, float) - start) / step).astype(int) + 1
+    axes = [start[k] + step * np.arange(size[k]) for k in range(3)]
+    value = shape(np.stack(np.meshgrid(*axes, indexing="ij"), -1))
+    inside = value < 0
+    cells = tuple(size - 1)
+
+    total = np.zeros((*cells, 3))
+    crossings = np.zeros(cells)
+    quads = []
+    index = np.arange(np.prod(cells)).reshape(cells)
+    for axis in range(3):
+        a = np.moveaxis(value, axis, 0)[:-1]
+        b = np.moveaxis(value, axis, 0)[1:]
+        cut = (a < 0) != (b < 0)
+        share = np.where(cut, a / np.where(cut, a - b, 1.0), 0.0)
+        cut, share = np.moveaxis(cut, 0, axis), np.moveaxis(share, 0, axis)
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        # Each cell has four edges along this axis.
+        for dj in (0, 1):
+            for dk in (0, 1):
+                window: list[slice] = [slice(None)] * 3
+                window[j] = slice(dj, cells[j] + dj)
+                window[k] = slice(dk, cells[k] + dk)
+                here, at = cut[tuple(window)], share[tuple(window)]
+                crossings += here
+                total[..., axis] += at
+                total[..., j] += dj * here
+                total[..., k] += dk * here
+        quads.append(_quads(cut, inside, index, axis))
+    used = np.flatnonzero(crossings.ravel())
+    corner = np.stack(np.unravel_index(used, cells), -1)
+    vertices = start + step * (corner + total.reshape(-1, 3)[used] / crossings.ravel()[used, None])
+    vertices = settled(shape, vertices, step)
+    number = np.full(index.size, -1)
+    number[used] = np.arange(len(used))
+    q = number[np.concatenate(quads)]
+    # The shorter diagonal bends less.
+    p = vertices[q]
+    short = np.linalg.norm(p[:, 0] - p[:, 2], axis=1) <= np.linalg.norm(p[:, 1] - p[:, 3], axis=1)
+    first = np.where(short[:, None], q[:, [0, 1, 2]], q[:, [0, 1, 3]])
+    second = np.where(short[:, None], q[:, [0, 2, 3]], q[:, [1, 2, 3]])
+    return Mesh.of(vertices, np.concatenate([first, second]))
+
+
+def _quads(cut: Bool, inside: Bool, index: Int64, axis: int) -> Int64:
+    """(Q, 4) cells around each cut edge along an axis, counter-clockwise seen from outside."""
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    window: list[slice] = [slice(None)] * 3
+    window[j], window[k] = slice(1, -1), slice(1, -1)
+    where = np.argwhere(cut[tuple(window)])
+    where[:, [j, k]] += 1
+    around = []
+    for dj, dk in ((-1, -1), (0, -1), (0, 0), (-1, 0)):
+        cell = where.copy()
+        cell[:, j] += dj
+        cell[:, k] += dk
+        around.append(index[tuple(cell.T)])
+    quads = np.stack(around, -1)
+    outward = inside[tuple(where.T)]
+    return np.where(outward[:, None], quads, quads[:, ::-1])
+
+
+def settled(shape: Shape, vertices: Float64, step: float) -> Float64:
+    """Move vertices onto the surface along its gradient, by no more than half a cell."""
+    moved = vertices
+    h = 1e-4
+    for _ in range(3):
+        slope = np.stack(
+            [(shape(moved + e) - shape(moved - e)) / (2 * h) for e in h * np.eye(3)], -1
+        )
+        norm2 = np.maximum((slope * slope).sum(-1), 0.05)
+        moved = moved - (shape(moved) / norm2)[:, None] * slope
+    away = moved - vertices
+    length = np.linalg.norm(away, axis=-1, keepdims=True)
+    return vertices + away * np.minimum(1.0, 0.5 * step / np.maximum(length, 1e-12))

@@ -1,0 +1,241 @@
+"""From the light in each pixel to what the camera reports: four phase images and their sums.
+
+Phase image k correlates the light with the signal shifted by ``theta_k = k pi / 2`` in two
+buckets, whose difference is ``D_k = m sum s c(phase - theta_k)`` electrons with the correlation
+``c(x) = cos x + h3 cos 3x + h5 cos 5x`` (Lange 2000; Lindner et al. 2010 for the harmonics). The
+phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` has the range in its angle and the amplitude in its
+length (eq 2.2). As the third and fifth harmonic are aliased onto the first by four samples, the
+range errs with four periods to one of the phase: wiggling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt8
+from tofuse.lab.simulation.effects import Effects
+from tofuse.recordings.frames import SATURATED_AMPLITUDE
+from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
+
+TAPS = 4
+
+
+def correlate(light: Float64, tap: int, harmonics: tuple[float, float]) -> Float64:
+    """Correlation (H, W) of light (H, W, 7) (channels of `kernels.phasor`) in a phase image."""
+    # Multiples of a right angle, exactly.
+    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[tap]
+    third = harmonics[0] * (light[..., 3] * cosine - light[..., 4] * sine)
+    fifth = harmonics[1] * (light[..., 5] * cosine + light[..., 6] * sine)
+    return light[..., 1] * cosine + light[..., 2] * sine + third + fifth
+
+
+def phasor_of(differences: Float64) -> Complex128:
+    """Phasor (...) of the bucket differences (4, ...)."""
+    return (differences[0] - differences[2] + 1j * (differences[1] - differences[3])) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Expected light of all phase images, relative to a white wall at 1 m.
+
+    Attributes
+    ----------
+    difference
+        (F, 4, H, W) correlation, for each frequency and phase image.
+    total
+        (F, 4, H, W) all modulated light.
+    ambient
+        (H, W) light that is not modulated, relative to a white wall in a bright office.
+    """
+
+    difference: Float64
+    total: Float64
+    ambient: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What the camera makes of an exposure.
+
+    Attributes
+    ----------
+    range_m
+        (H, W) radial range in m, 0 where dropped; neither corrected nor rounded.
+    amplitude
+        (H, W) raw counts.
+    saturated
+        (H, W) mask.
+    """
+
+    range_m: Float64
+    amplitude: Float64
+    saturated: Bool
+
+
+def expose(
+    model: CameraModel, effects: Effects, exposure: Exposure, rng: np.random.Generator | None
+) -> Measurement:
+    """Fill the buckets and read them out.
+
+    Parameters
+    ----------
+    rng
+        Source of noise; None for the expected values.
+    """
+    signal = model.signal_electrons * exposure.total
+    ambient = effects.ambient * model.ambient_electrons * exposure.ambient
+    difference = model.signal_electrons * model.modulation_contrast * exposure.difference
+    if rng is None or not effects.shot_noise:
+        buckets = (signal + ambient + difference) / 2, (signal + ambient - difference) / 2
+    else:
+        buckets = _noisy(model, effects, signal + ambient, difference, rng)
+    a, b = buckets
+    saturated: Bool = np.zeros(a.shape[2:], bool)
+    if effects.saturation:
+        full = np.maximum(a, b) >= model.full_well_electrons
+        saturated = np.asarray(full.any((0, 1)))
+        a, b = np.minimum(a, model.full_well_electrons), np.minimum(b, model.full_well_electrons)
+    share = (a + b) / (2 * model.full_well_electrons)
+    read = (a - b) * (1 - effects.amplitude_nonlinearity * model.compression * share)
+    phasors = phasor_of(np.moveaxis(read, 1, 0))
+    amplitude = np.abs(phasors[0]) * model.counts_per_electron
+    return Measurement(unwrapped(model, phasors), amplitude, saturated)
+
+
+def unwrapped(model: CameraModel, phasors: Complex128) -> Float64:
+    """Range (H, W) in m of phasors (F, H, W): the fine one's, in the period of the coarse one."""
+    turns = np.mod(np.angle(phasors) / (2 * np.pi), 1)
+    fine = turns[0] * model.period_m
+    if model.unwrap_hz is None:
+        return fine
+    coarse = turns[1] * model.ambiguity_m
+    periods = np.round((coarse - fine) / model.period_m)
+    return np.mod(fine + periods * model.period_m, model.ambiguity_m)
+
+
+def _noisy(
+    model: CameraModel,
+    effects: Effects,
+    electrons: Float64,
+    difference: Float64,
+    rng: np.random.Generator,
+) -> tuple[Float64, Float64]:
+    mean_a = np.maximum((electrons + difference) / 2, 0)
+    mean_b = np.maximum((electrons - difference) / 2, 0)
+    read = model.read_noise_electrons
+    if effects.noise == "poisson":
+        a = rng.poisson(mean_a) + rng.normal(0, read, mean_a.shape)
+        b = rng.poisson(mean_b) + rng.normal(0, read, mean_b.shape)
+        return a, b
+    # A factor that all phase images of a pixel share makes the tails of the range heavy
+    # (Student's t with 5 degrees).
+    shape = mean_a.shape[2:]
+    tails = np.sqrt(3 / rng.chisquare(5, shape))
+    gain = _noise_gain(shape) * tails
+    a, b = (
+        mean + gain * np.sqrt(mean + read**2) * _alike(rng, mean.shape) for mean in (mean_a, mean_b)
+    )
+    return a, b
+
+
+@cache
+def _noise_gain(shape: tuple[int, ...]) -> Float64:
+    """Factor on the noise of each pixel, log-normal with mean square 1: some pixels are bad."""
+    spread = 0.35
+    return np.exp(np.random.default_rng([90210]).normal(0, spread, shape) - spread**2)
+
+
+def _alike(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
+    """Normal noise of unit variance, half of which a pixel shares with its neighbours."""
+    own, other = rng.normal(size=shape), rng.normal(size=shape)
+    shifts = [np.roll(other, shift, (-2, -1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))]
+    return (own + sum(shifts) / 2) / np.sqrt(2)
+
+
+@cache
+def pixel_offsets(model: CameraModel) -> Float64:
+    """Range offset (H, W) in m of each pixel: along the read-out chain, and at random."""
+    height, width = model.camera.height, model.camera.width
+    ramp = np.linspace(-0.5, 0.5, width) + 0.25 * np.linspace(-0.5, 0.5, height)[:, None]
+    random = np.random.default_rng([height, width]).normal(0, model.pixel_delay_m, (height, width))
+    return model.readout_delay_m * ramp + random
+
+
+def drift(model: CameraModel, time_s: float) -> float:
+    """Range offset in m of a camera that was switched on at time 0."""
+    return model.drift_m * (1 - float(np.exp(-max(time_s, 0.0) / model.drift_time_s)))
+
+
+def calibrated(model: CameraModel, effects: Effects) -> DepthCorrection:
+    """Calibrate the camera: the correction that it ships with.
+
+    All pixels are shown one known range after another without noise, scattering or bounces, which
+    gives the curve; the offset of each pixel is what remains at one of them.
+    """
+    per_period = 96
+    count = per_period * round(model.ambiguity_m / model.period_m)
+    true = (np.arange(count) + 0.5) / count * model.ambiguity_m
+    measured = _of_known_range(model, effects, true)
+    bias = np.mod(measured - true + model.ambiguity_m / 2, model.ambiguity_m)
+    bias -= model.ambiguity_m / 2
+    order = np.argsort(measured)
+    knots, curve = measured[order], bias[order]
+    keep = np.concatenate([[True], np.diff(knots) > 0])
+    offsets = effects.pixel_offsets * pixel_offsets(model)
+    return DepthCorrection(knots[keep], curve[keep], offsets.astype(np.float32))
+
+
+def _of_known_range(model: CameraModel, effects: Effects, true: Float64) -> Float64:
+    harmonics = scaled_harmonics(model, effects)
+    phasors = []
+    for frequency in model.frequencies:
+        phase = 4 * np.pi * frequency / SPEED_OF_LIGHT * true
+        light = np.stack(
+            [
+                np.ones_like(phase),
+                *(part(n * phase) for n in (1, 3, 5) for part in (np.cos, np.sin)),
+            ],
+            -1,
+        )
+        phasors.append(phasor_of(np.stack([correlate(light, k, harmonics) for k in range(TAPS)])))
+    return unwrapped(model, np.stack(phasors))
+
+
+def scaled_harmonics(model: CameraModel, effects: Effects) -> tuple[float, float]:
+    """Harmonics of the correlation, as strong as the effects say."""
+    return model.harmonics[0] * effects.wiggling, model.harmonics[1] * effects.wiggling
+
+
+def reported_amplitude(model: CameraModel, measurement: Measurement) -> Float32:
+    """Amplitude image (H, W) in the camera's counts, whole numbers up to 65534, or saturated."""
+    amplitude = measurement.amplitude
+    if model.amplitude_kind == "range_compensated":
+        light = np.maximum(model.transmission, 1e-6)
+        amplitude = amplitude * measurement.range_m**2 / light
+    counts = np.clip(np.round(amplitude), 0, SATURATED_AMPLITUDE - 1)
+    return np.where(measurement.saturated, SATURATED_AMPLITUDE, counts).astype(np.float32)
+
+
+def reported_confidence(model: CameraModel, measurement: Measurement) -> UInt8 | None:
+    """Confidence (H, W): how many thresholds the raw amplitude passes; 0 where saturated."""
+    if not model.confidence_thresholds:
+        return None
+    level = np.searchsorted(model.confidence_thresholds, measurement.amplitude, side="right")
+    return np.where(measurement.saturated, 0, level).astype(np.uint8)
+
+
+def reported_sigma(model: CameraModel, measurement: Measurement) -> Float32 | None:
+    """Standard deviation (H, W) in m of the range that the camera itself states, or None.
+
+    What it can know: its read-out noise and the shot noise of the amplitude that it measured.
+    """
+    if not model.reports_noise:
+        return None
+    signal = np.maximum(measurement.amplitude / model.counts_per_electron, 1e-3)
+    electrons = signal / model.modulation_contrast + 2 * model.read_noise_electrons**2
+    phase = np.sqrt(electrons / 2) / signal
+    return (np.minimum(phase, 1.8) * model.period_m / (2 * np.pi)).astype(np.float32)
