@@ -24,15 +24,15 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.filters.multipath import Multipath
+from tofuse.corrections.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit
@@ -99,7 +99,7 @@ class Outcome:
 
 
 def outcome(
-    kind: str, seed: int, views: list[SurfaceMap], poses: list[Float64], pair: tuple[int, int]
+    kind: str, seed: int, views: list[PreparedView], poses: list[Float64], pair: tuple[int, int]
 ) -> Outcome | None:
     a, b = pair
     options = ProjectiveOptions()
@@ -169,7 +169,7 @@ def main() -> None:
             if arguments.compensate:
                 compensation = Multipath().start()
                 frames = [compensation.apply(frame) for frame in frames]  # type: ignore[misc]
-            views = [surface_map(frame, SurfaceOptions()) for frame in frames]
+            views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
             for pair in PAIRS:
                 got = outcome(kind, seed, views, made.T_room_camera, pair)
                 if got is None:

@@ -28,15 +28,15 @@ import numpy as np
 
 from covariance import KINDS
 from tofuse.arrays import Bool, Float64
-from tofuse.filters.multipath import Multipath
+from tofuse.corrections.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import Scene, build
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.native import corrected_depth
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import covariance
 from tofuse.sensor.models import CameraModel, camera_model
@@ -131,7 +131,7 @@ def sigma_along(information: Float64, direction: Float64) -> float:
 
 
 def comes_back(
-    views: Sequence[SurfaceMap], T: Float64, direction: Float64, options: ProjectiveOptions
+    views: Sequence[PreparedView], T: Float64, direction: Float64, options: ProjectiveOptions
 ) -> bool:
     """Whether the images themselves hold a direction: see above."""
     free = replace(options, levels=PATIENT, held=1e6, common_tilt=0.0, prior_m=3.0, prior_rad=3.0)
@@ -177,7 +177,7 @@ def main() -> None:
                 raw = render(scene, sequence, model, index, effects=effects, seed=seed).frame
                 depth = corrected_depth(factory, raw.camera, raw.depth, raw.depth_kind)
                 frame = compensation.apply(replace(raw, depth=depth))
-                views.append(surface_map(frame, SurfaceOptions()))
+                views.append(prepare_view(frame, SurfaceOptions()))
                 poses.append(sequence.T_room_camera(index / sequence.frame_rate_hz))
             T = se3.inverse(poses[0]) @ poses[1]
             truths = true_information(scene, model, poses[1], T)

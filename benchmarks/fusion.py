@@ -38,10 +38,10 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.arrays import Bool, Float64
+from tofuse.corrections.multipath import Multipath
 from tofuse.evaluation.surface import Shape, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
-from tofuse.filters.multipath import Multipath
 from tofuse.fusion.kept import KeptViews
 from tofuse.fusion.layout import Layout
 from tofuse.fusion.mesh import Mesh
@@ -53,11 +53,11 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import corrected_depth
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 _NOISE = Effects.none(shot_noise=True, ambient=1.0, saturation=True, mixed_pixels=True, wrap=True)
 _NOISE_SHARE = 0.01  # of the range
@@ -109,7 +109,7 @@ def views_of(
     for frame in frames:
         for corrector in correctors:
             frame = corrector.apply(frame)
-        surface = surface_map(frame, SurfaceOptions())
+        surface = prepare_view(frame, SurfaceOptions())
         clean, _ = apply_filters(config.model_filters, frame, ())
         assert isinstance(clean, RangeFrame)
         views.append(RangeView.of(clean, surface))
@@ -170,7 +170,7 @@ def long_run(count: int) -> None:
     )
     for frame, T in around_the_room(count):
         poses[frame.index] = T
-        surface = surface_map(frame, SurfaceOptions())
+        surface = prepare_view(frame, SurfaceOptions())
         started = time.process_time()
         builder.add(frame, surface, 0)
         kept_s.append(time.process_time() - started)
@@ -220,7 +220,7 @@ def within(path: Path, count: int, memory_mb: int) -> None:
     with threads(1), path.open("rb") as file:
         for _ in range(count):
             frame, T = pickle.load(file)
-            views.add(RangeView.of(frame, surface_map(frame, SurfaceOptions())))
+            views.add(RangeView.of(frame, prepare_view(frame, SurfaceOptions())))
             poses.append(T)
         T_world = np.array(poses)
         layout = Layout.of(views, T_world, fitting_voxel(views), options)

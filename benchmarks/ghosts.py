@@ -36,7 +36,6 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import Plan, plan, write
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.learn import learnt
 from tofuse.pipeline.preparation import Preparation
@@ -44,6 +43,7 @@ from tofuse.pipeline.reconstruct import fitted, reconstruct
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 OUT = sequences.OUT / "recordings" / "ghosts"
 WALKS = (
@@ -169,7 +169,7 @@ def at_true_poses(recording: Recording) -> Mesh:
         preparation.placed(ready.filtered, T)
         assert isinstance(ready.filtered, RangeFrame)
         assert isinstance(ready.clean, RangeFrame)
-        surface = surface_map(ready.filtered, SurfaceOptions())
+        surface = prepare_view(ready.filtered, SurfaceOptions())
         views.append(RangeView.of(ready.clean, surface))
     return fuse_surface(views, recording.reference, config.fusion)
 

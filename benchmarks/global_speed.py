@@ -29,7 +29,6 @@ import numpy as np
 import sequences
 from tofuse.fusion.options import Fusion
 from tofuse.kernels.threads import run_chunks, threads
-from tofuse.maps.surface_map import SurfaceMap, surface_map
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
@@ -37,6 +36,7 @@ from tofuse.pipeline.progress import Stopwatch
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.search import SearchOptions, search
 from tofuse.results.types import Reconstruction
 
@@ -77,13 +77,13 @@ def mapped(frames: list[RangeFrame], count: int) -> tuple[Reconstruction, BothTi
 def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     """Align and verify pairs of views that overlap by a half, as if they were loops."""
     closer = Revisits(spacing=Spacing(0.03, 0.015, 200))
-    store: ViewStore[SurfaceMap] = ViewStore(closer.spacing)
+    store: ViewStore[PreparedView] = ViewStore(closer.spacing)
     loops = closer.start(0, (), store)
     poses = result.diagnostics.sequential
     options = Keyframes().surface
     for k, frame in enumerate(there_and_back(frames, len(frames))):
         if result.has_pose[k]:
-            surface = surface_map(frame, options).thinned(200)
+            surface = prepare_view(frame, options).thinned(200)
             store.push(surface, poses[k])
             loops.push(frame, poses[k])
     views = [KeptView.of(posed.view, 600) for posed in store.views]
@@ -143,7 +143,7 @@ def main(arguments: list[str] | None = None) -> int:
             f"{'pairs':>6} {'refinement':>13} {'ms a pair':>10} {'all':>13}"
         )
         mapped(frames, 30)
-        ends = [surface_map(frames[k], Keyframes().surface) for k in (0, -1)]
+        ends = [prepare_view(frames[k], Keyframes().surface) for k in (0, -1)]
         search(ends[0], ends[1], SearchOptions(mode="both"))
         for count in options.frames:
             result, watch = mapped(frames, count)

@@ -31,12 +31,12 @@ import sequences
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.features import Features
 from tofuse.registration.fpfh import Fpfh
 from tofuse.registration.plane_sets import PlaneSets
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.view_pair import register_pair
 
@@ -96,7 +96,7 @@ class Outcome:
 @dataclass(frozen=True)
 class Views:
     steps: Steps
-    views: list[SurfaceMap]
+    views: list[PreparedView]
     reference: Float64
 
 
@@ -106,7 +106,7 @@ sequence_of = lru_cache(maxsize=1)(sequences.load)
 def load(steps: Steps, data: Path) -> Views:
     sequence = sequence_of(steps.sequence, data)
     chosen = steps.choose(sequence.reference)
-    views = [surface_map(sequence.frames[k], SurfaceOptions()) for k in chosen]
+    views = [prepare_view(sequence.frames[k], SurfaceOptions()) for k in chosen]
     return Views(steps, views, sequence.reference[chosen])
 
 
@@ -120,7 +120,7 @@ def without_albedo(taken: Views) -> Views:
 
 
 def look(
-    source: SurfaceMap, target: SurfaceMap, true: Float64 | None, options: SearchOptions
+    source: PreparedView, target: PreparedView, true: Float64 | None, options: SearchOptions
 ) -> Outcome:
     """Search for one pair on one core."""
     with threads(1):
@@ -199,7 +199,7 @@ Method = Callable[[RangeFrame, RangeFrame], Float64 | None]
 def searched(source: RangeFrame, target: RangeFrame) -> Float64 | None:
     """The pose that the exhaustive search finds, if it is believed."""
     options = SurfaceOptions()
-    views = surface_map(source, options), surface_map(target, options)
+    views = prepare_view(source, options), prepare_view(target, options)
     found = register_pair(*views, options=SearchOptions(), always_search=True)
     return found.T_target_source if found is not None and found.believed else None
 

@@ -30,8 +30,8 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
+from tofuse.corrections.multipath import Multipath, MultipathCorrector
 from tofuse.evaluation.trajectory import evaluate_trajectory
-from tofuse.filters.multipath import Multipath, MultipathCorrector
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import record

@@ -41,7 +41,6 @@ from sequences import DATA, OUT, kinect_loop
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.lab.simulation.record import simulate
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
@@ -50,6 +49,7 @@ from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import Registration
 from tofuse.registration.cloud_pair import register_clouds
 from tofuse.registration.confidence import BELIEVED, RIGHT_RAD, RIGHT_SHARE, Evidence, logistic
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.view_pair import follow, register_pair
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
@@ -229,7 +229,7 @@ def followed(source: RangeFrame, target: RangeFrame) -> Registration:
 
 def searched(source: RangeFrame, target: RangeFrame) -> Registration:
     """Search the images alone."""
-    maps = (surface_map(frame, SurfaceOptions()) for frame in (source, target))
+    maps = (prepare_view(frame, SurfaceOptions()) for frame in (source, target))
     found = register_pair(*maps, always_search=True)
     if found is None:
         raise RegistrationError("has too few surfaces", where=f"frame {source.index}")
@@ -396,18 +396,18 @@ def samples(most: int, data: Path) -> tuple[Samples, Samples]:
     return stacked(searched), stacked(followed)
 
 
-def _prepared(name: str, data: Path) -> tuple[list[SurfaceMap], Float64]:
+def _prepared(name: str, data: Path) -> tuple[list[PreparedView], Float64]:
     recording = opened(name, data)
     assert recording.reference is not None
     frames = [frame for frame in recording if isinstance(frame, RangeFrame)]
-    return [surface_map(frame, SurfaceOptions()) for frame in frames], recording.reference
+    return [prepare_view(frame, SurfaceOptions()) for frame in frames], recording.reference
 
 
 def _add(
     searched: list[tuple[Float64, bool, int]],
     followed: list[tuple[Float64, bool, int]],
-    source: SurfaceMap,
-    target: SurfaceMap,
+    source: PreparedView,
+    target: PreparedView,
     true: Float64 | None,
     scene: int,
     rng: np.random.Generator,

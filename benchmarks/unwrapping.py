@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.filters.unwrap import Unwrap
+from tofuse.corrections.unwrap import Unwrap
 from tofuse.geometry.cameras import range_from_z
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan

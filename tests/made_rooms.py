@@ -9,8 +9,8 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]
 
@@ -99,6 +99,6 @@ def seen(
     )
 
 
-def surface(frame: RangeFrame) -> SurfaceMap:
+def surface(frame: RangeFrame) -> PreparedView:
     """The view as the tests prepare it: small windows for small images."""
-    return surface_map(frame, SurfaceOptions(radii=(2,)))
+    return prepare_view(frame, SurfaceOptions(radii=(2,)))

@@ -21,7 +21,7 @@ from tofuse.lab.simulation.sensor import calibrated
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.models import camera_model
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)

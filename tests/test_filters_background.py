@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tofuse.corrections.scattering import LensScattering
 from tofuse.errors import InputError
 from tofuse.filters.background import Background
 from tofuse.filters.mask import Mask
-from tofuse.filters.scattering import LensScattering
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from tofuse.lab.simulation.scenes import box

@@ -27,9 +27,9 @@ from tofuse.kernels.blocks import (
     voxel_of,
 )
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 
 EYE = np.eye(4)
 CAMERA = BrownConrady(88, 72, 90.0, 90.0, 43.0, 36.0, -0.2, 0.05)
@@ -650,7 +650,7 @@ def test_filters_that_thin_out_are_overruled_on_planes_but_not_those_that_cut_of
     frame = half_dark(rng)
     mask = rng.random(frame.valid.shape) < 0.4
     mask[:, :20] = False
-    view = RangeView.of(frame.keep(mask), surface_map(frame, SurfaceOptions()))
+    view = RangeView.of(frame.keep(mask), prepare_view(frame, SurfaceOptions()))
     assert (view.strength[4:-4, 24:-4] > 0).mean() > 0.93
     assert not view.strength[:, :18].any()
 

@@ -10,8 +10,8 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import refinement as kernels
-from tofuse.maps.surface_map import Smoothed, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import Smoothed, SurfaceOptions, prepare_view
 from tofuse.registration.projective import points_of
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
@@ -52,8 +52,8 @@ def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.
 
 def evaluate(source, target, T, errors=None, known=KNOWN, settings=SETTINGS):
     out = np.empty(kernels.SIZE)
-    surface = surface_map(target, SHARP)
-    points = points_of(surface_map(source, SHARP), 1)
+    surface = prepare_view(target, SHARP)
+    points = points_of(prepare_view(source, SHARP), 1)
     kernels.pair_equations(
         points,
         surface.target,
@@ -142,8 +142,8 @@ def test_free_space_and_support_are_counted(pair):
 
 def test_overlap_counts_what_both_see_from_the_same_side(pair):
     source, target, T = pair
-    surface = surface_map(target, SurfaceOptions(radii=(2,)))
-    points = points_of(surface_map(source, SurfaceOptions(radii=(2,))), 2)
+    surface = prepare_view(target, SurfaceOptions(radii=(2,)))
+    points = points_of(prepare_view(source, SurfaceOptions(radii=(2,))), 2)
 
     def share(pose, cosine=0.5, least=0.0):
         out = np.empty(1)

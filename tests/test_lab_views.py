@@ -15,9 +15,9 @@ from tofuse.lab.methods.bergevin import Bergevin
 from tofuse.lab.methods.multiview import Cloud, Pairs, relaxed, squared_error
 from tofuse.lab.methods.pulli import Pulli, spread
 from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.refinement import Refining
 from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.registration.prepared_view import PreparedView
 
 METHODS = [Bergevin(), Pulli(), WilliamsBennamoun(), SmallAngles()]
 VIEWS = 8
@@ -94,7 +94,7 @@ def test_the_error_of_a_closed_chain_is_taken_out(method):
 def test_as_a_refinement_frames_in_between_follow(method):
     T, clouds = ring()
     start = drifted(T)
-    refiner = replace(method, points=2000).start(ViewStore[SurfaceMap](Spacing()))
+    refiner = replace(method, points=2000).start(ViewStore[PreparedView](Spacing()))
     for cloud, pose in zip(clouds, start, strict=True):
         refiner.push(cloud, pose)
     found = refiner.finish([c.index for c in clouds], start)
@@ -106,7 +106,7 @@ def test_as_a_refinement_frames_in_between_follow(method):
 
 @pytest.mark.parametrize("method", METHODS, ids=parts.name_of)
 def test_views_that_share_nothing_stay(method):
-    refiner = method.start(ViewStore[SurfaceMap](Spacing()))
+    refiner = method.start(ViewStore[PreparedView](Spacing()))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 50.0
     for k in range(2):
@@ -114,7 +114,7 @@ def test_views_that_share_nothing_stay(method):
     found = refiner.finish([0, 1], poses)
     assert not found.kept
     np.testing.assert_array_equal(found.poses, poses)
-    alone = method.start(ViewStore[SurfaceMap](Spacing())).finish([0], poses[:1])
+    alone = method.start(ViewStore[PreparedView](Spacing())).finish([0], poses[:1])
     assert not alone.kept
 
 

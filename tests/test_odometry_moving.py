@@ -16,7 +16,6 @@ from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.moving import (
     Moving,
     MovingObjects,
@@ -27,6 +26,7 @@ from tofuse.odometry.moving import (
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import agreement
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.sensor.models import camera_model
 
@@ -52,7 +52,7 @@ def room():
         for n, k in enumerate(indices)
     ]
     poses = [path.T_world_camera(k / FRAME_RATE_HZ, 0.0) for k in indices]
-    view, frame = surface_map(frames[0], SurfaceOptions()), frames[0]
+    view, frame = prepare_view(frames[0], SurfaceOptions()), frames[0]
     known = (view.planes[..., 3] > 0) & frame.valid
     squared = (frame.z * ray_lengths(frame.camera))[known] ** 2
     noise = float(np.median(view.sigma[known] * frame.amplitude_image[known] / squared))
@@ -99,7 +99,7 @@ def trajectory(motion, cover, frame):
 
 def segment(frames, poses, options=None):
     """Segment each frame against keyframes as a tracker takes them; views and what was found."""
-    views = [surface_map(frame, SurfaceOptions()) for frame in frames]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
     objects, key, found = MovingObjects(options), 0, []
     for n in range(1, len(frames)):
         predicted = objects.predicted_mask(poses[n], views[n])
@@ -184,7 +184,7 @@ def test_an_object_that_stops_becomes_static(room):
     made = [
         with_box(frame, centres[min(n, 8) * 2], half, noise, n)[0] for n, frame in enumerate(frames)
     ]
-    views = [surface_map(frame, SurfaceOptions()) for frame in made]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in made]
     objects = MovingObjects()
     fractions = [
         followed(objects, views[n], poses[n], views[0 if n < 12 else 11], poses[0]).fraction
@@ -201,7 +201,7 @@ def test_leaving_out_what_moves_keeps_the_pose(room):
         with_box(frame, centre, half, noise, n)[0]
         for n, (frame, centre) in enumerate(zip(frames, centres, strict=True))
     ]
-    views = [surface_map(frame, SurfaceOptions()) for frame in made]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in made]
     objects, n = MovingObjects(), 6
     for k in range(1, n):
         followed(objects, views[k], poses[k], views[0], poses[0])
@@ -231,7 +231,7 @@ def test_a_wrong_pose_is_no_motion(room, metres, degrees):
         np.r_[np.array([0.8, -0.4, 0.4]) * metres, np.radians(degrees) * np.array([0.3, 0.9, 0.3])]
     )
     wrong = [T if n < 10 else T @ off for n, T in enumerate(poses)]
-    views = [surface_map(frame, SurfaceOptions()) for frame in frames]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
     objects = MovingObjects()
     for n in range(1, 13):
         key = 0 if n < 7 else 6
@@ -243,7 +243,7 @@ def test_a_wrong_pose_is_no_motion(room, metres, degrees):
 
 def test_nothing_is_learnt_from_a_pair_that_disagrees():
     views = [
-        surface_map(wall(depth, index), SurfaceOptions()) for index, depth in enumerate([2, 2, 1])
+        prepare_view(wall(depth, index), SurfaceOptions()) for index, depth in enumerate([2, 2, 1])
     ]
     objects = MovingObjects()
     still = np.eye(4)
@@ -259,7 +259,7 @@ def test_a_pose_can_be_tried_without_learning_from_it(room):
     frames, poses, noise = room
     centres, half = trajectory("towards", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(9)]
-    views = [surface_map(frame, SurfaceOptions()) for frame in made]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in made]
     off = se3.exp([0.05, 0.03, 0.05, 0.02, 0.03, 0.01])
     tried, untried = MovingObjects(), MovingObjects()
     for n in range(1, 9):
@@ -278,7 +278,7 @@ def test_keyframes_keep_what_was_learnt_and_are_forgotten_when_there_are_too_man
     frames, poses, noise = room
     centres, half = trajectory("sideways", 0.25, frames[0])
     made = [with_box(frames[n], centres[n], half, noise, n)[0] for n in range(10)]
-    views = [surface_map(frame, SurfaceOptions()) for frame in made]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in made]
     objects = MovingObjects(MovingOptions(keyframes=1))
     for n in range(1, 9):
         moving = followed(objects, views[n], poses[n], views[0], poses[0])
@@ -317,7 +317,7 @@ def wall(depth, index=0):
 
 def test_pixels_left_out_have_no_surface_but_free_space_up_to_them(room):
     frames, poses, _ = room
-    view, other = (surface_map(frames[n], SurfaceOptions()) for n in (0, 1))
+    view, other = (prepare_view(frames[n], SurfaceOptions()) for n in (0, 1))
     mask = np.zeros(view.z.shape, bool)
     mask[:, :80] = True
     rest = without_pixels(view, mask)
@@ -377,7 +377,7 @@ def pair(seed=3):
         z += rng.normal(0, 0.003, z.shape)
         z[rng.random(z.shape) < 0.03] = 0
         frame = RangeFrame(k, float(k), camera, z.astype(np.float32))
-        views.append(surface_map(frame, SurfaceOptions()))
+        views.append(prepare_view(frame, SurfaceOptions()))
     return camera, views[1], views[0], T
 
 
@@ -557,7 +557,7 @@ def test_carry_and_predict_are_their_twins():
 
 def test_a_person_who_turns_before_a_still_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
-    views = [surface_map(frame, SurfaceOptions()) for frame in frames]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
     objects, still = MovingObjects(), np.eye(4)
     found = [followed(objects, view, still, views[0], still) for view in views[1:]]
     # The person is what is nearer than the wall.
@@ -572,7 +572,7 @@ def test_a_person_who_turns_before_a_still_camera_is_segmented(shared_data):
 def test_a_static_kitchen_does_not_move(shared_data):
     recording = open_recording(shared_data / "sevenscenes_kitchen")
     frames = [frame for _, frame in zip(range(40), recording, strict=False)][::4]
-    views = [surface_map(frame, SurfaceOptions()) for frame in frames]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in frames]
     T = [np.eye(4)]
     for k in range(1, len(views)):
         target = Target(views[0], se3.inverse(T[0]))

@@ -9,8 +9,8 @@ import pytest
 
 from made_rooms import CAMERA, at, seen
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceOptions
 from tofuse.odometry.keyframes import Keyframes
+from tofuse.registration.prepared_view import SurfaceOptions
 
 OPTIONS = Keyframes(surface=SurfaceOptions(radii=(2,)))
 # A camera that walks along and turns slowly.

@@ -11,12 +11,12 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.falloff import estimate_falloff
 from tofuse.pipeline.learn import learnt
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.sensor.models import camera_model
 
@@ -79,7 +79,7 @@ def test_a_recording_without_amplitude_or_motion_shows_none(frames):
 @pytest.mark.parametrize("exponent", [0.0, 4.0])
 def test_light_helps_where_geometry_does_not_tell_the_motion(wall, exponent):
     given = recording(wall, exponent)
-    views = [surface_map(frame, SurfaceOptions(falloff=0.0)) for frame in given]
+    views = [prepare_view(frame, SurfaceOptions(falloff=0.0)) for frame in given]
     by_shape = replace(ProjectiveOptions(), photometric=False)
     assert len(align(views[4], [Target(views[0], np.eye(4))], np.eye(4), by_shape).unobservable)
     found = estimate_falloff(given, lambda f: f, SurfaceOptions())

@@ -12,7 +12,6 @@ import pytest
 from test_kernels_refinement import corner
 from test_posegraph_revisits import ALL, DRIFT, away_and_back
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.base import Step, Tracker
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.frame_log import FrameLog
@@ -23,6 +22,7 @@ from tofuse.posegraph.loops import ClosedLoop
 from tofuse.posegraph.refinement import NoRefinement
 from tofuse.posegraph.revisits import Revisits
 from tofuse.registration.base import Registration
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.results.types import FrameRecord
 
 COUNT = 24
@@ -48,7 +48,7 @@ class _Drifting(Tracker):
     def push(self, frame, T_odometry=None, surface=None):
         at = min(frame.index, COUNT - 1)
         truth = away_and_back(COUNT)
-        view = surface_map(frame, SurfaceOptions(radii=(2,)))
+        view = prepare_view(frame, SurfaceOptions(radii=(2,)))
         if self.before is None:
             self.before = 0, np.eye(4)
             return Step("tracked", "", np.eye(4), surface=view)

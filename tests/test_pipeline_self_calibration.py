@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.evaluation.trajectory import displacement
-from tofuse.filters.camera_errors import CameraErrors
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate

@@ -14,7 +14,6 @@ import tofuse
 from made_rooms import at, seen
 from tofuse.files.spill import Scratch, Spill
 from tofuse.fusion.mesh import Mesh
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.pipeline import reconstruct
 from tofuse.pipeline.checkpoint import Stages
 from tofuse.pipeline.config import changed, from_method
@@ -23,6 +22,7 @@ from tofuse.pipeline.states import StateError, decode, encode
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import ArraySource, Recording
+from tofuse.registration.prepared_view import PreparedView
 
 
 class Kept(Stages):
@@ -124,24 +124,24 @@ def test_what_no_constructor_makes_is_refused(kept: Kept, name: str) -> None:
 
 def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
     view = kept.again("tracking").mapper.views[0].view
-    assert isinstance(through(view), SurfaceMap)
+    assert isinstance(through(view), PreparedView)
     for name in ("rays", "z", "sigma", "planes", "plane_variance", "photo"):
         array = getattr(view, name)
         for other in (array[:-3].copy(), array[..., :1].copy(), array.astype(np.float64)):
-            with pytest.raises(StateError, match="of a SurfaceMap"):
+            with pytest.raises(StateError, match="of a PreparedView"):
                 through(replace(view, **{name: other}))
 
 
 def test_what_was_put_away_is_looked_at_too(kept: Kept) -> None:
     """Views that memory can't hold are bytes in a file, and their shapes lie beside."""
     view = kept.again("tracking").mapper.views[0].view
-    spill: Spill[SurfaceMap] = Scratch(0).part(1.0)
+    spill: Spill[PreparedView] = Scratch(0).part(1.0)
     for _ in range(2):
         spill.put(view)
     again = through(spill)
     np.testing.assert_array_equal(again.get(0).z, view.z)
     entry = again._entries[0]
-    for shape, says in (((1, 1), "of a SurfaceMap has shape"), ((1 << 40, 1), "has no shape")):
+    for shape, says in (((1, 1), "of a PreparedView has shape"), ((1 << 40, 1), "has no shape")):
         entry.shapes["z"] = shape
         with pytest.raises(StateError, match=says):
             through(again)
@@ -186,7 +186,7 @@ def test_all_that_is_listed_takes_part_in_a_run(kept: Kept) -> None:
         annotated = {*vars(kind), *getattr(kind, "__annotations__", ())}
         inside = {"T_component_camera"} if kind is PosedView else set()
         assert set(arrays) <= annotated | inside, kind
-    for kind in (Mesh, PoseGraph, SurfaceMap):
+    for kind in (Mesh, PoseGraph, PreparedView):
         assert kind in state_checks._ARRAYS
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.filters.multipath import Multipath
+from tofuse.corrections.multipath import Multipath
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.pipeline.config import Config, from_method

@@ -13,7 +13,6 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph import accuracy
 from tofuse.posegraph.accuracy import (
     Accuracy,
@@ -28,6 +27,7 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from walks import round_walk, true_poses
 
 N = 14
@@ -133,7 +133,7 @@ def test_what_a_pair_sees_decides(view, degenerate) -> None:
 
 def flat_wall():
     z = np.full((60, 80), 2.0, np.float32)
-    return surface_map(as_frame(z, 0), SurfaceOptions())
+    return prepare_view(as_frame(z, 0), SurfaceOptions())
 
 
 def surface_of_corner():
@@ -141,7 +141,7 @@ def surface_of_corner():
     x, y = np.moveaxis(rays, -1, 0)
     planes = [(0.6, 0.0, 0.8), (-0.6, 0.0, 0.8), (0.0, -0.8, 0.6)]
     z = np.min([1.5 / (a * x + b * y + c) for a, b, c in planes], axis=0)
-    return surface_map(as_frame(z.astype(np.float32), 0), SurfaceOptions())
+    return prepare_view(as_frame(z.astype(np.float32), 0), SurfaceOptions())
 
 
 CAMERA = Pinhole(80, 60, 80.0, 80.0, 39.5, 29.5)

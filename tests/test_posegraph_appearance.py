@@ -10,12 +10,12 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.likeness import look_of, mutual_unlikeness
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.search import SearchOptions
 
 CAMERA = Pinhole(96, 72, 78.0, 78.0, 47.5, 35.5)
@@ -72,7 +72,7 @@ def turning(count, step, **options):
     xi = np.zeros((count, 6))
     xi[:, 4] = step * np.arange(count)
     views = [
-        surface_map(room(a, k, **options), SurfaceOptions(radii=(2,)))
+        prepare_view(room(a, k, **options), SurfaceOptions(radii=(2,)))
         for k, a in enumerate(xi[:, 4])
     ]
     return views, se3.exp(xi)
@@ -192,7 +192,7 @@ def test_the_same_place_is_more_alike_than_any_other(once_round):
 def test_exposure_does_not_count():
     frame = room(0.3, 0)
     brighter = replace(frame, amplitude_image=3 * frame.amplitude_image)
-    looks = [look_of(surface_map(f, SurfaceOptions(radii=(2,)))) for f in (frame, brighter)]
+    looks = [look_of(prepare_view(f, SurfaceOptions(radii=(2,)))) for f in (frame, brighter)]
     assert mutual_unlikeness(looks, 0.25)[0, 1] < 0.01
 
 

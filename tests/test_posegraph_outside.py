@@ -219,7 +219,7 @@ def test_options_that_make_no_sense_are_refused(part, options):
 def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
     """Views of a bare wall, which any turn about its normal and shift along it leaves as it is."""
     from test_kernels_refinement import SHARP, corner
-    from tofuse.maps.surface_map import surface_map
+    from tofuse.registration.prepared_view import prepare_view
 
     poses = se3.exp(np.linspace(0, 0.2, 6)[:, None] * np.array([1.0, 0, 0, 0, -0.5, 0]))
     views = []
@@ -231,7 +231,7 @@ def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
         n = T[:3, :3].T @ np.array([0, 0, 1.0])
         z = (2.0 - T[2, 3]) / (rays @ n[:2] + n[2])
         frame = replace(frame, depth=z.astype(np.float32), amplitude_image=None)
-        views.append(KeptView.of(surface_map(frame, SHARP), 800))
+        views.append(KeptView.of(prepare_view(frame, SHARP), 800))
     rolled = poses.copy()
     for k in range(6):
         rolled[k] = rolled[k] @ se3.exp(np.array([0, 0, 0, 0, 0, 0.02 * k]))

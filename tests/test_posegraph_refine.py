@@ -12,12 +12,12 @@ from test_kernels_refinement import SHARP, corner
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import surface_map
 from tofuse.posegraph.accuracy import Shown, accuracy_of
 from tofuse.posegraph.build import build_graph
 from tofuse.posegraph.refine import Bodies, RefineOptions, chosen, refine
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
 from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
+from tofuse.registration.prepared_view import prepare_view
 
 OPTIONS = RefineOptions()
 
@@ -37,7 +37,7 @@ def surfaces(poses, noise=0.0, **kwargs):
     for k, T in enumerate(poses):
         frame = replace(corner(T, **kwargs), index=k)
         depth = frame.depth + noise * rng.standard_normal(frame.depth.shape).astype(np.float32)
-        out.append(surface_map(replace(frame, depth=depth), SHARP))
+        out.append(prepare_view(replace(frame, depth=depth), SHARP))
     return out
 
 
@@ -193,7 +193,7 @@ def test_an_error_that_pixels_share_counts_once_where_all_views_are_compared():
     truth = path(4)
     shared = np.full(corner(truth[0]).depth.shape, 0.01, np.float32)
     frames = [replace(corner(T), index=k, shared_sigma_image=shared) for k, T in enumerate(truth)]
-    views = [surface_map(frame, SHARP) for frame in frames]
+    views = [prepare_view(frame, SHARP) for frame in frames]
     whole = [view.once() for view in views]
     np.testing.assert_array_equal(whole[0].plane_variance, views[0].pixel_variance)
     assert whole[0].once() is whole[0]

@@ -9,7 +9,6 @@ import pytest
 
 from test_kernels_refinement import corner
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph import revisits
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.loops import GivenLoop
@@ -17,6 +16,7 @@ from tofuse.posegraph.revisits import Revisits
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import BELIEVED
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.verification import Assessment
 
 ALL = Spacing(angle=0, distance=0)
@@ -51,7 +51,7 @@ def pushed(options, frames, poses, given=()):
     store = ViewStore(ALL)
     loops = options.start(0, given, store)
     for frame, T in zip(frames, poses, strict=True):
-        store.push(surface_map(frame, SurfaceOptions(radii=(2,))), T)
+        store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
         loops.push(frame, T)
     known = {f.index: T for f, T in zip(frames, poses, strict=True)}
     return loops.finish(known, dict.fromkeys(known, np.zeros((6, 6))))
@@ -183,7 +183,7 @@ def test_loops_are_looked_for_again_where_views_have_moved(turn):
     store = ViewStore(ALL)
     loops = Revisits(spacing=ALL, searches=0, appearance=Appearance(most=0)).start(0, (), store)
     for frame, T in zip(frames, far, strict=True):
-        store.push(surface_map(frame, SurfaceOptions(radii=(2,))), T)
+        store.push(prepare_view(frame, SurfaceOptions(radii=(2,))), T)
         loops.push(frame, T)
     unsure = {f.index: np.zeros((6, 6)) for f in frames}
 

@@ -12,16 +12,16 @@ from test_posegraph_refine import path
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
-from tofuse.maps.surface_map import surface_map
 from tofuse.posegraph import shared_error
 from tofuse.posegraph.refine import RefineOptions, refine
 from tofuse.posegraph.views import KeptView
+from tofuse.registration.prepared_view import prepare_view
 
 WIDE = (1.0, 50.0, 0.5)  # scale, robust limit (so wide that robust weights are 1), cosine
 
 
 def view(frame) -> KeptView:
-    return KeptView.of(surface_map(frame, SHARP), 1500)
+    return KeptView.of(prepare_view(frame, SHARP), 1500)
 
 
 def bent(frame, rng, size: float):

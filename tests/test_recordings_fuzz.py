@@ -24,7 +24,7 @@ from tofuse.geometry.cameras import RayTable
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.open import open_recording
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 
 
 def make_native(folder: Path) -> None:

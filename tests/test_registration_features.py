@@ -11,10 +11,10 @@ import tofuse
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.registration.features import Features
 from tofuse.registration.keypoints import keypoints, light_image
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,
@@ -228,7 +228,7 @@ def test_the_light_does_not_fall_with_the_distance():
 
 def test_points_lie_where_the_pixels_see_them(images):
     frame = images[1]
-    surface = surface_map(frame, SurfaceOptions())
+    surface = prepare_view(frame, SurfaceOptions())
     found = keypoints(frame, surface, detector="sift", light="auto", count=300, blur_px=0.7)
     assert len(found) > 50
     np.testing.assert_allclose(CAMERA.project(found.points), found.pixels, atol=0.05)

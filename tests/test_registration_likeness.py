@@ -10,8 +10,8 @@ import pytest
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import build
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.registration.likeness import look_of, mutual_unlikeness, unlikeness
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.sensor.models import camera_model
 
 
@@ -22,7 +22,7 @@ def views():
     effects = Effects.none(shot_noise=True)
     model = camera_model("sr4000")
     return [
-        surface_map(render(scene, path, model, k, effects=effects).frame, SurfaceOptions())
+        prepare_view(render(scene, path, model, k, effects=effects).frame, SurfaceOptions())
         for k in range(0, 384, 20)
     ]
 

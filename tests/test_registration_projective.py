@@ -12,7 +12,7 @@ from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.render import render
 from tofuse.lab.simulation.scene import FRAME_RATE_HZ, build
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import UNITS, Level, ProjectiveOptions, Target, align, points_of
 from tofuse.sensor.models import camera_model
 
@@ -28,7 +28,7 @@ class Pair:
         scene, sequence = build(name, texture=texture)
         effects = Effects.none(shot_noise=noise)
         self.frames = [render(scene, sequence, MODEL, k, effects=effects).frame for k in indices]
-        self.views = [surface_map(frame, SurfaceOptions()) for frame in self.frames]
+        self.views = [prepare_view(frame, SurfaceOptions()) for frame in self.frames]
         rate = FRAME_RATE_HZ
         self.poses = [sequence.T_world_camera(k / rate, indices[0] / rate) for k in indices]
         self.target = Target(self.views[0], np.eye(4))
@@ -138,7 +138,7 @@ def test_outliers_do_not_move_it(room):
     depth[100:130, 20:60] += 0.3
     light = frame.amplitude_image.copy()
     light[10:40, 30:90] *= 4
-    view = surface_map(replace(frame, depth=depth, amplitude_image=light), SurfaceOptions())
+    view = prepare_view(replace(frame, depth=depth, amplitude_image=light), SurfaceOptions())
     found = align(view, [room.target], np.eye(4), OPTIONS)
     assert_near(found, room.poses[1], 0.003, 0.05)
     assert found.inlier_share < 0.95
@@ -155,7 +155,7 @@ def test_a_scene_under_a_magnifying_glass_is_as_robust(room):
     found = []
     for size in (1.0, scale):
         views = [
-            surface_map(replace(f, depth=f.depth * np.float32(size)), SurfaceOptions())
+            prepare_view(replace(f, depth=f.depth * np.float32(size)), SurfaceOptions())
             for f in (target, source)
         ]
         aligned = align(views[1], [Target(views[0], np.eye(4))], np.eye(4), coarse)
@@ -171,7 +171,7 @@ def test_an_exposure_that_changed_is_allowed_for(room, wall, gain):
     for pair in (room, wall):
         frame = pair.frames[1]
         brighter = replace(frame, amplitude_image=frame.amplitude_image * np.float32(gain))
-        view = surface_map(brighter, SurfaceOptions())
+        view = prepare_view(brighter, SurfaceOptions())
         found = align(view, [pair.target], np.eye(4), OPTIONS)
         assert found.exposure == pytest.approx(-np.log(gain), abs=0.01)
         assert_near(found, pair.poses[1], 0.001, 0.03)
@@ -206,7 +206,7 @@ def test_threads_change_nothing(room):
 
 def test_a_view_of_nothing_holds_nothing_and_stays_at_the_prediction(room):
     frame = room.frames[1]
-    blank = surface_map(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
+    blank = prepare_view(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
     T = se3.exp([0.1, 0, 0, 0, 0.1, 0])
     for source, target in ((blank, room.target), (room.views[1], Target(blank, np.eye(4)))):
         found = align(source, [target], T, OPTIONS)

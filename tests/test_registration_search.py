@@ -14,12 +14,12 @@ from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate_recording
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.odometry.keyframes import Keyframes
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.registration.agreement import Agreement, AgreementOptions, agreement
 from tofuse.registration.floor import FloorOptions, find_floor, find_floors
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.search import Candidate, SearchOptions, _distinct, search
 
@@ -57,7 +57,7 @@ def seen(T_world_camera, boxes=FURNITURE, sigma=0.004, seed=0, walls=True):
 
 
 def view(*arguments, **options):
-    return surface_map(seen(*arguments, **options), SurfaceOptions())
+    return prepare_view(seen(*arguments, **options), SurfaceOptions())
 
 
 def camera(x, z, yaw, pitch=-0.35):
@@ -383,7 +383,7 @@ def test_rough_planes_fill_what_noise_left_open():
     rng = np.random.default_rng(2)
     far = frame.depth > 2.4
     noisy = frame.depth + np.where(far, 0.012 * rng.standard_normal(far.shape), 0)
-    made = surface_map(replace(frame, depth=noisy.astype(np.float32)), SurfaceOptions())
+    made = prepare_view(replace(frame, depth=noisy.astype(np.float32)), SurfaceOptions())
     filled = with_rough_planes(made)
     own = made.planes[..., 3] > 0
     np.testing.assert_array_equal(filled.planes[own], made.planes[own])
@@ -461,9 +461,9 @@ def test_albedo_tells_where_geometry_is_alike():
     """Bare walls, 27 degrees apart, textured."""
     effects = Effects.none(shot_noise=True)
     recording = simulate_recording("empty-room", every=30, frames=9, effects=effects).select(3)
-    views = [surface_map(frame, SurfaceOptions()) for frame in recording]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in recording]
     dark = [
-        surface_map(replace(frame, amplitude_image=None), SurfaceOptions()) for frame in recording
+        prepare_view(replace(frame, amplitude_image=None), SurfaceOptions()) for frame in recording
     ]
     poses = recording.reference
     right = {"with": 0, "without": 0}
@@ -482,7 +482,7 @@ def test_albedo_tells_where_geometry_is_alike():
 
 def test_a_view_of_nothing_is_not_searched(pair):
     frame = seen(A)
-    empty = surface_map(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
+    empty = prepare_view(replace(frame, depth=np.zeros_like(frame.depth)), SurfaceOptions())
     assert search(empty, pair[1]) is None
     assert search(pair[0], empty) is None
 
@@ -520,7 +520,7 @@ def test_recorded_views_are_found_without_a_hint(shared_data):
     """A Kinect v2 round boxes: neighbours 0.5 m and 26 degrees apart, and the loop's two ends."""
     recording = open_recording(shared_data / "kinectv2_loop" / "recording")
     _, poses = read_tum(shared_data / "kinectv2_loop" / "recording" / "reference_poses.txt")
-    views = [surface_map(frame, SurfaceOptions()) for frame in recording]
+    views = [prepare_view(frame, SurfaceOptions()) for frame in recording]
     for i, j in ((3, 2), (6, 5), (16, 0)):
         found = search(views[i], views[j])
         metres, degrees = error(found.T_target_source, se3.inverse(poses[j]) @ poses[i])

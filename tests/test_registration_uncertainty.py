@@ -8,8 +8,8 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import tiles
 from tofuse.kernels.alignment import POINT_SIZE
 from tofuse.kernels.doubt import faked_information
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.registration.uncertainty import (
     Patches,
@@ -48,7 +48,7 @@ def _view(index, planes, T=None, *, sigma=0.004, bend=None, light=None):
     frame = RangeFrame(
         index, index / 30, CAMERA, depth.astype(np.float32), "z", light, amplitude_kind="raw"
     )
-    return surface_map(frame, SurfaceOptions())
+    return prepare_view(frame, SurfaceOptions())
 
 
 def _aligned(source, target, T):

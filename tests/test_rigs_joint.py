@@ -11,9 +11,9 @@ import numpy as np
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.rig import around, relative
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.posegraph.views import KeptView
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.rigs.joint import View, disagreements, refine_together
 
 CAMERA = Pinhole(128, 96, 90.0, 90.0, 63.5, 47.5)
@@ -58,7 +58,8 @@ def rig(seed: int, offset: float = 0.0) -> tuple[list[View], np.ndarray]:
             k,
             0,
             KeptView.of(
-                surface_map(looked_at(T[k], rng, offset if k == 2 else 0.0), SurfaceOptions()), 4000
+                prepare_view(looked_at(T[k], rng, offset if k == 2 else 0.0), SurfaceOptions()),
+                4000,
             ),
         )
         for k in range(4)

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from test_sensor_multipath import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
-from tofuse.filters.correction import Correction, Corrector
-from tofuse.filters.multipath import Multipath
+from test_corrections_multipath import CAMERA, FLOOR, GAIN, LEFT, PERIOD_M, RIGHT, Plane, Seen
+from tofuse.corrections.base import Correction, Corrector
+from tofuse.corrections.multipath import Multipath
 from tofuse.geometry import se3
 from tofuse.kernels.multipath import PATCH
 from tofuse.pipeline.config import from_method

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import tofuse
+from tofuse.corrections.unwrap import Unwrap
 from tofuse.errors import InputError
 from tofuse.files.images import write_png
-from tofuse.filters.unwrap import Unwrap
 from tofuse.geometry.cameras import Pinhole, range_from_z
 from tofuse.kernels.threads import threads
 from tofuse.kernels.unwrap import STEPS, pass_messages

@@ -22,7 +22,7 @@ from tofuse.arrays import Float64, Intp
 from tofuse.calibration.plane_views import PlaneView
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Camera
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 
 _KNOT_M = 0.04
 _MOST_KNOTS = 200

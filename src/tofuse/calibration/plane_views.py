@@ -13,11 +13,11 @@ from tofuse.calibration.board_pose import board_pose
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, points_from_z, ray_lengths
-from tofuse.maps.surface_map import SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.registration.plane_sets import PlaneSets
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.sensor.noise import NoiseModel
 
 _SEARCHED = 60  # frames at most
@@ -141,7 +141,7 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
         camera = camera or frame.camera
         rng = np.random.default_rng([seed, frame.index])
         taken = np.zeros(frame.depth.shape, bool)
-        for found in finder.found(surface_map(frame, SurfaceOptions()), rng):
+        for found in finder.found(prepare_view(frame, SurfaceOptions()), rng):
             plane = found.normal / found.offset
             mask = _near(frame, plane, noise) & ~taken
             taken |= mask

@@ -20,7 +20,7 @@ from tofuse.recordings.camera_file import camera_fields
 from tofuse.recordings.native import read_correction
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 
 # What a subject gives: data for JSON, lines to print, and warnings.
 Told = tuple[dict[str, Any], list[str], list[str]]

@@ -25,8 +25,8 @@ from scipy.spatial import cKDTree
 from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import nearest_depth
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import ViewPoints, landing_pixels
 
 Kind = Literal["appeared", "vanished"]
@@ -91,16 +91,16 @@ class Change:
 class _Seen:
     """A view, prepared to be compared with points."""
 
-    view: SurfaceMap
+    view: PreparedView
     points: ViewPoints
     nearest: Float32
     T_world_camera: Float64
 
 
 def changes(
-    before: Sequence[SurfaceMap],
+    before: Sequence[PreparedView],
     poses_before: Float64,
-    after: Sequence[SurfaceMap],
+    after: Sequence[PreparedView],
     poses_after: Float64,
 ) -> list[Change]:
     """Find what changed between two sessions, the largest first.
@@ -134,7 +134,7 @@ def changes(
     return sorted(found, key=lambda c: -len(c.points))
 
 
-def _prepared(views: Sequence[SurfaceMap], poses: Float64) -> list[_Seen]:
+def _prepared(views: Sequence[PreparedView], poses: Float64) -> list[_Seen]:
     return [
         _Seen(view, ViewPoints.of(view, _POINTS), nearest_depth(view), T)
         for view, T in zip(views, poses, strict=True)

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float32, Float64
+from tofuse.corrections.base import Corrector
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.filters.correction import Corrector
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Camera, Fisheye, Pinhole
 from tofuse.kernels.consistency import agreement_sums, move_points, project_by_lens

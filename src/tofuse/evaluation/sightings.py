@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import evenly
 from tofuse.registration.agreement import AgreementOptions, agreement
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
 # Of each image: some points, compared with images of this width.
 _POINTS = 700
@@ -109,9 +109,9 @@ def sightings(frames: Sequence[RangeFrame], poses: ArrayLike) -> Sightings:
     return compared([prepared(frames[k]) for k in rows], T[rows])
 
 
-def prepared(frame: RangeFrame) -> SurfaceMap:
+def prepared(frame: RangeFrame) -> PreparedView:
     """A frame as `compared` takes it."""
-    return surface_map(frame, SurfaceOptions()).thinned(_COLUMNS)
+    return prepare_view(frame, SurfaceOptions()).thinned(_COLUMNS)
 
 
 def whole(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:
@@ -124,7 +124,7 @@ def whole(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:
 
 
 def compared(
-    views: Sequence[SurfaceMap], poses: Float64, groups: Sequence[int] | None = None
+    views: Sequence[PreparedView], poses: Float64, groups: Sequence[int] | None = None
 ) -> Sightings:
     """Compare pairs of prepared views under their poses (N, 4, 4) T_world_camera.
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.filters._options import above, at_least
+from tofuse.bounds import above, at_least
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame

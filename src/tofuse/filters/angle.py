@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool, Float32
-from tofuse.filters._options import within
+from tofuse.bounds import within
 from tofuse.filters.base import Filter
 from tofuse.geometry.cameras import unknown_rays
 from tofuse.kernels.neighbourhood import is_steeper, largest_angle

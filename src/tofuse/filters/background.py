@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from tofuse.arrays import Bool
+from tofuse.bounds import above, within
 from tofuse.errors import InputError
-from tofuse.filters._options import above, within
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.background import MovingObject, moving_object

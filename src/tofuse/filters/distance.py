@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.filters._options import above, at_least, finite
+from tofuse.bounds import above, at_least, finite
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame

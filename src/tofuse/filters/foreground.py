@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool, Float32
-from tofuse.filters._options import above, within
+from tofuse.bounds import above, within
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame

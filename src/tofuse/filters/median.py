@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool, Float32
-from tofuse.filters._options import above, whole
+from tofuse.bounds import above, whole
 from tofuse.filters.base import Filter
 from tofuse.kernels.neighbourhood import window_median
 from tofuse.kernels.threads import run_chunks

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
-from tofuse.filters._options import above, whole, within
+from tofuse.bounds import above, whole, within
 from tofuse.filters.base import Filter
 from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part

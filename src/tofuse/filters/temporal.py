@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
-from tofuse.filters._options import above, whole
+from tofuse.bounds import above, whole
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame

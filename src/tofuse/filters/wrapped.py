@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Bool
-from tofuse.filters._options import within
+from tofuse.bounds import within
+from tofuse.corrections.raw_amplitude import pixel_pitch, wrapped_light
 from tofuse.filters.base import Filter
-from tofuse.filters.unwrap import pixel_pitch, wrapped_light
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light

@@ -17,9 +17,9 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.options import Fusion
 from tofuse.fusion.tsdf import fitting_voxel, fuse_surface
 from tofuse.fusion.views import RangeView
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.refinement import without_errors
 from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.registration.prepared_view import PreparedView
 
 _SKETCHED, _SKETCHED_PIXELS = 60, 6000  # views in a sketch, and about so many pixels of each
 
@@ -62,7 +62,7 @@ class ModelBuilder:
         self._bytes = 0
         self._voxel_m = 0.01  # of clouds
 
-    def add(self, frame: Frame, surface: SurfaceMap | None, most_points: int) -> None:
+    def add(self, frame: Frame, surface: PreparedView | None, most_points: int) -> None:
         """Keep a (filtered) view.
 
         Parameters

@@ -19,8 +19,8 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.atlas import NOBODY, draw_triangles, see
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import Projection
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.registration.prepared_view import Projection
 
 # How far a surface may be from what a view sees there: m, and as a share of the depth.
 _SLACK, _SLACK_SHARE = 0.02, 0.02

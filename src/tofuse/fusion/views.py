@@ -13,14 +13,14 @@ from tofuse.arrays import Bool, Float32, Int8, UInt8, UInt16
 from tofuse.geometry.cameras import ray_lengths
 from tofuse.kernels.middle import median
 from tofuse.kernels.tsdf import draw_to_planes, mark_jumps, pack_view
-from tofuse.maps.surface_map import (
+from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.registration.prepared_view import (
+    PreparedView,
     Projection,
-    SurfaceMap,
     SurfaceOptions,
-    surface_map,
+    prepare_view,
     with_more_planes,
 )
-from tofuse.recordings.frames import CloudFrame, RangeFrame
 
 # Weights, in 1/m^2, are kept as logarithms: six steps an octave, from 2^-14 on.
 _STEPS, _LEAST = 6.0, -14.0
@@ -77,7 +77,7 @@ class RangeView:
     def of(
         cls,
         frame: RangeFrame,
-        surface: SurfaceMap | None = None,
+        surface: PreparedView | None = None,
         options: SurfaceOptions | None = None,
     ) -> RangeView:
         """Keep what of `frame` is valid; `surface` is the same image before filters, if there is.
@@ -89,7 +89,7 @@ class RangeView:
         """
         options = options or SurfaceOptions()
         if surface is None:
-            surface = surface_map(frame, options)
+            surface = prepare_view(frame, options)
         surface = with_more_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
         shape = surface.z.shape
         smoothed, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)

@@ -20,8 +20,8 @@ from tofuse.inspection.finding import Finding
 from tofuse.inspection.geometry import check_kind, wrong_focal
 from tofuse.inspection.motion import Pair, aligned, aligned_pair, field_of_view
 from tofuse.inspection.sample import MAP_COLUMNS, Sample, part_starts
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
 # Views that are turned by this share of the field of view tell; by less than that many degrees,
 # too little.
@@ -105,7 +105,7 @@ def _further(sample: Sample, step: Pair, gap: int) -> Pair | None:
         except UnreadableFrameError:
             continue
         if isinstance(frame, RangeFrame) and frame.valid.any():
-            other = surface_map(frame, SurfaceOptions(columns=MAP_COLUMNS))
+            other = prepare_view(frame, SurfaceOptions(columns=MAP_COLUMNS))
             return aligned_pair(step.first, other, step.i, k)
     return None
 
@@ -121,7 +121,7 @@ def _scores(pair: Pair) -> list[float]:
     return out
 
 
-def _scaled(view: SurfaceMap, scale: float) -> SurfaceMap:
+def _scaled(view: PreparedView, scale: float) -> PreparedView:
     """Return the view had its rays been longer by a factor to all sides."""
     rays = view.rays * np.float32(scale)
     planes, photo = view.planes.copy(), view.photo.copy()

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.view_points import landing_pixels
 
@@ -45,8 +45,8 @@ class Pair:
 
     i: int
     j: int
-    first: SurfaceMap
-    second: SurfaceMap
+    first: PreparedView
+    second: PreparedView
     found: Aligned
 
     @property
@@ -80,7 +80,7 @@ class Pair:
         )
 
 
-def field_of_view(view: SurfaceMap) -> float:
+def field_of_view(view: PreparedView) -> float:
     """Smaller angle of the field of view, rad."""
     rays = view.rays
     x = np.arctan(rays[rays.shape[0] // 2, :, 0])
@@ -88,7 +88,7 @@ def field_of_view(view: SurfaceMap) -> float:
     return float(min(np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y)))
 
 
-def aligned_pair(first: SurfaceMap, second: SurfaceMap, i: int, j: int) -> Pair:
+def aligned_pair(first: PreparedView, second: PreparedView, i: int, j: int) -> Pair:
     """Align two views, from no motion, and if that fails from turns to all sides."""
     best = aligned(second, first, np.eye(4))
     if best.score < _GOOD_SCORE:
@@ -105,7 +105,7 @@ def aligned_pair(first: SurfaceMap, second: SurfaceMap, i: int, j: int) -> Pair:
     return Pair(i, j, first, second, best)
 
 
-def aligned(source: SurfaceMap, target: SurfaceMap, T_target_source: Float64) -> Aligned:
+def aligned(source: PreparedView, target: PreparedView, T_target_source: Float64) -> Aligned:
     """Align two small views from a start; by their shape alone where light does not settle."""
     targets = [Target(target, np.eye(4))]
     for options in (_OPTIONS, replace(_OPTIONS, photometric=False)):
@@ -122,7 +122,7 @@ def aligned(source: SurfaceMap, target: SurfaceMap, T_target_source: Float64) ->
     )  # fmt: skip
 
 
-def _in_front(source: SurfaceMap, target: SurfaceMap, T_target_source: Float64) -> float:
+def _in_front(source: PreparedView, target: PreparedView, T_target_source: Float64) -> float:
     """Share of the points of the source that stand where the target saw through.
 
     Single pixels and thin edges don't count: they fly, or the pose is off by a little.

@@ -31,7 +31,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from tofuse.arrays import Bool, Float64, Int64
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 
 Model = Literal["kind", "z", "range"]
 
@@ -90,7 +90,7 @@ class Region:
         return _spread(e / self.w)
 
 
-def regions_of(view: SurfaceMap, frame: int) -> list[Region]:
+def regions_of(view: PreparedView, frame: int) -> list[Region]:
     """Smooth pieces of a view without edges or creases."""
     planes = view.planes
     w = planes[..., 3]
@@ -113,7 +113,7 @@ def regions_of(view: SurfaceMap, frame: int) -> list[Region]:
     return out
 
 
-def _labels(view: SurfaceMap, on: Bool) -> Int64:
+def _labels(view: PreparedView, on: Bool) -> Int64:
     """(H, W) number of the piece that each pixel is of."""
     rows, columns = on.shape
     number = np.arange(rows * columns).reshape(rows, columns)

@@ -12,9 +12,9 @@ from tofuse.arrays import Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.inspection.motion import Pair, aligned_pair
 from tofuse.inspection.planar import Bending, Region, bending, regions_of
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording, evenly
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
 # What is looked for is as wide as the image; more pixels would only take longer.
 MAP_COLUMNS = 128
@@ -80,11 +80,11 @@ class Sample:
         return tuple(f for f in self.frames if isinstance(f, RangeFrame) and f.valid.any())
 
     @cached_property
-    def maps(self) -> dict[int, SurfaceMap]:
+    def maps(self) -> dict[int, PreparedView]:
         """Surfaces of the range images, by position in `frames`."""
         options = SurfaceOptions(columns=MAP_COLUMNS)
         return {
-            k: surface_map(f, options)
+            k: prepare_view(f, options)
             for k, f in enumerate(self.frames)
             if isinstance(f, RangeFrame) and f.valid.any()
         }

@@ -195,7 +195,7 @@ def compare(
     Parameters
     ----------
     rays, z, sigma, planes, plane_variance
-        Of the view, as in `SurfaceMap`.
+        Of the view, as in `PreparedView`.
     stride, other_stride
         Pixels from one cell to the next.
     other_z, other_sigma, other_planes, other_variance, lookup, lookup_frame

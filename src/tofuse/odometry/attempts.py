@@ -9,8 +9,8 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Aligned, Level, ProjectiveOptions, Target, align
 from tofuse.registration.verification import PATIENT, Assessment, UsualFit
 
@@ -43,7 +43,7 @@ class Attempt:
     """
 
     aligned: Aligned
-    view: SurfaceMap
+    view: PreparedView
     reference: Reference
     predicted: bool
     how: str
@@ -89,8 +89,8 @@ class Attempts:
 
     def __init__(
         self,
-        whole: SurfaceMap,
-        view: SurfaceMap,
+        whole: PreparedView,
+        view: PreparedView,
         references: Sequence[Reference],
         expected: Float64 | None,
         steady: Float64 | None,
@@ -121,7 +121,7 @@ class Attempts:
         return "it is far from where the motion leads" if self._made else ""
 
     def again(
-        self, T: Float64, view: SurfaceMap, reference: Reference, *, predicted: bool
+        self, T: Float64, view: PreparedView, reference: Reference, *, predicted: bool
     ) -> Attempt:
         """Align once more from a pose T (4, 4): other pixels take part now."""
         aligned = self._align(view, reference, T, self._options)
@@ -152,7 +152,13 @@ class Attempts:
             yield self._attempt(aligned, view, r, how, predicted=False)
 
     def _attempt(
-        self, aligned: Aligned, view: SurfaceMap, reference: Reference, how: str, *, predicted: bool
+        self,
+        aligned: Aligned,
+        view: PreparedView,
+        reference: Reference,
+        how: str,
+        *,
+        predicted: bool,
     ) -> Attempt:
         return Attempt(aligned, view, reference, predicted, how, self._usual.assess(aligned))
 
@@ -177,7 +183,7 @@ class Attempts:
 
     def _align(
         self,
-        view: SurfaceMap,
+        view: PreparedView,
         reference: Reference,
         T: Float64,
         options: ProjectiveOptions,
@@ -188,7 +194,7 @@ class Attempts:
         return align(view, [reference.target], T, options, start=start, usual_scale=scale)
 
 
-def _turns(view: SurfaceMap) -> list[Float64]:
+def _turns(view: PreparedView) -> list[Float64]:
     """Motions of the camera to try: none, and turns about itself and about what it sees."""
     centre = np.eye(4)
     centre[2, 3] = view.depth

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
 from tofuse.arrays import Bool, Float64
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.motion import Moment
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link, Registration
+from tofuse.registration.prepared_view import PreparedView
 
 Status = Literal["tracked", "predicted", "lost", "skipped"]
 
@@ -49,7 +49,7 @@ class Step:
     T_component_camera: Float64 | None
     reference: int | None = None
     registration: Registration | None = None
-    surface: SurfaceMap | None = None
+    surface: PreparedView | None = None
     component: int = 0
     links: tuple[Link, ...] = ()
     doubtful: bool = False
@@ -60,7 +60,7 @@ class Tracker(Protocol):
     """Odometry at work: keeps what it needs of the frames so far."""
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """Find the pose of the next (filtered) frame.
 
@@ -73,7 +73,7 @@ class Tracker(Protocol):
         """
         ...
 
-    def prepare(self, frame: Frame) -> SurfaceMap | None:
+    def prepare(self, frame: Frame) -> PreparedView | None:
         """Make a frame ready before its turn, if there is something to be made of it alone.
 
         Other threads may ask for it while frames before it are tracked.

@@ -9,7 +9,6 @@ from typing import ClassVar
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.odometry.base import Odometry, Status, Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.odometry.moving import MovingObjects, at_size
@@ -17,6 +16,7 @@ from tofuse.odometry.segmentation import NOTICED
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registration
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align, registration_of
 from tofuse.registration.uncertainty import UncertaintyOptions, covariance
 
@@ -58,19 +58,19 @@ class _GivenTracker(Tracker):
         self._objects = MovingObjects()
         self._T_component_world: Float64 | None = None
 
-    def prepare(self, frame: Frame) -> SurfaceMap | None:
+    def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""
-        return surface_map(frame, self._options.surface) if isinstance(frame, RangeFrame) else None
+        return prepare_view(frame, self._options.surface) if isinstance(frame, RangeFrame) else None
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`."""
         if not isinstance(frame, RangeFrame):
             raise InputError("is a cloud; poses are given for images", where=f"frame {frame.index}")
         if T_odometry is None:
             return Step("lost", "no pose was given", None)
-        view = surface_map(frame, self._options.surface) if surface is None else surface
+        view = prepare_view(frame, self._options.surface) if surface is None else surface
         if self._T_component_world is None:
             self._T_component_world = se3.inverse(T_odometry)
         T = self._T_component_world @ T_odometry
@@ -93,7 +93,7 @@ class _GivenTracker(Tracker):
         return Step("tracked", "", T, keyframe.view.index, registration, view, moving=mask)
 
     def _registration(
-        self, view: SurfaceMap, keyframe: Keyframe, target: Target, T: Float64
+        self, view: PreparedView, keyframe: Keyframe, target: Target, T: Float64
     ) -> Registration:
         options = self._options
         aligned = align(view, [target], T, options.alignment)
@@ -152,14 +152,14 @@ class _StatedTracker(Tracker):
         self._odometry = odometry
         self._trackers: dict[int, Tracker] = {}  # by component
 
-    def prepare(self, frame: Frame) -> SurfaceMap | None:
+    def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""
         if self._stated(frame).T_component_camera is None or not isinstance(frame, RangeFrame):
             return None
-        return surface_map(frame, self._odometry.options.surface)
+        return prepare_view(frame, self._odometry.options.surface)
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`."""
         stated = self._stated(frame)

@@ -9,8 +9,8 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.likeness import look_of, unlikeness
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Target
 from tofuse.registration.verification import IN_SIGHT
 
@@ -24,7 +24,7 @@ _SHIFT = 0.5
 class Keyframe:
     """A view with its pose in the frame of its component; doubtful if it fitted unusually badly."""
 
-    view: SurfaceMap
+    view: PreparedView
     T_component_camera: Float64
     component: int
     doubtful: bool = False
@@ -91,7 +91,7 @@ class KeyframeMap:
         away = np.linalg.norm(between[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(between))
         return self._keyframes[-1 if away[-1] < IN_SIGHT else int(np.argmin(away))]
 
-    def alike(self, view: SurfaceMap, component: int) -> Keyframe | None:
+    def alike(self, view: PreparedView, component: int) -> Keyframe | None:
         """The keyframe outside of a component that looks most like a view, of equals the newest."""
         others = [k for k in self._keyframes if k.component != component]
         if not others:

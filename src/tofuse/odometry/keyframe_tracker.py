@@ -9,7 +9,6 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap, surface_map
 from tofuse.odometry.attempts import Attempt, Attempts
 from tofuse.odometry.base import Step, Tracker
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
@@ -21,6 +20,7 @@ from tofuse.odometry.rivals import Rivals
 from tofuse.odometry.segmentation import NOTICED, Segmentation
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Link, Registration
+from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.projective import registration_of
 from tofuse.registration.uncertainty import covariance
 from tofuse.registration.verification import UsualFit, comparable
@@ -44,14 +44,14 @@ class KeyframeTracker(Tracker):
         self._T_odometry: Float64 | None = None
         self._in_sequence = False  # whether the frame just before has a pose in the component
 
-    def prepare(self, frame: Frame) -> SurfaceMap | None:
+    def prepare(self, frame: Frame) -> PreparedView | None:
         """See `Tracker.prepare`."""
         if not isinstance(frame, RangeFrame) or self._unfit(frame):
             return None
-        return surface_map(frame, self._options.surface)
+        return prepare_view(frame, self._options.surface)
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`."""
         if not isinstance(frame, RangeFrame):
@@ -59,7 +59,7 @@ class KeyframeTracker(Tracker):
         self._relocalizer.count_frame()
         if surface is None and (reason := self._unfit(frame)):
             return self._lose(reason)
-        view = surface_map(frame, self._options.surface) if surface is None else surface
+        view = prepare_view(frame, self._options.surface) if surface is None else surface
         if np.count_nonzero(view.planes[..., 3] > 0) < self._options.minimum_points:
             return self._lose("too few pixels have a surface")
         now = Moment(frame.index, frame.timestamp)
@@ -102,7 +102,7 @@ class KeyframeTracker(Tracker):
                 return ""
         return f"every depth is {first:.3g} m"
 
-    def _attempts(self, view: SurfaceMap, now: Moment, T_odometry: Float64 | None) -> Attempts:
+    def _attempts(self, view: PreparedView, now: Moment, T_odometry: Float64 | None) -> Attempts:
         """Alignments with the last keyframe and the last frame."""
         last, options = self._last, self._options
         T_last = np.eye(4) if last is None else last.T_component_camera
@@ -136,7 +136,7 @@ class KeyframeTracker(Tracker):
             return None
         return np.asarray(last.T_component_camera @ se3.inverse(before) @ T_odometry, np.float64)
 
-    def _begin_component(self, view: SurfaceMap, attempts: Attempts) -> Step:
+    def _begin_component(self, view: PreparedView, attempts: Attempts) -> Step:
         """Start anew with a view that can't be connected, and look for where it may belong."""
         self._component += 1
         last = None if self._last is None else self._last.view.index

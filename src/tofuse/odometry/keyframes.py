@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from tofuse.maps.surface_map import SurfaceOptions
 from tofuse.odometry.base import Odometry, Tracker
 from tofuse.parts import part
+from tofuse.registration.prepared_view import SurfaceOptions
 from tofuse.registration.projective import ProjectiveOptions
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.uncertainty import UncertaintyOptions

@@ -24,8 +24,8 @@ from tofuse.geometry import se3
 from tofuse.kernels import moving as kernels
 from tofuse.kernels.middle import median
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import PreparedView
 
 # Rows of cells of a chunk; fixed, so that the number of threads changes nothing.
 _CHUNK_ROWS = 60
@@ -149,7 +149,7 @@ class _Cells:
 class _Last:
     """The view before: where it was, and its cells."""
 
-    view: SurfaceMap
+    view: PreparedView
     T_world_camera: Float64
     cells: _Cells
 
@@ -210,16 +210,16 @@ class Moving:
     reliable: bool
     learnt: Learnt
 
-    def applied(self, view: SurfaceMap) -> SurfaceMap:
+    def applied(self, view: PreparedView) -> PreparedView:
         """Return the view without its pixels that moved."""
         return without_pixels(view, self.view)
 
-    def applied_to_reference(self, reference: SurfaceMap) -> SurfaceMap:
+    def applied_to_reference(self, reference: PreparedView) -> PreparedView:
         """Return the reference without its pixels that moved."""
         return without_pixels(reference, self.reference)
 
 
-def without_pixels(view: SurfaceMap, mask: Bool) -> SurfaceMap:
+def without_pixels(view: PreparedView, mask: Bool) -> PreparedView:
     """Return a view that has no surface at some pixels: no plane, no albedo, no noise.
 
     Their depth stays, as it tells up to where the ray was free; to keep it from being taken for a
@@ -267,7 +267,7 @@ class MovingObjects:
     keyframe; afterwards `compare` both, and `learn` the outcome. Where the masks have grown much
     beyond those (something just began to move), align once more without them: they are right before
     the pose is. `compare` takes whole views. References are recognised by their
-    `SurfaceMap.index`; one that was the last view learnt keeps what was learnt of it.
+    `PreparedView.index`; one that was the last view learnt keeps what was learnt of it.
     """
 
     def __init__(self, options: MovingOptions | None = None) -> None:
@@ -280,7 +280,7 @@ class MovingObjects:
         """Forget the last view, after which the camera was lost; references are remembered."""
         self._last = None
 
-    def predicted_mask(self, T_world_camera_predicted: Float64, view: SurfaceMap) -> Bool:
+    def predicted_mask(self, T_world_camera_predicted: Float64, view: PreparedView) -> Bool:
         """(H, W) pixels of a view, not yet aligned, that belong to what moved in the last view.
 
         An object is assumed to be nearly where it was, in the scene or before the camera: the mask
@@ -306,7 +306,7 @@ class MovingObjects:
         )  # fmt: skip
         return _pixels(moving, shape, stride)
 
-    def reference_mask(self, reference: SurfaceMap) -> Bool:
+    def reference_mask(self, reference: PreparedView) -> Bool:
         """(H, W) pixels of a keyframe that are known to have moved."""
         return _pixels(
             self._reference(reference).moving, reference.z.shape, self._stride(reference)
@@ -314,9 +314,9 @@ class MovingObjects:
 
     def compare(
         self,
-        view: SurfaceMap,
+        view: PreparedView,
         T_world_camera: Float64,
-        reference: SurfaceMap,
+        reference: PreparedView,
         T_world_reference: Float64,
         *,
         suspected: bool = False,
@@ -399,14 +399,14 @@ class MovingObjects:
     def _max_evidence(self) -> float:
         return -float(np.log(self.options.outliers))
 
-    def _stride(self, view: SurfaceMap) -> int:
+    def _stride(self, view: PreparedView) -> int:
         return -(-view.z.shape[1] // self.options.columns)
 
     @property
     def _prior(self) -> float:
         return float(np.log(self.options.prior / (1 - self.options.prior)))
 
-    def _reference(self, reference: SurfaceMap) -> _Cells:
+    def _reference(self, reference: PreparedView) -> _Cells:
         """What is known of a reference so far."""
         shape = _cell_shape(reference.z.shape, self._stride(reference))
         known = self._references.get(reference.index)
@@ -425,7 +425,7 @@ class MovingObjects:
         while len(self._references) > self.options.keyframes:
             self._references.popitem(last=False)
 
-    def _carried(self, view: SurfaceMap, T_world_camera: Float64) -> tuple[_Cells, Bool]:
+    def _carried(self, view: PreparedView, T_world_camera: Float64) -> tuple[_Cells, Bool]:
         """What is known of the cells of a view from the last one, and what arrived since."""
         options, last, stride = self.options, self._last, self._stride(view)
         shape = _cell_shape(view.z.shape, stride)
@@ -453,7 +453,9 @@ class MovingObjects:
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return _Cells(depth, odds, odds > options.detect, tracked), arrived
 
-    def _scale(self, view: SurfaceMap, moving: Bool, reference: SurfaceMap, T: Float64) -> float:
+    def _scale(
+        self, view: PreparedView, moving: Bool, reference: PreparedView, T: Float64
+    ) -> float:
         """Robust scale of the residuals between two views, in sigmas."""
         grid = reference.projection
         ratios = kernels.residual_ratios(
@@ -465,8 +467,8 @@ class MovingObjects:
 
     def _compare(
         self,
-        view: SurfaceMap,
-        other: SurfaceMap,
+        view: PreparedView,
+        other: PreparedView,
         other_moving: Bool,
         T_other_view: Float64,
         scale: float,

@@ -10,7 +10,6 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.odometry.motion import Moment, Motion
 from tofuse.odometry.sequential import SEED_STAGE
@@ -19,6 +18,7 @@ from tofuse.recordings.frames import Frame
 from tofuse.registration.any_pair import AnyPair
 from tofuse.registration.base import PROBABLE, Link, Registration
 from tofuse.registration.confidence import CERTAIN
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.reduce import extent
 
 # The motion is followed without a search once it has predicted the results of so many of the last
@@ -103,7 +103,7 @@ class _PairwiseTracker(Tracker):
         self._steady.clear()
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
         least = self._options.minimum_points

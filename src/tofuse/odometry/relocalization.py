@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from tofuse.arrays import Float64
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.keyframe_map import Keyframe, KeyframeMap
 from tofuse.registration.base import Link, Registration
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit, comparable
 from tofuse.registration.view_pair import register_pair
@@ -40,7 +40,7 @@ class Relocalizer:
 
     def links(
         self,
-        view: SurfaceMap,
+        view: PreparedView,
         keyframes: KeyframeMap,
         component: int,
         last: int | None = None,
@@ -64,7 +64,7 @@ class Relocalizer:
                     break
         return tuple(found)
 
-    def link(self, view: SurfaceMap, keyframe: Keyframe, *, adjacent: bool) -> Link | None:
+    def link(self, view: PreparedView, keyframe: Keyframe, *, adjacent: bool) -> Link | None:
         """Register a view to a keyframe, if the budget allows and the pose is probable.
 
         Views that are adjacent in time see the same place, so that a probable pose is certain.
@@ -75,14 +75,14 @@ class Relocalizer:
         certain = adjacent or found.stands_alone
         return Link(keyframe.view.index, view.index, found, certain, found.how)
 
-    def agrees(self, view: SurfaceMap, keyframe: Keyframe, T: Float64) -> bool | None:
+    def agrees(self, view: PreparedView, keyframe: Keyframe, T: Float64) -> bool | None:
         """Whether a registration without a guess finds T_keyframe_camera; None if it finds none."""
         found = self._probable(view, keyframe)
         if found is None or self._search is None:
             return None
         return not self._search.differ(found.T_target_source, T)
 
-    def _probable(self, view: SurfaceMap, keyframe: Keyframe) -> Registration | None:
+    def _probable(self, view: PreparedView, keyframe: Keyframe) -> Registration | None:
         """Register a view to a keyframe, if the budget allows; the same pair once."""
         pair = view.index, keyframe.view.index
         if pair not in self._known:

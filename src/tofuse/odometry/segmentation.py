@@ -6,11 +6,11 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.attempts import Attempt, Attempts, Reference
 from tofuse.odometry.keyframe_map import Keyframe
 from tofuse.odometry.moving import Moving, MovingObjects, without_pixels
 from tofuse.odometry.relocalization import Relocalizer
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Target
 
 # Fraction of a view that moves, from which the rest is aligned once more, and which is reported.
@@ -33,7 +33,7 @@ class Segmentation:
         self._objects.reset()
         self._moved = False
 
-    def rest_of(self, view: SurfaceMap, T_component_camera: Float64) -> SurfaceMap:
+    def rest_of(self, view: PreparedView, T_component_camera: Float64) -> PreparedView:
         """A view, expected at a pose (4, 4), without what moved in the last one."""
         if not self._moved:
             return view
@@ -101,7 +101,7 @@ class Segmentation:
         return found, moving
 
     def _segmented(
-        self, view: SurfaceMap, T: Float64, keyframe: Keyframe, *, suspected: bool
+        self, view: PreparedView, T: Float64, keyframe: Keyframe, *, suspected: bool
     ) -> Moving:
         k = keyframe
         return self._objects.compare(view, T, k.view, k.T_component_camera, suspected=suspected)

@@ -10,12 +10,12 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar
 from tofuse.registration.icp import algorithm_1
+from tofuse.registration.prepared_view import PreparedView
 
 Guess = Literal["identity", "previous", "odometry"]
 
@@ -93,7 +93,7 @@ class _SequentialTracker(Tracker):
         self._motion = np.eye(4)
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
         options, last = self._options, self._last

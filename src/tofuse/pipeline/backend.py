@@ -14,7 +14,6 @@ from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
 from tofuse.fusion.pose_errors import with_pose_errors
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.prediction import Prediction, runs, with_prediction
 from tofuse.parts import name_of
@@ -41,6 +40,7 @@ from tofuse.posegraph.refinement import Refinement, Refiner
 from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
 from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 from tofuse.results.verdict import ranked
 
@@ -110,7 +110,7 @@ class Kept:
     depths: dict[int, float]
     ambiguity_m: float | None
     knows_errors: bool
-    views: ViewStore[SurfaceMap]
+    views: ViewStore[PreparedView]
 
 
 class BackEnd:

@@ -11,10 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from tofuse import parts
+from tofuse.corrections.base import Correction
 from tofuse.errors import InputError
 from tofuse.files.reading import parsed, read_text
 from tofuse.filters.base import Filter
-from tofuse.filters.correction import Correction
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.base import Odometry
 from tofuse.posegraph.graph import Optimiser
@@ -99,6 +99,7 @@ class Config:
 
 
 ROOMS = (
+    "tofuse.corrections",
     "tofuse.filters",
     "tofuse.registration",
     "tofuse.odometry",

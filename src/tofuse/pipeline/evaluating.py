@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.corrections.base import Corrector
+from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.errors import InputError
 from tofuse.evaluation.consistency import Consistency, map_consistency, poses_of_frames
 from tofuse.evaluation.trajectory import TrajectoryError, evaluate_trajectory
 from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
-from tofuse.filters.camera_errors import CameraErrors
-from tofuse.filters.correction import Corrector
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result

@@ -22,10 +22,10 @@ from scipy.special import stdtrit
 from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
 from tofuse.kernels.alignment import LIGHT, POINT
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.projective import ProjectiveOptions, Target, align, points_of
 from tofuse.registration.verification import PATIENT
 from tofuse.registration.view_points import landing_pixels
@@ -91,7 +91,7 @@ class _Views:
     def __init__(self, recording: Recording, prepare: Prepare, options: SurfaceOptions) -> None:
         self._recording, self._prepare, self._options = recording, prepare, options
 
-    def get(self, k: int) -> SurfaceMap | None:
+    def get(self, k: int) -> PreparedView | None:
         """The k-th view; None if there is none, or none with light."""
         if k >= len(self._recording):
             return None
@@ -101,7 +101,7 @@ class _Views:
             return None
         if not isinstance(frame, RangeFrame) or not len(frame):
             return None
-        view = surface_map(frame, self._options)
+        view = prepare_view(frame, self._options)
         return view if view.has_photo else None
 
 
@@ -131,7 +131,7 @@ def _from(views: _Views, start: int, known: float) -> _Slope | None:
 
 
 def _aligned(
-    source: SurfaceMap, target: SurfaceMap, guess: Float64, known: float
+    source: PreparedView, target: PreparedView, guess: Float64, known: float
 ) -> tuple[Float64, _Slope | None] | None:
     """T_target_source (4, 4), and what the light of two views shows; None where they don't fit.
 
@@ -160,7 +160,7 @@ def _aligned(
 
 
 def _fitted(
-    source: SurfaceMap, target: SurfaceMap, guess: Float64, options: ProjectiveOptions
+    source: PreparedView, target: PreparedView, guess: Float64, options: ProjectiveOptions
 ) -> Float64 | None:
     """T_target_source (4, 4), if the views fit, and hold it in every direction."""
     found = align(source, [Target(target, np.eye(4))], guess, options)
@@ -169,7 +169,7 @@ def _fitted(
     return found.T_world_source
 
 
-def _without(view: SurfaceMap, exponent: float) -> SurfaceMap:
+def _without(view: PreparedView, exponent: float) -> PreparedView:
     """A view with the falloff taken off its albedo."""
     x, y = np.moveaxis(view.rays, -1, 0)
     length2 = 1 + x * x + y * y
@@ -178,7 +178,7 @@ def _without(view: SurfaceMap, exponent: float) -> SurfaceMap:
     return replace(view, photo=photo)
 
 
-def _slope(source: SurfaceMap, target: SurfaceMap, T: Float64) -> _Slope | None:
+def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | None:
     """Slope of the difference in log albedo over that in the log cosine; None without much motion.
 
     Parameters

@@ -10,13 +10,13 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.posegraph.joining import Stretch
 from tofuse.posegraph.outside import Sensed
 from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import FrameRecord
 
 
@@ -157,7 +157,7 @@ class FrameLog:
         ]
         return FrameLog(entries, self.interruptions, self.repeated)
 
-    def stretches(self, views: ViewStore[SurfaceMap]) -> list[Stretch]:
+    def stretches(self, views: ViewStore[PreparedView]) -> list[Stretch]:
         """The components as they were tracked, in the order in which they began."""
         members: dict[int, list[Entry]] = {}
         for entry in self.posed:

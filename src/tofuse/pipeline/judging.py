@@ -25,7 +25,6 @@ from tofuse.evaluation.sightings import Sightings, compared, prepared
 from tofuse.evaluation.trajectory import displacement, distances_between
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.pipeline.checks import bounds, images, tolerance_of
@@ -38,6 +37,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, evenly
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.card import bound, length
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import accuracy_json, plain, reasons_json, write_result
@@ -202,7 +202,7 @@ class _Images:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._views: dict[int, SurfaceMap | None] = {}
+        self._views: dict[int, PreparedView | None] = {}
 
     def under(self, poses: Float64) -> Seen:
         """Compare the frames under their poses (N, 4, 4), NaN where there is none."""
@@ -211,7 +211,7 @@ class _Images:
         chosen = [k for k, _ in found]
         return Seen(compared([view for _, view in found], poses[chosen]))
 
-    def _view(self, k: int) -> SurfaceMap | None:
+    def _view(self, k: int) -> PreparedView | None:
         """The k-th frame, prepared; None if it can't be read."""
         if k not in self._views:
             try:

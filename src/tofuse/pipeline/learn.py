@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.corrections.base import Correction
 from tofuse.filters.base import Filter
-from tofuse.filters.correction import Correction
 from tofuse.kernels.threads import threads as use_threads
 from tofuse.odometry.given import GivenPoses
 from tofuse.odometry.keyframes import Keyframes

@@ -10,7 +10,6 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.memory import give_back
 from tofuse.kernels.threads import thread_count, threads, undivided
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
 from tofuse.pipeline.assembly import Assembly
@@ -26,6 +25,7 @@ from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.frames import Frame
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import FrameRecord, Reconstruction
 
 
@@ -220,7 +220,7 @@ class Mapper:
         return self._log
 
     @property
-    def views(self) -> Sequence[PosedView[SurfaceMap]]:
+    def views(self) -> Sequence[PosedView[PreparedView]]:
         """Prepared views of frames with a pose, spaced by motion, in the order of their frames."""
         return self._kept.views.views
 

@@ -19,7 +19,6 @@ from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.given import GivenPoses, StatedPose, StatedPoses
 from tofuse.pipeline.checkpoint import NotKept
 from tofuse.pipeline.config import Config, from_method
@@ -32,6 +31,7 @@ from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
 from tofuse.results.sessions import sentences
@@ -190,7 +190,7 @@ def _told(
     result: Reconstruction,
     sessions: Sequence[Session],
     firsts: Sequence[int],
-    views: Sequence[PosedView[SurfaceMap]],
+    views: Sequence[PosedView[PreparedView]],
     recording: Recording,
 ) -> Reconstruction:
     """The result, which says what became of each session."""

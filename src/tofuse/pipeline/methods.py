@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from tofuse.corrections.multipath import Multipath
+from tofuse.corrections.noise import Noise
 from tofuse.filters.angle import NeighbourhoodAngle
 from tofuse.filters.confidence import Confidence
-from tofuse.filters.multipath import Multipath
 from tofuse.filters.neighbours import NeighbourShare
-from tofuse.filters.noise import Noise
 from tofuse.filters.wrapped import Wrapped
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.keyframes import Keyframes

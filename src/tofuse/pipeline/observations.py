@@ -12,7 +12,6 @@ from tofuse.files.spill import Scratch
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.pipeline.backend import Kept
 from tofuse.pipeline.budget import views_bytes
@@ -21,6 +20,7 @@ from tofuse.pipeline.preparation import Ready
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.samples import FrameSample, FrameSamples
 
 _KEPT_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
@@ -45,7 +45,7 @@ class Observations:
     def __init__(self, config: Config, seed: int, given: Sequence[GivenLoop]) -> None:
         ends = [frame for loop in given for frame in (loop.i, loop.j)]
         scratch = Scratch(views_bytes(config.memory_mb))
-        self.views: ViewStore[SurfaceMap] = ViewStore(Spacing(), always=ends, scratch=scratch)
+        self.views: ViewStore[PreparedView] = ViewStore(Spacing(), always=ends, scratch=scratch)
         self.loops = config.loops.start(seed, given, self.views)
         self.samples = FrameSamples()
         self._refiner = config.refinement.start(self.views)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.errors import UnreadableFrameError
-from tofuse.filters.camera_errors import CameraErrors
 from tofuse.fusion.texture import LitView, Textured, textured
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads as use_threads

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.filters.base import Removal, apply_filters
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Tracker
 from tofuse.pipeline.config import Config, check_views
 from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.prepared_view import PreparedView
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Ready:
     filtered: Frame
     clean: Frame
     removals: tuple[Removal, ...]
-    surface: SurfaceMap | None = None
+    surface: PreparedView | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.arrays import Float32, Float64
+from tofuse.corrections.noise import Noise
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.ply import read_ply
 from tofuse.filters.confidence import Confidence
-from tofuse.filters.noise import Noise
 from tofuse.geometry import se3
 from tofuse.pipeline.checkpoint import NotKept, Stages
 from tofuse.pipeline.config import Config, ViewKind, from_method, kind_of

@@ -11,9 +11,10 @@ from typing import Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.corrections.raw_amplitude import wrapped_light
+from tofuse.corrections.unwrap import Unwrap
 from tofuse.errors import InputError
 from tofuse.filters.base import apply_filters
-from tofuse.filters.unwrap import Unwrap, wrapped_light
 from tofuse.inspection.finding import Finding
 from tofuse.inspection.inspect import inspect_recording
 from tofuse.parts import name_of

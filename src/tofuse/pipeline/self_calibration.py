@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.filters.camera_errors import CameraErrors
+from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.suspicion import Suspicion

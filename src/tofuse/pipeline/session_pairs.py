@@ -11,13 +11,13 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.evaluation.changes import changes
 from tofuse.evaluation.sightings import Sightings, compared
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import evenly
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.sessions import AS_GOOD_AS_CERTAIN
 from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
 
-View = PosedView[SurfaceMap]
+View = PosedView[PreparedView]
 
 # Views of each session that are compared with those of the others.
 _COMPARED = 60

@@ -19,7 +19,6 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.views import RangeView
 from tofuse.geometry import se3
 from tofuse.kernels.alignment import PIXEL_SIZE, POINT_SIZE
-from tofuse.maps.surface_map import Projection, SurfaceMap
 from tofuse.odometry.base import Step
 from tofuse.odometry.keyframe_map import Keyframe
 from tofuse.pipeline.frame_log import Entry
@@ -27,6 +26,7 @@ from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.refinement import Refinement
 from tofuse.posegraph.views import Outline, PosedView
 from tofuse.registration.base import Registration
+from tofuse.registration.prepared_view import PreparedView, Projection
 from tofuse.results.samples import FrameSample
 from tofuse.results.types import FrameRecord
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # Type and sizes of arrays; letters stand for any, within one object the same. An exclamation mark:
 # all are finite. Attributes that an object lacks, or that are None, are not looked at.
 _ARRAYS: dict[type, dict[str, str]] = {
-    SurfaceMap: {
+    PreparedView: {
         "rays": "f4 H W 2", "z": "f4 H W", "sigma": "f4 H W", "planes": "f4 H W 4",
         "plane_variance": "f4 H W", "photo": "f4 H W 3", "pixel_variance": "f4 H W",
         "target": f"f4 H W {PIXEL_SIZE}",

@@ -31,13 +31,13 @@ Arrays = dict[str, NDArray[Any]]
 
 # Whose classes may take part.
 _ROOMS = (
+    "corrections",
     "evaluation",
     "files.spill",
     "filters",
     "fusion",
     "geometry",
     "lab.methods",
-    "maps",
     "odometry",
     "pipeline.backend",
     "pipeline.behind",

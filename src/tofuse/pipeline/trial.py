@@ -26,10 +26,10 @@ from scipy.special import stdtrit
 from tofuse.arrays import Float32, Float64, Intp
 from tofuse.errors import UnreadableFrameError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.projective import (
     Aligned,
     Level,
@@ -172,12 +172,12 @@ def trial(recording: Recording, without: Prepare, corrected: Prepare, doubt: flo
 class _View:
     """A view without the correction, and by which share of z (H, W) that would move its points."""
 
-    surface: SurfaceMap
+    surface: PreparedView
     change: Float32
 
     @classmethod
     def of(cls, without: RangeFrame, corrected: RangeFrame) -> _View:
-        surface = surface_map(without, _VIEW)
+        surface = prepare_view(without, _VIEW)
         both = without.valid & corrected.valid
         share = np.where(both, corrected.z / np.where(both, without.z, 1) - 1, np.nan)
         rows, columns = surface.z.shape
@@ -353,7 +353,7 @@ def _compared(
     return J, distance, weight
 
 
-def _landed(view: SurfaceMap, points: Float64) -> tuple[Intp, ...]:
+def _landed(view: PreparedView, points: Float64) -> tuple[Intp, ...]:
     """Row and column (M,) of the pixels of a view that points (M, 3) land on, and if they do."""
     grid = view.projection
     ahead = points[:, 2] > 1e-3

@@ -18,10 +18,10 @@ from scipy.stats import chi2
 
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.trust import joint_covariance, pose_covariances
 from tofuse.posegraph.views import PosedView
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
 
 _LEVEL = 0.95
@@ -114,7 +114,7 @@ def degenerate_directions(
     graph: PoseGraph,
     unobservable: Mapping[int, Float64],
     own: Collection[tuple[int, int]],
-    views: Mapping[int, PosedView[SurfaceMap]],
+    views: Mapping[int, PosedView[PreparedView]],
     stated: Collection[tuple[int, int]] = (),
 ) -> list[Float64]:
     """For every edge the directions that it does not measure: (k, 6), right perturbations of j.

@@ -25,7 +25,6 @@ from scipy.sparse.csgraph import dijkstra
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels.motion import moved, twist_between
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.cut_edges import cut_edges, sides_without
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
@@ -39,13 +38,14 @@ from tofuse.registration.likeness import (
     mutual_unlikeness,
     unlikeness_of_pairs,
 )
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import IN_SIGHT, PATIENT, UsualFit, self_scaled
 from tofuse.registration.view_pair import follow, register_pair
 
 How = Literal["links", "motion"]
-View = PosedView[SurfaceMap]
+View = PosedView[PreparedView]
 
 # Pairs of neighbouring views from which is learnt how views of this camera fit.
 _LEARN = 16

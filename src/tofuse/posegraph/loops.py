@@ -10,12 +10,12 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1
+from tofuse.registration.prepared_view import PreparedView
 
 # Keeps the draws of loops apart from those of other stages that register the same pair.
 SEED_STAGE = 2
@@ -131,7 +131,7 @@ class LoopDetector(Protocol):
 
     part_kind: ClassVar[str] = "loops"
 
-    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
+    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
         """Begin a new recording.
 
         Parameters

@@ -9,7 +9,6 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.loops import (
     ClosedLoop,
@@ -22,6 +21,7 @@ from tofuse.posegraph.loops import (
 )
 from tofuse.posegraph.views import ViewStore
 from tofuse.recordings.frames import Frame
+from tofuse.registration.prepared_view import PreparedView
 
 
 @part("loops", "nearby", label="validated")
@@ -60,7 +60,7 @@ class Nearby(LoopDetector):
         if self.per_frame < 0:
             raise ValueError(f"per_frame is {self.per_frame}, not 0 or more")
 
-    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
+    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
         """See `LoopDetector.start`. What a person gives takes the place of what is found."""
         return _NearbyLoops(self, seed, given)
 

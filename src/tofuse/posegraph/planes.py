@@ -9,7 +9,6 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.common_planes import CHANCE, Aligned, PlaneOptions, refine_clouds
@@ -23,6 +22,7 @@ from tofuse.posegraph.refinement import (
 )
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import Frame
+from tofuse.registration.prepared_view import PreparedView
 
 
 @part("refinement", "planes")
@@ -57,7 +57,7 @@ class Planes(Refining):
         if not 0 <= self.loss <= 1:
             raise ValueError(f"loss is {self.loss}, not 0 to 1")
 
-    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
         return _Planes(self)
 

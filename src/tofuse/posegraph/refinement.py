@@ -13,7 +13,6 @@ from tofuse.arrays import Bool, Float32, Float64, Intp
 from tofuse.files.spill import Spill
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.outside import Told
@@ -22,6 +21,7 @@ from tofuse.posegraph.submaps import InSubmap, fell, refine_submaps
 from tofuse.posegraph.suspicion import Suspicion, loop_gap, of_submaps, suspicion
 from tofuse.posegraph.views import KeptView, Outline, PosedView, Spilled, ViewStore
 from tofuse.recordings.frames import Frame
+from tofuse.registration.prepared_view import PreparedView
 
 CameraError = Literal["offset", "scale", "focal"]
 
@@ -103,7 +103,7 @@ class Refining(Protocol):
 
     part_kind: ClassVar[str] = "refinement"
 
-    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """Begin a new recording; prepared views are added to `views` as they come."""
         ...
 
@@ -113,7 +113,7 @@ class Refining(Protocol):
 class NoRefinement(Refining):
     """Leaves the poses as the optimiser found them."""
 
-    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
         return _Idle()
 
@@ -142,7 +142,7 @@ class Known(Refining):
     measured: tuple[Measured, ...]
     stated: tuple[Measured, ...]
 
-    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
         return _Known(self)
 
@@ -195,7 +195,7 @@ class Joint(Refining):
         if not 10 <= self.submap <= 100_000:
             raise ValueError(f"submap is {self.submap}, not 10 to 100000")
 
-    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
         return _Joint(self, views)
 
@@ -203,7 +203,7 @@ class Joint(Refining):
 class _Joint(Refiner):
     points: ClassVar[bool] = False
 
-    def __init__(self, options: Joint, views: ViewStore[SurfaceMap]) -> None:
+    def __init__(self, options: Joint, views: ViewStore[PreparedView]) -> None:
         self._options = options
         self._store = views
 
@@ -242,10 +242,10 @@ class _Joint(Refiner):
 
 def _together(
     options: Joint,
-    posed: Sequence[PosedView[SurfaceMap]],
+    posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
     told: Told,
-    _: ViewStore[SurfaceMap],
+    _: ViewStore[PreparedView],
 ) -> tuple[Refined, Callable[[], Suspicion]]:
     """Refine all views at once; returns also what tells what they say of their camera."""
     views = [_kept(p, options) for p in posed]
@@ -259,10 +259,10 @@ def _together(
 
 def _in_submaps(
     options: Joint,
-    posed: Sequence[PosedView[SurfaceMap]],
+    posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
     told: Told,
-    store: ViewStore[SurfaceMap],
+    store: ViewStore[PreparedView],
 ) -> tuple[Refined, Callable[[], Suspicion]]:
     """Refine views submap by submap; returns also what tells what they say of their camera."""
     ids = [p.index for p in posed]
@@ -296,7 +296,7 @@ class _Seen:
         return self.kept.get()
 
 
-def _kept(posed: PosedView[SurfaceMap], options: Joint) -> KeptView:
+def _kept(posed: PosedView[PreparedView], options: Joint) -> KeptView:
     return KeptView.of(posed.view.once().bare(), options.refine.points)
 
 

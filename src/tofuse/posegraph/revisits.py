@@ -12,7 +12,6 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels.spread import executor
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
 from tofuse.posegraph.graph import LoopRecord
@@ -38,12 +37,13 @@ from tofuse.posegraph.views import (
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registration
 from tofuse.registration.likeness import look_of
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.verification import UsualFit
 from tofuse.registration.view_pair import follow, register_pair
 
-View = PosedView[SurfaceMap]
+View = PosedView[PreparedView]
 
 _POINTS = 600
 # The trajectory has drifted when a loop closes: little, or much. Neighbouring pixels share their
@@ -139,7 +139,7 @@ class Revisits(LoopDetector):
         if not 0.5 <= self.unusual <= 100:
             raise ValueError(f"unusual is {self.unusual}, not 0.5 to 100")
 
-    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]) -> Loops:
+    def start(self, seed: int, given: Sequence[GivenLoop], views: ViewStore[PreparedView]) -> Loops:
         """See `LoopDetector.start`. There is nothing random in it."""
         return _RevisitLoops(self, given, views)
 
@@ -170,11 +170,11 @@ class _RevisitLoops(Loops):
     points: ClassVar[bool] = False
 
     def __init__(
-        self, options: Revisits, given: Sequence[GivenLoop], views: ViewStore[SurfaceMap]
+        self, options: Revisits, given: Sequence[GivenLoop], views: ViewStore[PreparedView]
     ) -> None:
         self._options = options
         self._store = views
-        self._chosen: ViewStore[SurfaceMap] = ViewStore(options.spacing)
+        self._chosen: ViewStore[PreparedView] = ViewStore(options.spacing)
         self._poses: dict[int, Float64] = {}
         self._given_loops = given
         self._seen: dict[int, _Seen] = {}
@@ -307,7 +307,7 @@ class _RevisitLoops(Loops):
 
     def _guessed(
         self, target: View, source: View
-    ) -> tuple[SurfaceMap, SurfaceMap, Float64, UsualFit]:
+    ) -> tuple[PreparedView, PreparedView, Float64, UsualFit]:
         """What `register_near` takes, from where the trajectory has two views."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Else all views would keep, until the end, what they are compared with here.
@@ -448,14 +448,14 @@ class _RevisitLoops(Loops):
 
 
 def register_near(
-    source: SurfaceMap, target: SurfaceMap, guess: Float64, usual: UsualFit
+    source: PreparedView, target: PreparedView, guess: Float64, usual: UsualFit
 ) -> Registration | None:
     """Register two views from T_target_source as the trajectory has it."""
     return follow(source, target, guess, usual=usual)
 
 
 def register_anywhere(
-    source: SurfaceMap, target: SurfaceMap, usual: UsualFit, options: SearchOptions
+    source: PreparedView, target: PreparedView, usual: UsualFit, options: SearchOptions
 ) -> Registration | None:
     """Search two views in each other without a guess."""
     return register_pair(source, target, usual=usual, options=options)

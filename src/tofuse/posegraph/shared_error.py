@@ -20,7 +20,7 @@ import numpy as np
 from tofuse.arrays import Float32, Float64, Int64
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 
 # Patches in a row, and rows of patches; errors this far apart are still alike (by 1/e), as a share
 # of the image's width, as the tracker's covariance has it.
@@ -37,7 +37,7 @@ _UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3 + [1.0])
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
 
 
-def patches_of(points: Float32, surface: SurfaceMap) -> Int64:
+def patches_of(points: Float32, surface: PreparedView) -> Int64:
     """(N,) the patch of each point of a view."""
     rays = points[:, :2] / points[:, 2:3]
     low, high = np.nanmin(surface.rays, (0, 1)), np.nanmax(surface.rays, (0, 1))
@@ -54,7 +54,7 @@ def _alike(aspect: float) -> Float64:
     return np.exp(-np.hypot(x[:, None] - x, y[:, None] - y) / _REACH)
 
 
-def alike(surface: SurfaceMap) -> Float64:
+def alike(surface: PreparedView) -> Float64:
     """(PATCHES, PATCHES) correlation of the errors of the patches of a view."""
     rows, columns = surface.z.shape
     return _alike(rows / columns)

@@ -17,8 +17,8 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.alignment import POINT, POINT_SIZE, SIGMA
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import Projection, SurfaceMap
 from tofuse.posegraph import shared_error
+from tofuse.registration.prepared_view import PreparedView, Projection
 from tofuse.registration.projective import points_of
 
 # Of every view, to tell which views overlap: so many points, and an image of this width.
@@ -78,11 +78,11 @@ class Outlined(Protocol):
 class KeptView:
     """A prepared view of few pixels, and the points that it gives as a source."""
 
-    surface: SurfaceMap
+    surface: PreparedView
     points: Float32
 
     @classmethod
-    def of(cls, surface: SurfaceMap, points: int) -> KeptView:
+    def of(cls, surface: PreparedView, points: int) -> KeptView:
         """Take about so many points of a view."""
         every = max(1, round(np.sqrt(surface.z.size / points)))
         return cls(surface, points_of(surface, every))

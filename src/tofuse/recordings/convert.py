@@ -22,7 +22,7 @@ from tofuse.recordings.native import (
     same_distortion,
 )
 from tofuse.recordings.recording import Recording
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 
 FINEST_UNIT_M = 1e-4
 FINEST_SIGMA_M = 1e-5

@@ -41,7 +41,7 @@ from tofuse.recordings.frames import (
 )
 from tofuse.recordings.imu import gravity_at
 from tofuse.recordings.sources import FileSource, check_timestamps, ply_frame, tum_poses
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.frequencies import DISAGREEMENT, combined
 from tofuse.sensor.models import SPEED_OF_LIGHT
 

@@ -11,7 +11,7 @@ from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import ViewPoints
 
 _CHUNK_POINTS = 6000
@@ -106,8 +106,8 @@ class Agreement:
 
 
 def agreement(
-    source: SurfaceMap,
-    target: SurfaceMap,
+    source: PreparedView,
+    target: PreparedView,
     T_target_source: Float64,
     options: AgreementOptions | None = None,
 ) -> Agreement:
@@ -132,12 +132,12 @@ class Comparison:
         the source to the target, and back.
     """
 
-    ways: tuple[tuple[ViewPoints, SurfaceMap, Float32], tuple[ViewPoints, SurfaceMap, Float32]]
+    ways: tuple[tuple[ViewPoints, PreparedView, Float32], tuple[ViewPoints, PreparedView, Float32]]
     options: AgreementOptions
 
     @classmethod
     def of(
-        cls, source: SurfaceMap, target: SurfaceMap, options: AgreementOptions | None = None
+        cls, source: PreparedView, target: PreparedView, options: AgreementOptions | None = None
     ) -> Comparison:
         """Prepare two views."""
         options = AgreementOptions() if options is None else options
@@ -178,7 +178,7 @@ class Comparison:
         )
 
 
-def nearest_depth(view: SurfaceMap) -> Float32:
+def nearest_depth(view: PreparedView) -> Float32:
     """(H, W) least z in m among the neighbours of a pixel, 0 where it is invalid itself.
 
     Pixels without a plane are often at edges, where they mix the depths of both sides.
@@ -189,7 +189,7 @@ def nearest_depth(view: SurfaceMap) -> Float32:
 
 def _one_way(
     points: ViewPoints,
-    view: SurfaceMap,
+    view: PreparedView,
     nearest: Float32,
     T: Float64,
     options: AgreementOptions,

@@ -12,12 +12,12 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.cloud_pair import follow_clouds, measured_as_clouds, register_clouds
 from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.uncertainty import UncertaintyOptions
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import follow, register_pair
@@ -122,11 +122,11 @@ def _registered_as_images(
     return None if found is None else found.between(T_target_camera, T_camera_source)
 
 
-def _as_image(view: Frame) -> tuple[SurfaceMap, Float64] | None:
+def _as_image(view: Frame) -> tuple[PreparedView, Float64] | None:
     """A view as its camera saw it, and T_view_camera (4, 4); None for clouds from no viewpoint."""
     options = SurfaceOptions()
     if isinstance(view, RangeFrame):
-        return surface_map(view, options), np.eye(4)
+        return prepare_view(view, options), np.eye(4)
     viewpoint = viewpoint_of(view)
     image = None if viewpoint is None else as_image(view, viewpoint)
-    return None if image is None else (surface_map(image[0], options), image[1])
+    return None if image is None else (prepare_view(image[0], options), image[1])

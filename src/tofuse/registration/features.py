@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.keypoints import Detector, Keypoints, Light, keypoints
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,
@@ -108,10 +108,10 @@ class Features(Registrar):
         rival = max((share for k, share in enumerate(shares) if k != best), default=0.0)
         return registration_of(pairs, found[best], shares[best] - max(rival, 0.0))
 
-    def _found(self, view: Frame) -> tuple[Keypoints, SurfaceMap]:
+    def _found(self, view: Frame) -> tuple[Keypoints, PreparedView]:
         if not isinstance(view, RangeFrame):
             raise RegistrationError("is no image", where=f"frame {view.index}")
-        surface = surface_map(view, self.surface)
+        surface = prepare_view(view, self.surface)
         points = keypoints(
             view,
             surface,

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64
 from tofuse.kernels import search as kernels
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.view_points import ViewPoints
 
 
@@ -62,7 +62,7 @@ _KNOWN_TILT = np.radians(10.0)
 
 
 def find_floors(
-    views: tuple[SurfaceMap, SurfaceMap],
+    views: tuple[PreparedView, PreparedView],
     options: FloorOptions | None = None,
     gravity: tuple[Float64, Float64] | None = None,
 ) -> tuple[Floor, Floor] | None:
@@ -85,7 +85,7 @@ def find_floors(
     return None
 
 
-def find_floor(view: SurfaceMap, down: Float64, options: FloorOptions) -> Floor | None:
+def find_floor(view: PreparedView, down: Float64, options: FloorOptions) -> Floor | None:
     """Find the largest plane across `down` (3,) that has nothing below it, or None."""
     seen = ViewPoints.of(view, _POINTS)
     p, n = seen.points.astype(float), seen.normals.astype(float)

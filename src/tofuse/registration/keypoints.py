@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.errors import RegistrationError
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.registration.prepared_view import PreparedView
 
 Detector = Literal["sift", "orb", "fast"]
 Light = Literal["auto", "albedo", "color"]
@@ -94,7 +94,7 @@ def light_image(frame: RangeFrame, light: Light) -> UInt8:
 
 def keypoints(
     frame: RangeFrame,
-    surface: SurfaceMap,
+    surface: PreparedView,
     *,
     detector: Detector,
     light: Light,
@@ -152,7 +152,7 @@ def _strongest(found: Any, count: int) -> list[Any]:
 
 
 def _placed(
-    surface: SurfaceMap, pixels: Float64, width: int, blur_px: float
+    surface: PreparedView, pixels: Float64, width: int, blur_px: float
 ) -> tuple[Float64, Float64, Bool]:
     """Points (n, 3) of pixels (n, 2) of an image so wide, variances (n,), and which are known.
 

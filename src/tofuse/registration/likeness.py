@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from tofuse.arrays import Float32, Float64, Intp
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 
 _ROWS, _COLUMNS = 9, 12
 _CHUNKS = 16
@@ -26,7 +26,7 @@ _LIT = 0.2
 _COMPONENTS, _ANSWERS = 8, 6
 
 
-def look_of(view: SurfaceMap) -> Float32:
+def look_of(view: PreparedView) -> Float32:
     """(2, 9, 12) mean log depth and log albedo of each cell, NaN where little is known."""
     rows, columns = view.z.shape
     i = np.arange(rows) * _ROWS // rows

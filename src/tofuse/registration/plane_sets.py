@@ -12,11 +12,11 @@ import numpy as np
 from tofuse.arrays import Bool, Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.view_points import ViewPoints
 
 # Points of a view, and points from which planes are tried in each round of RANSAC.
@@ -126,12 +126,12 @@ class PlaneSets(Registrar):
         margin = shares[best] - max(rival, 0.0)
         return self._told(a, b, pairs, T, len(poses), depth, margin)
 
-    def _prepared(self, view: Frame) -> SurfaceMap:
+    def _prepared(self, view: Frame) -> PreparedView:
         if not isinstance(view, RangeFrame):
             raise RegistrationError("is no image", where=f"frame {view.index}")
-        return surface_map(view, self.surface)
+        return prepare_view(view, self.surface)
 
-    def found(self, view: SurfaceMap, rng: np.random.Generator) -> list[Plane]:
+    def found(self, view: PreparedView, rng: np.random.Generator) -> list[Plane]:
         """Planes of a view by RANSAC, the largest first.
 
         A point and its normal make a plane; of those tried, that with the most points on it is

@@ -17,8 +17,8 @@ from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels import steps
 from tofuse.kernels.middle import median
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.base import Registration
+from tofuse.registration.prepared_view import PreparedView
 
 # A direction is held if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
@@ -109,7 +109,7 @@ class ProjectiveOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
 
-def points_of(view: SurfaceMap, stride: int) -> Float32:
+def points_of(view: PreparedView, stride: int) -> Float32:
     """Every `stride`-th pixel of every `stride`-th row that has a plane, as the kernels take it.
 
     The points lie on the fitted surface, as the target's do: what smoothing does to a curved
@@ -122,7 +122,7 @@ def points_of(view: SurfaceMap, stride: int) -> Float32:
 class Target:
     """A view to align with, and where it is: T_target_world."""
 
-    view: SurfaceMap
+    view: PreparedView
     T_target_world: Float64
 
 
@@ -233,7 +233,7 @@ def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> R
 
 
 def align(
-    source: SurfaceMap,
+    source: PreparedView,
     targets: Sequence[Target],
     T_world_predicted: Float64,
     options: ProjectiveOptions,

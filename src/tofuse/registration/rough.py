@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.arrays import Float32
 from tofuse.kernels.surface import fit_planes
 from tofuse.kernels.threads import run_chunks
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 
 _CHUNKS = 4
 # Share of the depth by which a surface may be off its plane, and half width of a plane as a share
@@ -18,7 +18,7 @@ _CHUNKS = 4
 _ROUGH, _WINDOW = 0.01, 0.016
 
 
-def with_rough_planes(view: SurfaceMap) -> SurfaceMap:
+def with_rough_planes(view: PreparedView) -> PreparedView:
     """Return the view with wide planes, of median depths, where it has none of its own.
 
     The tracker wants planes that are as good as the noise of the view says. A grazed floor is

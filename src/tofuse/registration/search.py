@@ -19,7 +19,6 @@ from tofuse.arrays import Bool, Float32, Float64
 from tofuse.geometry import se3
 from tofuse.kernels import search as kernels
 from tofuse.kernels.threads import run_all, run_chunks
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import (
     Agreement,
     AgreementOptions,
@@ -27,6 +26,7 @@ from tofuse.registration.agreement import (
     nearest_depth,
 )
 from tofuse.registration.floor import Floor, FloorOptions, find_floors
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import Level, ProjectiveOptions, Target, align
 from tofuse.registration.rough import with_rough_planes
 from tofuse.registration.view_points import ViewPoints
@@ -231,8 +231,8 @@ class _View:
 
 
 def search(
-    source: SurfaceMap,
-    target: SurfaceMap,
+    source: PreparedView,
+    target: PreparedView,
     options: SearchOptions | None = None,
     *,
     gravity: tuple[Float64, Float64] | None = None,
@@ -265,8 +265,8 @@ class Search:
         How they are judged.
     """
 
-    source: SurfaceMap
-    target: SurfaceMap
+    source: PreparedView
+    target: PreparedView
     compared: Comparison
     options: SearchOptions
     s: _View
@@ -274,7 +274,7 @@ class Search:
 
     @classmethod
     def of(
-        cls, source: SurfaceMap, target: SurfaceMap, options: SearchOptions | None = None
+        cls, source: PreparedView, target: PreparedView, options: SearchOptions | None = None
     ) -> Search | None:
         """Prepare two views; None where one has too few surfaces to be searched with."""
         options = SearchOptions() if options is None else options
@@ -348,7 +348,7 @@ class Search:
         return _distinct([*kept, *rest], options)
 
 
-def _prepare(view: SurfaceMap) -> _View:
+def _prepare(view: PreparedView) -> _View:
     """Look a view up on a pinhole grid."""
     rays = view.rays[view.planes[..., 3] > 0]
     if len(rays) < _LEAST_POINTS:

@@ -27,7 +27,7 @@ from tofuse.arrays import Float64
 from tofuse.kernels import tiles as kernels
 from tofuse.kernels.middle import median
 from tofuse.kernels.motion import distance_and_angle
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target
 
 _UPPER7 = np.triu_indices(7)
@@ -130,7 +130,7 @@ class Patches:
 
 
 def patches(
-    source: SurfaceMap,
+    source: PreparedView,
     targets: Sequence[Target],
     aligned: Aligned,
     alignment: ProjectiveOptions,
@@ -222,7 +222,7 @@ def covariance_of_patches(found: Patches, options: UncertaintyOptions) -> Float6
 
 
 def covariance(
-    source: SurfaceMap,
+    source: PreparedView,
     targets: Sequence[Target],
     aligned: Aligned,
     alignment: ProjectiveOptions,

@@ -14,10 +14,10 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import CERTAIN, CONTRADICTION, Evidence
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import (
     UNITS,
     Aligned,
@@ -79,8 +79,8 @@ class _Pose:
 
 
 def register_pair(
-    source: SurfaceMap,
-    target: SurfaceMap,
+    source: PreparedView,
+    target: PreparedView,
     guess: Float64 | None = None,
     *,
     usual: UsualFit | None = None,
@@ -130,8 +130,8 @@ def register_pair(
 
 
 def follow(
-    source: SurfaceMap,
-    target: SurfaceMap,
+    source: PreparedView,
+    target: PreparedView,
     guess: Float64,
     *,
     usual: UsualFit | None = None,
@@ -153,8 +153,8 @@ def follow(
 class _Pair:
     """Two views, and how they are compared."""
 
-    source: SurfaceMap
-    target: SurfaceMap
+    source: PreparedView
+    target: PreparedView
     usual: UsualFit
     options: SearchOptions
     uncertainty: UncertaintyOptions | None
@@ -162,8 +162,8 @@ class _Pair:
     @classmethod
     def of(
         cls,
-        source: SurfaceMap,
-        target: SurfaceMap,
+        source: PreparedView,
+        target: PreparedView,
         usual: UsualFit | None,
         options: SearchOptions | None,
         uncertainty: UncertaintyOptions | None,
@@ -287,5 +287,5 @@ class _Pair:
         return C
 
 
-def _at(view: SurfaceMap) -> list[Target]:
+def _at(view: PreparedView) -> list[Target]:
     return [Target(view, np.eye(4))]

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Intp
 from tofuse.kernels.alignment import LIGHT, NORMAL, POINT, SIGMA
-from tofuse.maps.surface_map import SurfaceMap
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import points_of
 
 
@@ -32,7 +32,7 @@ class ViewPoints:
     light: Float32
 
     @classmethod
-    def of(cls, view: SurfaceMap, count: int) -> ViewPoints:
+    def of(cls, view: PreparedView, count: int) -> ViewPoints:
         """Take about `count` pixels that have a plane, evenly over the image."""
         there = view.planar_share * view.z.size
         packed = points_of(view, max(1, round(float(np.sqrt(there / count)))))
@@ -45,7 +45,7 @@ class ViewPoints:
         )
 
 
-def landing_pixels(view: SurfaceMap, points: Float64) -> Intp:
+def landing_pixels(view: PreparedView, points: Float64) -> Intp:
     """(N, 2) column and row of the pixels that points (N, 3) land on; -1 outside."""
     lookup, (x0, y0, per_x, per_y) = view.projection.lookup, view.projection.frame
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)

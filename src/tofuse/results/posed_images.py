@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8, UInt16
+from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.files.atomic import make_folder
 from tofuse.files.images import write_png
 from tofuse.files.ply import read_ply
-from tofuse.filters.camera_errors import CameraErrors
 from tofuse.fusion.texture import LitView
 from tofuse.geometry.cameras import Camera, Pinhole, ray_lengths, scaled
 from tofuse.recordings.frames import RangeFrame

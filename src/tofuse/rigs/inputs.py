@@ -11,12 +11,12 @@ import numpy as np
 
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.filters.base import apply_filters
-from tofuse.maps.surface_map import SurfaceMap, SurfaceOptions, surface_map
 from tofuse.pipeline.config import Config, from_method
 from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
 _MOST_CAMERAS = 64
 
@@ -78,9 +78,9 @@ class Camera:
         filtered, _ = apply_filters(self.config.filters, frame, ())
         return filtered if isinstance(filtered, RangeFrame) else frame
 
-    def surface(self, frame: RangeFrame) -> SurfaceMap:
+    def surface(self, frame: RangeFrame) -> PreparedView:
         """An image as it is compared."""
-        return surface_map(self.corrected(frame), SurfaceOptions())
+        return prepare_view(self.corrected(frame), SurfaceOptions())
 
 
 def open_cameras(paths: Sequence[str | Path], format: str | None = None) -> list[Camera]:  # noqa: A002

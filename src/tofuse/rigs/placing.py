@@ -20,11 +20,11 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_all
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.views import KeptView
 from tofuse.registration.agreement import Comparison
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.confidence import BELIEVED, Evidence
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.search import Search, SearchOptions
 from tofuse.registration.verification import comparable
 from tofuse.registration.view_pair import register_pair
@@ -68,7 +68,7 @@ class Placement:
     reasons: dict[int, str]
 
 
-def place(cameras: Sequence[Sequence[SurfaceMap | None]]) -> Placement:
+def place(cameras: Sequence[Sequence[PreparedView | None]]) -> Placement:
     """Place cameras that stand still against each other.
 
     Parameters
@@ -98,7 +98,7 @@ class _Set:
 
 
 class _Placer:
-    def __init__(self, cameras: Sequence[Sequence[SurfaceMap | None]]) -> None:
+    def __init__(self, cameras: Sequence[Sequence[PreparedView | None]]) -> None:
         self._views = cameras
         self._depth = {
             c: float(np.median([v.depth for v in views if v is not None]))
@@ -147,7 +147,7 @@ class _Placer:
                 kept.append(poses[k])
         self._proposals[a, b] = np.array(kept[:_PROPOSALS]).reshape(-1, 4, 4)
 
-    def _found(self, target: SurfaceMap, source: SurfaceMap) -> Float64:
+    def _found(self, target: PreparedView, source: PreparedView) -> Float64:
         """Poses T_target_source (N, 4, 4) that a pair of views proposes."""
         near = register_pair(source, target)
         poses = [] if near is None else [near.T_target_source]

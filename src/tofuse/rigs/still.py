@@ -14,13 +14,13 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.pipeline.progress import Progress
 from tofuse.posegraph.views import KeptView
 from tofuse.recordings.background import FarSurface, far_surface
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.still import average_of, motion_between
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.inputs import Camera
 from tofuse.rigs.joint import Placed, View, distances_between, refine_together
@@ -116,7 +116,7 @@ def _with_clock_errors(
     order: Sequence[int],
     placed: Placed,
     offsets: Float64,
-    instants: Sequence[Sequence[SurfaceMap | None]],
+    instants: Sequence[Sequence[PreparedView | None]],
 ) -> Placed:
     """Add to the covariances what clocks leave open: how far poses move if one is a frame late."""
     at = _common_times(cameras, offsets)
@@ -132,7 +132,7 @@ def _with_clock_errors(
     return replace(placed, covariance=blocks)
 
 
-def _views(instants: Sequence[Sequence[SurfaceMap | None]], order: Sequence[int]) -> list[View]:
+def _views(instants: Sequence[Sequence[PreparedView | None]], order: Sequence[int]) -> list[View]:
     """The views of the placed cameras, numbered in their order."""
     count = max((len(row) for row in instants), default=1)
     points = int(np.clip(_ALL_POINTS / count, _LEAST_POINTS, _POINTS))
@@ -198,7 +198,7 @@ def _finer_offsets(
     return out
 
 
-def _kept(surface: SurfaceMap | None) -> KeptView | None:
+def _kept(surface: PreparedView | None) -> KeptView | None:
     return None if surface is None else KeptView.of(surface, _LEAST_POINTS)
 
 
@@ -225,7 +225,7 @@ def _least(lags: Float64, costs: Float64) -> float | None:
 
 def _instants(
     cameras: Sequence[Camera], notes: list[str]
-) -> tuple[Float64, list[list[SurfaceMap | None]]]:
+) -> tuple[Float64, list[list[PreparedView | None]]]:
     """Time offsets (K,), and for each camera its views of all instants."""
     offsets = np.zeros(len(cameras))
     sampled = [camera.images(_LOOKED_AT) for camera in cameras]
@@ -237,13 +237,13 @@ def _instants(
     return offsets, [_at_times(c, o, at) for c, o in zip(cameras, offsets, strict=True)]
 
 
-def _at_times(camera: Camera, offset: float, at: Float64) -> list[SurfaceMap | None]:
+def _at_times(camera: Camera, offset: float, at: Float64) -> list[PreparedView | None]:
     """Views of a camera at the rig's times; None where it has none."""
     times = camera.recording.timestamps + offset
     near = np.abs(times[None] - at[:, None]).argmin(1)
     apart = np.abs(times[near] - at)
     interval = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
-    row: list[SurfaceMap | None] = []
+    row: list[PreparedView | None] = []
     for k, far in zip(near, apart, strict=True):
         frame = camera.image(int(k)) if far <= _SAME_INSTANT * interval else None
         row.append(None if frame is None else camera.surface(frame))

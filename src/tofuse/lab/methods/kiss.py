@@ -13,13 +13,13 @@ from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.odometry.base import Odometry, Step, Tracker
 from tofuse.parts import part
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.base import Registration
 from tofuse.registration.interfaces import Alignment, Matches, Points
 from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.prepared_view import PreparedView
 
 # Of the range: edges of the map's voxels, the first threshold's sigma and the smallest motion that
 # it learns from (the paper: 1 m, 2 m and 0.1 m of 100 m).
@@ -137,7 +137,7 @@ class _KissTracker(Tracker):
         self._motion = np.eye(4)
 
     def push(
-        self, frame: Frame, T_odometry: Float64 | None = None, surface: SurfaceMap | None = None
+        self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
     ) -> Step:
         """See `Tracker.push`; raises nothing for frames without points."""
         if len(frame) < self._options.minimum_points:

@@ -17,12 +17,12 @@ from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
-from tofuse.maps.surface_map import SurfaceMap
 from tofuse.posegraph.outside import Told
 from tofuse.posegraph.planes import KeptPoints
 from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
 from tofuse.posegraph.views import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
+from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.shape import shape_at
 
 # Views overlap if this share of the points of one has a partner in the other, and so many.
@@ -114,7 +114,7 @@ class Relaxing(Refining):
         """Return the poses (N, 4, 4) T_world_view that the pairs ask for; the first stays."""
         ...
 
-    def start(self, views: ViewStore[SurfaceMap]) -> Refiner:
+    def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
         return _Relaxation(self)
 

@@ -24,7 +24,7 @@ from tofuse.lab.simulation.render import Rendered, render
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.native import RecordingWriter, corrected_depth
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.models import CameraModel, camera_model
 
 # Is told how many frames are done, and of how many.

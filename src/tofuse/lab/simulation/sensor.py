@@ -18,7 +18,7 @@ import numpy as np
 from tofuse.arrays import Bool, Complex128, Float32, Float64, UInt8
 from tofuse.lab.simulation.effects import Effects
 from tofuse.recordings.frames import SATURATED_AMPLITUDE
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 from tofuse.sensor.models import SPEED_OF_LIGHT, CameraModel
 
 TAPS = 4

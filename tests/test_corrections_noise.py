@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import tofuse
+from tofuse.corrections.noise import Noise
 from tofuse.errors import InputError
-from tofuse.filters.noise import Noise
 from tofuse.geometry.cameras import Pinhole
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.reconstruct import fitted

@@ -8,13 +8,12 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from tofuse.arrays import Float32, Float64
-from tofuse.filters._options import above
-from tofuse.filters.correction import Correction, Corrector
-from tofuse.filters.multipath import light_image
+from tofuse.arrays import Float64
+from tofuse.bounds import above
+from tofuse.corrections.base import Correction, Corrector
+from tofuse.corrections.raw_amplitude import pixel_pitch, wrapped_light
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.sensor.multipath_surfaces import FALLOFF
 from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
 
 _ROUNDS = 4
@@ -112,26 +111,3 @@ class UnwrapCorrector(Corrector):
             amplitude_image=amplitude,
             ambiguity_m=frame.ambiguity_m,
         )
-
-
-def wrapped_light(frame: Frame, period_m: float | None) -> tuple[Float32, Float32, float] | None:
-    """Return radial range and raw light with the falloff of lens and lamp taken off, and period."""
-    if not isinstance(frame, RangeFrame):
-        return None
-    image = light_image(frame, period_m)
-    if image is None:
-        return None
-    rays = frame.camera.rays()
-    cosine2 = 1 / (1 + (rays * rays).sum(-1))
-    radial = np.where(frame.valid, frame.radial_range, np.float32(0))
-    with np.errstate(invalid="ignore"):
-        light = np.nan_to_num(image.light / cosine2 ** (FALLOFF / 2))
-    return radial, light.astype(np.float32), image.period_m
-
-
-def pixel_pitch(frame: Frame) -> float:
-    """Angle between neighbouring pixels in the middle of the image, rad."""
-    assert isinstance(frame, RangeFrame)
-    rays = frame.camera.rays()
-    rows, columns = (slice(n // 4, max(n - n // 4, n // 4 + 2)) for n in rays.shape[:2])
-    return float(np.nanmedian(np.abs(np.diff(rays[rows, columns, 0], axis=1))))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError
-from tofuse.sensor.correction import DepthCorrection
+from tofuse.sensor.depth_correction import DepthCorrection
 
 
 def test_curve_is_linear_between_knots_and_constant_outside() -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from tofuse.arrays import Float64
-from tofuse.filters.correction import Correction, Corrector
+from tofuse.corrections.base import Correction, Corrector
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.noise import NoiseModel

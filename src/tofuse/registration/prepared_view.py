@@ -244,7 +244,7 @@ _projections: WeakKeyDictionary[Camera, dict[int, Projection]] = WeakKeyDictiona
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceMap:
+class PreparedView:
     """A view on a grid of at most `SurfaceOptions.columns` columns.
 
     Attributes
@@ -282,7 +282,7 @@ class SurfaceMap:
     projection: Projection
     has_photo: bool = field(default=False)
     pixel_variance: Float32 | None = None
-    _thinned: dict[int, SurfaceMap] = field(default_factory=dict, init=False, repr=False)
+    _thinned: dict[int, PreparedView] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def normals(self) -> Float32:
@@ -298,7 +298,7 @@ class SurfaceMap:
         """How many there are, valid or not."""
         return self.z.size
 
-    def once(self) -> SurfaceMap:
+    def once(self) -> PreparedView:
         """Return the view with `pixel_variance` for `plane_variance`, if it has both.
 
         A single alignment can't but take an error that pixels share for the camera's motion, so it
@@ -309,11 +309,11 @@ class SurfaceMap:
             return self
         return replace(self, plane_variance=self.pixel_variance, pixel_variance=None)
 
-    def bare(self) -> SurfaceMap:
+    def bare(self) -> PreparedView:
         """Return the view without what was derived from it, which takes as much memory again."""
         return replace(self)
 
-    def thinned(self, columns: int) -> SurfaceMap:
+    def thinned(self, columns: int) -> PreparedView:
         """Return the view at every n-th pixel, so that it has at most so many columns.
 
         A plane fits beyond its own pixel, so for comparing views few pixels are enough. All who
@@ -334,7 +334,7 @@ class SurfaceMap:
         projection = self.projection.thinned(step)
         rays = projection.rays
         own = self.pixel_variance
-        self._thinned[step] = SurfaceMap(
+        self._thinned[step] = PreparedView(
             self.index,
             rays,
             z,
@@ -365,7 +365,7 @@ class SurfaceMap:
         return float(np.count_nonzero(self.planes[..., 3] > 0)) / self.z.size
 
 
-def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
+def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     """Prepare a view.
 
     The noise is taken from the frame's own `sigma_image` where it has one, else from a law of the
@@ -409,7 +409,7 @@ def surface_map(frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
         )
     shared = _shared_sigma(frame, projection.lengths2)
     variance, own_variance = _with_shared(quality[..., 1] * np.float32(scale), planes, shared)
-    return SurfaceMap(
+    return PreparedView(
         frame.index,
         rays,
         z,
@@ -429,11 +429,13 @@ def _no_photo(rows: int, columns: int) -> Float32:
     return np.full((rows, columns, 3), np.nan, np.float32)
 
 
-def with_more_planes(surface: SurfaceMap, frame: RangeFrame, options: SurfaceOptions) -> SurfaceMap:
+def with_more_planes(
+    surface: PreparedView, frame: RangeFrame, options: SurfaceOptions
+) -> PreparedView:
     """Return the view of `frame` with planes where the tracker does well to have none.
 
     Where pixels are noisier than the typical one, and at outlines. Planes that were fitted before
-    stay; variances are those of `SurfaceMap.once`.
+    stay; variances are those of `PreparedView.once`.
     """
     surface = surface.once()
     known = (surface.z > 0) & (surface.sigma > 0)
@@ -452,17 +454,17 @@ def with_more_planes(surface: SurfaceMap, frame: RangeFrame, options: SurfaceOpt
 
 
 def _with_noisy_planes(
-    surface: SurfaceMap,
+    surface: PreparedView,
     frame: RangeFrame,
     w: Float32,
     noise: Float32,
     missing: Bool,
     options: SurfaceOptions,
-) -> SurfaceMap:
+) -> PreparedView:
     """Return the view with planes where it is noisier than its typical pixel.
 
-    `surface_map` takes what differs by more than the typical noise for a jump in depth. Here a jump
-    is what differs by more than the noise of the pixels beside it, as long as one of these is not
+    `prepare_view` takes what differs by more than the typical noise for a jump in depth. Here a
+    jump is what differs by more than the noise of the pixels next to it, unless one of these is
     much noisier than the other. `noise` (H, W) is a share of the depth.
     """
     edge = _noisy_edges(w, noise, options)
@@ -481,13 +483,13 @@ def _with_noisy_planes(
 
 
 def _with_carried_planes(
-    surface: SurfaceMap,
+    surface: PreparedView,
     quiet: Float32,
     w: Float32,
     noise: Float32,
     missing: Bool,
     options: SurfaceOptions,
-) -> SurfaceMap:
+) -> PreparedView:
     """Return the view with the planes of their neighbours at pixels that have measured these.
 
     No window fits next to an outline. But a surface goes on up to there, and a pixel that mixes its

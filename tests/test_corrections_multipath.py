@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.filters.multipath import Multipath, light_image
+from tofuse.corrections.multipath import Multipath
+from tofuse.corrections.raw_amplitude import light_image
 from tofuse.geometry.cameras import Pinhole, ray_lengths
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import record

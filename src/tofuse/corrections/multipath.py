@@ -8,17 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.filters._options import above, at_least, whole, within
-from tofuse.filters.correction import Correction, Corrector
+from tofuse.bounds import above, at_least, whole, within
+from tofuse.corrections.base import Correction, Corrector
+from tofuse.corrections.raw_amplitude import light_image, modulation_period
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.multipath import Bounces, GainEstimator, Interference, LightImage, Reflections
 from tofuse.sensor.multipath_map import LightMap
-from tofuse.sensor.multipath_surfaces import FALLOFF
-
-# Cameras of one frequency measure with periods up to this. A longer ambiguity is a beat of several
-# frequencies, which says nothing about the phase that was measured.
-_LONGEST_PERIOD_M = 6.0
 
 
 @part("correction", "multipath", label="validated")
@@ -139,7 +135,10 @@ class MultipathCorrector(Corrector):
         """See `Corrector.alone`: so are views that are passed on."""
         if not isinstance(frame, RangeFrame) or not self._options.applied:
             return True
-        return _period(frame, self._options.period_m) is None or frame.amplitude_image is None
+        return (
+            modulation_period(frame, self._options.period_m) is None
+            or frame.amplitude_image is None
+        )
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. The amplitude loses its indirect share as well."""
@@ -173,34 +172,6 @@ class MultipathCorrector(Corrector):
             for n, size in zip(found.surfaces.good.shape, frame.valid.shape, strict=True)
         ]
         self._map.add(found.surfaces, frame.valid[np.ix_(*middle)], T_world_camera)
-
-
-def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage | None:
-    """Return the frame's depth and raw light; None if its light or its period is not known."""
-    period_m = _period(frame, period_m)
-    if period_m is None or frame.amplitude_image is None or not len(frame):
-        return None
-    z = np.where(frame.valid, frame.z, np.float32(0))
-    rays = frame.camera.rays()
-    amplitude = frame.amplitude_image
-    fine = frame.valid & np.isfinite(amplitude) & (amplitude > 0)
-    fine &= amplitude < SATURATED_AMPLITUDE
-    light = np.where(fine, amplitude, np.float32(0))
-    if frame.amplitude_kind == "range_compensated":
-        square = np.where(fine, 1 + (rays * rays).sum(-1), np.float32(1))
-        # z squared times the square of the ray's length is the range's.
-        light = light / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
-    return LightImage(z, rays, light.astype(np.float32, copy=False), period_m)
-
-
-def _period(frame: RangeFrame, given: float | None) -> float | None:
-    """Range after which the phase of a frame's one frequency repeats; None where not known."""
-    if given is not None:
-        return given
-    period_m = frame.ambiguity_m
-    if period_m is None or period_m > _LONGEST_PERIOD_M or frame.amplitude_kind == "ir":
-        return None
-    return period_m
 
 
 def _corrected(

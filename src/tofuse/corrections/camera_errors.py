@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.filters.correction import Correction, Corrector
+from tofuse.corrections.base import Correction, Corrector
 from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame

@@ -10,15 +10,14 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from tofuse.arrays import Bool, Complex128, Float64
+from tofuse.arrays import Bool, Float64
+from tofuse.bounds import above, within
+from tofuse.corrections.base import Correction, Corrector
+from tofuse.corrections.raw_amplitude import light_image, light_phasor, phasor
 from tofuse.errors import InputError
-from tofuse.filters._options import above, within
-from tofuse.filters.correction import Correction, Corrector
-from tofuse.filters.multipath import light_image
 from tofuse.parts import part
 from tofuse.recordings.background import moving_object
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.sensor.multipath import LightImage
 from tofuse.sensor.scattering import Scattering, learn_shares
 
 # A pixel with less than this share of its light its own is measured too badly to be saved.
@@ -113,7 +112,7 @@ class ScatteringCorrector(Corrector):
         image = light_image(frame, self._period_m)
         if image is None:
             return frame
-        measured = _phasor(image)
+        measured = phasor(image)
         own = self._model.removed(measured)
         lit = (measured != 0) & (np.abs(own) > _LEAST_OWN * np.abs(measured))
         ratio = np.where(lit, own, 1) / np.where(lit, measured, 1)
@@ -139,24 +138,3 @@ def _moves_and_still(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
     square = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
     around = cv2.dilate(moves.astype(np.uint8), square) > 0
     return moves, ~around & np.isfinite(found.far.z) & (found.far.share > _STILL)
-
-
-def light_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex128 | None:
-    """Return the light (H, W) of a frame, with its phase; 0 where there is none.
-
-    None where the light or the period is not known.
-    """
-    image = light_image(frame, period_m)
-    return None if image is None else _phasor(image)
-
-
-def _phasor(image: LightImage) -> Complex128:
-    """Phasor (H, W) of the raw light; 0 where there is none."""
-    seen = (image.z > 0) & (image.light > 0)
-    x, y = image.rays[..., 0], image.rays[..., 1]
-    r = np.where(seen, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
-    phase = np.float32(2 * np.pi / image.period_m) * r
-    light = np.where(seen, image.light, np.float32(0))
-    out = np.empty(r.shape, np.complex128)
-    out.real, out.imag = light * np.cos(phase), light * np.sin(phase)
-    return out

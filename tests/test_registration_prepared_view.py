@@ -10,15 +10,15 @@ import pytest
 
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable, ray_lengths
 from tofuse.kernels.threads import threads
-from tofuse.maps.surface_map import (
+from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.registration.prepared_view import (
+    PreparedView,
     Projection,
     Smoothed,
-    SurfaceMap,
     SurfaceOptions,
-    surface_map,
+    prepare_view,
     with_more_planes,
 )
-from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 
 CAMERA = Pinhole(88, 72, 115.0, 115.0, 43.5, 35.5)
@@ -54,14 +54,14 @@ def wall(camera=CAMERA, sigma=0.0, seed=0, *, kind="z", amplitude="raw", spread=
     )
 
 
-def inside(view: SurfaceMap, margin=4):
+def inside(view: PreparedView, margin=4):
     return np.s_[margin:-margin, margin:-margin]
 
 
 @pytest.mark.parametrize("sigma", [0.001, 0.004, 0.02])
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated", "ir", None])
 def test_the_noise_is_measured_on_the_view(sigma, amplitude):
-    view = surface_map(wall(sigma=sigma, amplitude=amplitude), OPTIONS)
+    view = prepare_view(wall(sigma=sigma, amplitude=amplitude), OPTIONS)
     found = np.median(view.sigma[view.sigma > 0])
     assert found == pytest.approx(sigma, rel=0.15)
 
@@ -69,7 +69,7 @@ def test_the_noise_is_measured_on_the_view(sigma, amplitude):
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
 def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
     frame = wall(sigma=0.004, amplitude=amplitude, spread=0.5)
-    view = surface_map(frame, OPTIONS)
+    view = prepare_view(frame, OPTIONS)
     clean = wall(sigma=0.0, amplitude=amplitude, spread=0.5)
     off = (frame.z - clean.z) / view.sigma
     raw = wall(amplitude="raw", spread=0.5).amplitude_image
@@ -80,7 +80,7 @@ def test_where_less_light_comes_back_the_noise_is_larger(amplitude):
 def test_the_cameras_own_noise_is_believed_up_to_a_factor():
     frame = wall(sigma=0.004)
     ramp = np.linspace(0.5, 2, 72, dtype=np.float32)[:, None].repeat(88, 1)
-    view = surface_map(replace(frame, sigma_image=0.0003 * ramp), OPTIONS)
+    view = prepare_view(replace(frame, sigma_image=0.0003 * ramp), OPTIONS)
     ratio = view.sigma / ramp * ray_lengths(CAMERA)
     np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-5)
     assert ratio[0, 0] > 0.001  # what the view shows of it, 4 mm at places
@@ -89,7 +89,7 @@ def test_the_cameras_own_noise_is_believed_up_to_a_factor():
 def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
     offs = []
     for seed in range(4):
-        view = surface_map(wall(sigma=0.005, seed=seed), OPTIONS)
+        view = prepare_view(wall(sigma=0.005, seed=seed), OPTIONS)
         true = view.rays.astype(float) @ PLANE[:2] + PLANE[2]
         good = view.planes[..., 3] > 0
         offs.append(((view.planes[..., 3] - true) / np.sqrt(view.plane_variance + 1e-30))[good])
@@ -98,7 +98,7 @@ def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
 
 @pytest.mark.parametrize("kind", ["z", "range"])
 def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
-    view = surface_map(wall(kind=kind), OPTIONS)
+    view = prepare_view(wall(kind=kind), OPTIONS)
     assert view.index == 3
     assert view.planar_share > 0.9
     assert np.abs(view.planes[inside(view)][..., :3] - PLANE).max() < 1e-3
@@ -109,7 +109,7 @@ def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
 
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
 def test_albedo_and_its_slopes_are_freed_of_range_and_incidence(amplitude):
-    view = surface_map(wall(amplitude=amplitude, texture=2.0), OPTIONS)
+    view = prepare_view(wall(amplitude=amplitude, texture=2.0), OPTIONS)
     assert view.has_photo
     found = view.photo[np.isfinite(view.photo).all(-1)]
     assert len(found) > 0.8 * view.z.size
@@ -119,7 +119,7 @@ def test_albedo_and_its_slopes_are_freed_of_range_and_incidence(amplitude):
 
 
 def test_without_amplitude_there_is_no_albedo_but_all_the_rest():
-    view = surface_map(wall(amplitude=None), OPTIONS)
+    view = prepare_view(wall(amplitude=None), OPTIONS)
     assert not view.has_photo
     assert np.isnan(view.photo).all()
     assert view.planar_share > 0.9
@@ -129,7 +129,7 @@ def test_saturated_pixels_say_nothing_of_the_albedo():
     frame = wall()
     light = frame.amplitude_image.copy()
     light[30:40, 30:40] = SATURATED_AMPLITUDE
-    view = surface_map(replace(frame, amplitude_image=light), OPTIONS)
+    view = prepare_view(replace(frame, amplitude_image=light), OPTIONS)
     assert np.isnan(view.photo[30:40, 30:40]).all()
     good = np.isfinite(view.photo[..., 0])
     assert np.ptp(view.photo[good][:, 0]) < 0.05
@@ -142,8 +142,8 @@ def test_a_ray_table_with_unknown_rays(columns):
     table[:6, :6] = np.nan
     table[41, 50] = np.nan  # one of four, when halved
     bent = wall(lens)
-    view = surface_map(replace(bent, camera=RayTable(table)), SurfaceOptions(columns=columns))
-    whole = surface_map(bent, SurfaceOptions(columns=columns))
+    view = prepare_view(replace(bent, camera=RayTable(table)), SurfaceOptions(columns=columns))
+    whole = prepare_view(bent, SurfaceOptions(columns=columns))
     step = 88 // columns
     assert view.z.shape == (72 // step, columns)
     assert (view.planes[: 4 // step, : 4 // step] == 0).all()
@@ -160,7 +160,7 @@ def test_a_ray_table_with_unknown_rays(columns):
 def test_a_view_without_a_single_pixel_has_no_surface(columns, amplitude):
     frame = wall(amplitude=amplitude)
     blank = replace(frame, depth=np.zeros_like(frame.depth))
-    view = surface_map(blank, SurfaceOptions(columns=columns))
+    view = prepare_view(blank, SurfaceOptions(columns=columns))
     assert view.planar_share == 0
     assert np.isfinite(view.sigma).all()
     assert np.isnan(view.photo).all()
@@ -169,7 +169,7 @@ def test_a_view_without_a_single_pixel_has_no_surface(columns, amplitude):
 @pytest.mark.parametrize("shape", [(2, 2), (2, 40), (40, 2), (5, 5), (3, 100)])
 def test_tiny_images_give_a_view(shape):
     camera = Pinhole(shape[1], shape[0], 50.0, 50.0, shape[1] / 2, shape[0] / 2)
-    view = surface_map(wall(camera), SurfaceOptions(columns=16))
+    view = prepare_view(wall(camera), SurfaceOptions(columns=16))
     assert view.planes.shape == (*view.z.shape, 4)
     assert np.isfinite(view.planes).all()
     assert 0 <= view.planar_share <= 1
@@ -182,13 +182,13 @@ def test_a_frame_full_of_nonsense_gives_a_view():
     sigma = rng.choice([0, -1, 1.0, 1e-30, 1e30, np.inf, np.nan], (72, 88)).astype(np.float32)
     base = RangeFrame(0, 0.0, CAMERA, depth.astype(np.float32), amplitude_image=light)
     for frame in (base, replace(base, sigma_image=sigma)):
-        view = surface_map(frame, OPTIONS)
+        view = prepare_view(frame, OPTIONS)
         assert np.isfinite(view.planes).all()
 
 
 def test_vga_is_reduced_to_the_columns_asked_for():
     camera = Pinhole(640, 480, 570.0, 570.0, 319.5, 239.5)
-    view = surface_map(wall(camera), SurfaceOptions(columns=320))
+    view = prepare_view(wall(camera), SurfaceOptions(columns=320))
     assert view.z.shape == (240, 320)
     assert np.abs(view.planes[inside(view)][..., :3] - PLANE).max() < 1e-3
     smaller = Pinhole(320, 240, 285.0, 285.0, 159.5, 119.5)
@@ -215,9 +215,9 @@ def test_the_lookup_finds_the_pixel_of_a_ray(step):
 def test_threads_change_nothing():
     frame = wall(sigma=0.005)
     with threads(1):
-        one = surface_map(frame, OPTIONS)
+        one = prepare_view(frame, OPTIONS)
     with threads(2):
-        two = surface_map(frame, OPTIONS)
+        two = prepare_view(frame, OPTIONS)
     for name in ("planes", "plane_variance", "photo", "sigma"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
@@ -249,7 +249,7 @@ def test_stated_noise_of_the_range_is_that_of_z_at_any_resolution(columns):
     """Whatever the view shows: it has no noise at all."""
     camera = Pinhole(88, 72, 60.0, 60.0, 43.5, 35.5)
     frame = wall(camera)
-    view = surface_map(
+    view = prepare_view(
         replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)),
         replace(OPTIONS, columns=columns),
     )
@@ -272,8 +272,8 @@ def smoothed(sigma, seed):
 def test_a_curved_surface_counts_where_its_noise_is_stated_though_not_shown():
     frame = smoothed(0.01, 1)
     strict = replace(OPTIONS, flatness=0.0, smoothed=NEVER)
-    blind = surface_map(frame, strict)
-    told = surface_map(replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict)
+    blind = prepare_view(frame, strict)
+    told = prepare_view(replace(frame, sigma_image=np.full((72, 88), 0.01, np.float32)), strict)
     waves = np.s_[4:-4, 60:-4]
     blind_share, told_share = ((v.planes[waves][..., 3] > 0).mean() for v in (blind, told))
     assert blind_share < 0.75 < 0.95 < told_share
@@ -284,7 +284,7 @@ def test_a_nearly_flat_surface_is_one_however_little_noise_it_shows():
     frame = smoothed(0.0005, 1)
     waves = np.s_[4:-4, 60:-4]
     strict, default = (
-        surface_map(frame, replace(OPTIONS, flatness=f, smoothed=NEVER)) for f in (0.0, 0.002)
+        prepare_view(frame, replace(OPTIONS, flatness=f, smoothed=NEVER)) for f in (0.0, 0.002)
     )
     strict, default = ((v.planes[waves][..., 3] > 0).mean() for v in (strict, default))
     assert strict < 0.75 < 0.95 < default
@@ -297,7 +297,7 @@ def test_small_shapes_stand_where_the_camera_smoothed_its_noise_away():
     depth[:, 20:25] = 1.2
     noise = np.random.default_rng(2).normal(size=depth.shape) * 0.004
     quiet, never, noisy = (
-        surface_map(replace(frame, depth=(depth + n).astype(np.float32)), options)
+        prepare_view(replace(frame, depth=(depth + n).astype(np.float32)), options)
         for n, options in (
             (0 * noise, OPTIONS),
             (0 * noise, replace(OPTIONS, smoothed=NEVER)),
@@ -315,12 +315,12 @@ def test_noise_is_no_edge():
     """At 1.5 m, 4 cm between neighbours is noise here, and a step of 40 cm still is none."""
     frame = wall(sigma=0.04, seed=2)
     strict, default = (
-        surface_map(frame, replace(OPTIONS, edge_sigmas=k)).planar_share for k in (0.0, 3.0)
+        prepare_view(frame, replace(OPTIONS, edge_sigmas=k)).planar_share for k in (0.0, 3.0)
     )
     assert strict < 0.3 < 0.75 < default
     step = frame.depth.copy()
     step[:, 44:] += 0.4
-    planes = surface_map(replace(frame, depth=step), OPTIONS).planes[4:-4, :, 3]
+    planes = prepare_view(replace(frame, depth=step), OPTIONS).planes[4:-4, :, 3]
     assert (planes[:, 43:45] > 0).mean() < 0.2
     assert (planes[:, 10:30] > 0).mean() > 0.7
 
@@ -335,7 +335,7 @@ def test_pixels_of_a_reduced_view_weigh_by_their_stated_noise():
     options = replace(OPTIONS, columns=88)
     off = {}
     for name, stated in (("right", sigma), ("even", np.full_like(sigma, 0.02))):
-        view = surface_map(replace(frame, sigma_image=stated), options)
+        view = prepare_view(replace(frame, sigma_image=stated), options)
         middle = inside(view)
         exact = view.rays @ PLANE[:2] + PLANE[2]
         known = view.planes[..., 3][middle] > 0
@@ -366,14 +366,14 @@ def painted(shift=0.0, gain=1.0, *, color=True):
 def test_colour_holds_a_pose_before_a_flat_wall_whatever_the_exposure(gain):
     shift, true = 0.05, np.eye(4)
     true[0, 3] = shift
-    views = [surface_map(f, OPTIONS) for f in (painted(), painted(shift, gain))]
+    views = [prepare_view(f, OPTIONS) for f in (painted(), painted(shift, gain))]
     aligned = align(views[1], [Target(views[0], np.eye(4))], np.eye(4), ProjectiveOptions())
     assert aligned.photometric
     assert len(aligned.unobservable) == 0
     assert np.linalg.norm((aligned.T_world_source - true)[:3, 3]) < 0.003
     # Of coded light: the power of the code is in it.
     assert aligned.exposure == pytest.approx(-np.log(gain) / 2.2, abs=0.02)
-    bare = [surface_map(f, OPTIONS) for f in (painted(color=False), painted(shift, color=False))]
+    bare = [prepare_view(f, OPTIONS) for f in (painted(color=False), painted(shift, color=False))]
     blind = align(bare[1], [Target(bare[0], np.eye(4))], np.eye(4), ProjectiveOptions())
     assert len(blind.unobservable) == 3
 
@@ -383,30 +383,30 @@ def test_saturated_and_dark_colour_is_none():
     color = frame.color_image.copy()
     color[40:60, 40:60, 1] = 255
     color[80:100, 80:100] = 2
-    view = surface_map(replace(frame, color_image=color), OPTIONS)
+    view = prepare_view(replace(frame, color_image=color), OPTIONS)
     assert np.isnan(view.photo[44:56, 44:56]).all()
     assert np.isnan(view.photo[84:96, 84:96]).all()
     assert np.isfinite(view.photo[44:56, 84:96]).all()
 
 
 def test_colour_that_is_not_registered_takes_no_part():
-    view = surface_map(replace(painted(), color_registered=False), OPTIONS)
+    view = prepare_view(replace(painted(), color_registered=False), OPTIONS)
     assert not view.has_photo
 
 
 def test_amplitude_goes_before_colour():
     frame = replace(wall(amplitude="raw", texture=1.0), color_image=np.zeros((72, 88, 3), np.uint8))
-    plain = surface_map(replace(frame, color_image=None), OPTIONS)
-    np.testing.assert_array_equal(surface_map(frame, OPTIONS).photo, plain.photo)
+    plain = prepare_view(replace(frame, color_image=None), OPTIONS)
+    np.testing.assert_array_equal(prepare_view(frame, OPTIONS).photo, plain.photo)
 
 
 def test_what_pixels_share_of_an_error_is_not_averaged_away() -> None:
     """A group of pixels with a shared error is worth what one of them is, whatever its noise."""
     frame = wall(sigma=0.004)
-    plain = surface_map(frame, OPTIONS)
+    plain = prepare_view(frame, OPTIONS)
     shared = np.zeros((72, 88), np.float32)
     shared[:, 44:] = 0.005
-    view = surface_map(replace(frame, shared_sigma_image=shared), OPTIONS)
+    view = prepare_view(replace(frame, shared_sigma_image=shared), OPTIONS)
     np.testing.assert_array_equal(view.planes, plain.planes)
     np.testing.assert_array_equal(view.sigma, plain.sigma)
     np.testing.assert_array_equal(view.plane_variance[:, :44], plain.plane_variance[:, :44])
@@ -420,7 +420,7 @@ def test_what_pixels_share_of_an_error_is_not_averaged_away() -> None:
 
     bad = np.full((72, 88), np.nan, np.float32)
     bad[::2] = -1
-    unknown = surface_map(replace(frame, shared_sigma_image=bad), OPTIONS)
+    unknown = prepare_view(replace(frame, shared_sigma_image=bad), OPTIONS)
     np.testing.assert_array_equal(unknown.plane_variance, plain.plane_variance)
 
 
@@ -428,8 +428,8 @@ def test_a_shared_error_is_reduced_with_the_image() -> None:
     frame = wall(sigma=0.004)
     shared = np.repeat(np.linspace(0.001, 0.02, 88, dtype=np.float32)[None], 72, 0)
     small = SurfaceOptions(columns=44)
-    plain = surface_map(frame, small)
-    view = surface_map(replace(frame, shared_sigma_image=shared), small)
+    plain = prepare_view(frame, small)
+    view = prepare_view(replace(frame, shared_sigma_image=shared), small)
     assert view.z.shape == (36, 44)
     added = np.sqrt((view.plane_variance - plain.plane_variance) / 100)
     seen = view.planes[..., 3] > 0
@@ -439,7 +439,7 @@ def test_a_shared_error_is_reduced_with_the_image() -> None:
 
 
 def test_a_thinned_view_is_kept_once():
-    view = surface_map(wall(sigma=0.01), OPTIONS)
+    view = prepare_view(wall(sigma=0.01), OPTIONS)
     thin = view.thinned(50)
     assert thin is view.thinned(44)
     assert view.thinned(88) is view
@@ -447,13 +447,13 @@ def test_a_thinned_view_is_kept_once():
 
 
 def test_views_without_light_share_one_image_of_it():
-    dark = [surface_map(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
+    dark = [prepare_view(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
     assert dark[0].photo is dark[1].photo
     assert dark[0].thinned(50).photo is dark[1].thinned(50).photo
     assert not dark[0].has_photo
     assert np.isnan(dark[0].photo).all()
     assert np.isnan(dark[0].thinned(50).photo).all()
-    assert surface_map(wall(), OPTIONS).photo is not dark[0].photo
+    assert prepare_view(wall(), OPTIONS).photo is not dark[0].photo
 
 
 def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
@@ -465,7 +465,7 @@ def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
     truth[:, 40:60] -= 0.8
     depth[:, 40] += 0.4
     frame = replace(frame, depth=depth)
-    view = surface_map(frame, OPTIONS)
+    view = prepare_view(frame, OPTIONS)
     more = with_more_planes(view, frame, OPTIONS)
     before, after = (v.planes[6:-6, :, 3] > 0 for v in (view, more))
     assert not before[:, [*range(37, 43), *range(58, 62)]].any()

@@ -1,4 +1,4 @@
-"""Checks of the numbers that filters are configured with; each raises ValueError."""
+"""Checks of the numbers that parts are configured with; each raises ValueError."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""Corrections: each removes one systematic error from a view before it is filtered."""

@@ -1,1 +1,0 @@
-"""Views prepared for tracking: local planes, albedo, noise."""
