@@ -27,6 +27,7 @@ import pairs
 import scoring
 import tofuse
 from sequences import DATA
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 
 # Poses (4, 4) in one frame, and points (n, 3) of each view.
@@ -67,7 +68,7 @@ def row(title: str, views: Views) -> str:
     poses = []
     with tempfile.TemporaryDirectory() as folder:
         for k, (T, points) in enumerate(views):
-            write_ply(Path(folder) / f"{k:04d}.ply", points)
+            write_ply(Path(folder) / f"{k:04d}.ply", GeometryRecord(points))
             poses.append(T)
         start = time.perf_counter()
         result = tofuse.reconstruct(tofuse.open(folder))

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from made_recordings import pcd_bytes
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.geometry.cameras import BrownConrady
 
@@ -48,7 +49,7 @@ def make_helios(folder: Path, count: int = 3) -> None:
     for k, cloud in enumerate(clouds):
         light = amplitudes(count)[k].ravel().astype(np.float32)
         path = folder / f"Image_{k}.ply"
-        write_ply(path, cloud.reshape(-1, 3), scalars={"intensity": light})
+        write_ply(path, GeometryRecord(cloud.reshape(-1, 3), scalars={"intensity": light}))
 
 
 def make_blaze(folder: Path, count: int = 3) -> None:

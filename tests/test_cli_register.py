@@ -13,6 +13,7 @@ import pytest
 from browser import changed, chromium, watched
 from registration_scenes import bumpy_ball, stone, turn
 from test_cli_errors import call, listing, refuses
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.las import write_las
 from tofuse.files.ply import read_ply, write_ply
 from tofuse.files.pose import read_pose
@@ -40,7 +41,7 @@ def clouds(tmp_path) -> tuple[Path, Path]:
     target = stone(3000, 1, noise=0.001)
     source = se3.transform(se3.inverse(T_SMALL), stone(3000, 2, noise=0.001))
     for name, points in (("source.ply", source), ("target.ply", target)):
-        write_ply(tmp_path / name, points)
+        write_ply(tmp_path / name, GeometryRecord(points))
     return tmp_path / "source.ply", tmp_path / "target.ply"
 
 
@@ -147,7 +148,7 @@ def write_cloud(path: Path, points: np.ndarray) -> None:
     """Write (N, 3) points in double precision, in the format of the suffix."""
     rows = "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in points)
     if path.suffix == ".ply":
-        write_ply(path, points, double=True)
+        write_ply(path, GeometryRecord(points), double=True)
     elif path.suffix == ".xyz":
         path.write_text(rows)
     elif path.suffix == ".pcd":
@@ -157,7 +158,7 @@ def write_cloud(path: Path, points: np.ndarray) -> None:
         )
     elif path.suffix == ".las":
         pytest.importorskip("laspy")
-        write_las(path, points)
+        write_las(path, GeometryRecord(points))
     else:
         laspy = pytest.importorskip("laspy")
         header = laspy.LasHeader(version="1.2", point_format=0)
@@ -201,8 +202,8 @@ def test_map_coordinates_come_back_to_the_millimetre(
     np.testing.assert_allclose(said["reference_point_m"], MIDDLE, atol=1.5)
     assert said["warnings"] == []  # what readers take off is added again
     aligned = read_ply(out / "aligned.ply")
-    assert aligned.vertex["x"].dtype == np.float64
-    np.testing.assert_allclose(aligned.coordinates, se3.transform(T, source), atol=1e-3)
+    assert aligned.points.dtype == np.float64
+    np.testing.assert_allclose(aligned.points, se3.transform(T, source), atol=1e-3)
     np.testing.assert_array_equal(np.loadtxt(out / "transform.txt"), T)
     # As a guess the result leads to itself: nothing is lost on the way out and in.
     _, again = told(capfd, *paths, "--guess", out / "registration.json")
@@ -223,7 +224,10 @@ def test_a_cloud_of_a_map_and_one_about_the_origin(tmp_path, capfd) -> None:
 
 def test_an_image_and_a_cloud(room_recording, tmp_path, capfd) -> None:
     frame = open_recording(room_recording)[0]
-    write_ply(tmp_path / "cloud.ply", frame.points, color=np.zeros_like(frame.points, np.uint8))
+    write_ply(
+        tmp_path / "cloud.ply",
+        GeometryRecord(frame.points, color=np.zeros_like(frame.points, np.uint8)),
+    )
     status, said = told(
         capfd, f"{room_recording}#1", tmp_path / "cloud.ply",
         "--camera", room_recording / "camera.json",
@@ -339,13 +343,13 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
         case "missing recording":
             return f"{folder / 'none'}#3", ("none", "doesn't exist")
         case "empty cloud":
-            write_ply(path, np.zeros((0, 3)))
+            write_ply(path, GeometryRecord(np.zeros((0, 3))))
             return path, ("bad.ply", "0 valid points")
         case "nan cloud":
-            write_ply(path, np.full((50, 3), np.nan))
+            write_ply(path, GeometryRecord(np.full((50, 3), np.nan)))
             return path, ("bad.ply", "0 valid points")
         case "few points":
-            write_ply(path, np.eye(3))
+            write_ply(path, GeometryRecord(np.eye(3)))
             return path, ("bad.ply", "3 valid points", "10")
         case "no cloud":
             path.write_bytes(b"junk")
@@ -355,7 +359,7 @@ def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ..
         case "out of range":
             return f"{room}#8", (str(room), "has no frame 8", "0 to 7")
         case "out of range of one":
-            write_ply(path, np.random.default_rng(0).normal(size=(50, 3)))
+            write_ply(path, GeometryRecord(np.random.default_rng(0).normal(size=(50, 3))))
             return f"{path}#1", ("has no frame 1", "its only frame is 0")
         case "negative":
             return f"{room}#-1", ("'-1'", "whole number")
@@ -390,7 +394,7 @@ def test_a_camera_for_two_clouds_is_refused(clouds, room_recording, capfd) -> No
 def test_clouds_that_share_nothing_are_refused_in_a_line(tmp_path, capfd) -> None:
     """No motion is fixed by points on a line."""
     for k in range(2):
-        write_ply(tmp_path / f"{k}.ply", np.linspace([0, 0, 1], [1, 0, 1 + k], 40))
+        write_ply(tmp_path / f"{k}.ply", GeometryRecord(np.linspace([0, 0, 1], [1, 0, 1 + k], 40)))
     refuses(capfd, "register", tmp_path / "0.ply", tmp_path / "1.ply", says=("tofuse: ",))
 
 
@@ -497,7 +501,7 @@ def test_belief_decides_the_exit_status(
 def test_a_page_of_a_pair_of_which_hardly_anything_is_known(tmp_path, monkeypatch, capfd) -> None:
     """Too few points for surfaces, no distance, and a start far away."""
     for name in ("a&b.ply", "target.ply"):
-        write_ply(tmp_path / name, np.random.default_rng(1).normal(size=(12, 3)))
+        write_ply(tmp_path / name, GeometryRecord(np.random.default_rng(1).normal(size=(12, 3))))
     far = se3.exp([1e4, 0, 0, 0, 0, 1])
     found = made(far, rms_m=float("nan"), information=np.zeros((6, 6)))
     monkeypatch.setattr(pair_module, "register", lambda *a, **k: found)
@@ -573,7 +577,10 @@ def test_what_is_known_of_points_goes_along(clouds, tmp_path, capfd, light_page)
     color = np.random.default_rng(1).integers(0, 255, (count, 3)).astype(np.uint8)
     normals = np.tile(np.array([0, 0, -1], np.float32), (count, 1))
     light = np.arange(count, dtype=np.float32)
-    write_ply(clouds[0], points, color=color, normals=normals, scalars={"intensity": light})
+    write_ply(
+        clouds[0],
+        GeometryRecord(points, color=color, normals=normals, scalars={"intensity": light}),
+    )
     _, said = told(capfd, *clouds, "--out", tmp_path / "out")
     aligned = read_ply(tmp_path / "out" / "aligned.ply")
     np.testing.assert_array_equal(aligned.color, color)

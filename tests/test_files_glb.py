@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import unlit_glb, write_glb
 
 SIZES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -50,7 +51,7 @@ def test_a_mesh_comes_back(tmp_path) -> None:
     color = np.array([[0, 127, 255]] * 7, np.uint8)
     faces = np.array([[0, 1, 2], [2, 3, 6], [4, 5, 0]])
     path = tmp_path / "m.glb"
-    write_glb(path, points, faces, normals=normals, color=color)
+    write_glb(path, GeometryRecord(points, faces, normals=normals, color=color))
     document, arrays = parse(path)
     assert document["asset"]["version"] == "2.0"
     node = document["nodes"][document["scenes"][document["scene"]]["nodes"][0]]
@@ -72,7 +73,7 @@ def test_a_mesh_comes_back(tmp_path) -> None:
 
 def test_a_mesh_without_faces_is_an_empty_scene(tmp_path) -> None:
     path = tmp_path / "m.glb"
-    write_glb(path, np.zeros((0, 3)), np.zeros((0, 3), int))
+    write_glb(path, GeometryRecord(np.zeros((0, 3)), np.zeros((0, 3), int)))
     document, arrays = parse(path)
     assert arrays == []
     # Empty lists are not allowed.
@@ -89,7 +90,7 @@ def test_what_does_not_fit_is_refused(tmp_path) -> None:
         {"points": points, "faces": faces, "normals": np.zeros((2, 3))},
     ):
         with pytest.raises(InputError, match=r"m\.glb"):
-            write_glb(tmp_path / "m.glb", **problem)
+            write_glb(tmp_path / "m.glb", GeometryRecord(**problem))
     assert not (tmp_path / "m.glb").exists()
 
 
@@ -99,7 +100,7 @@ def test_a_node_places_the_mesh_in_the_scene(tmp_path) -> None:
     points, faces = rng.normal(0, 1, (9, 3)).astype(np.float32), np.arange(9).reshape(3, 3)
     T = np.eye(4)
     T[:3] = [[0, 1, 0, 0.5], [-1, 0, 0, 0], [0, 0, 1, -2]]
-    write_glb(tmp_path / "m.glb", points, faces, T_scene_node=T)
+    write_glb(tmp_path / "m.glb", GeometryRecord(points, faces), T_scene_node=T)
     scene = trimesh.load_scene(tmp_path / "m.glb", process=False, maintain_order=True)
     (mesh,) = scene.geometry.values()
     np.testing.assert_array_equal(mesh.vertices, points)  # in their own frame

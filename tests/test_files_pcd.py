@@ -142,20 +142,22 @@ def test_all_kinds_hold_the_same(tmp_path: Path, kind: str) -> None:
     pcd = read_pcd(tmp_path / "a.pcd")
     assert pcd.organised
     assert (pcd.width, pcd.height) == (4, 3)
-    for name in FIELDS:
-        np.testing.assert_array_equal(pcd.fields[name], rows[name])
-    assert np.isnan(pcd.points[4, 0])
+    cloud = pcd.cloud
+    np.testing.assert_array_equal(cloud.points, np.stack([rows[name] for name in "xyz"], -1))
+    for name in ("intensity", "label", "histogram"):
+        np.testing.assert_array_equal(cloud.scalars[name], rows[name])
+    assert np.isnan(cloud.points[4, 0])
     packed = int(rows["rgb"][0])
-    assert pcd.color is not None
-    assert pcd.color[0].tolist() == [packed >> 16, packed >> 8 & 255, packed & 255]
-    np.testing.assert_array_equal(pcd.amplitude, rows["intensity"])
+    assert cloud.color is not None
+    assert cloud.color[0].tolist() == [packed >> 16, packed >> 8 & 255, packed & 255]
+    np.testing.assert_array_equal(cloud.amplitude, rows["intensity"])
     np.testing.assert_array_equal(pcd.viewpoint, [1, 2, 3, 1, 0, 0, 0])
 
 
 def test_color_packed_as_float(tmp_path: Path) -> None:
     rows = _rows()
     (tmp_path / "a.pcd").write_bytes(_header("binary", rgb_type="F") + rows.tobytes())
-    color = read_pcd(tmp_path / "a.pcd").color
+    color = read_pcd(tmp_path / "a.pcd").cloud.color
     assert color is not None
     assert color[3].tolist() == [int(rows["rgb"][3]) >> s & 255 for s in (16, 8, 0)]
 

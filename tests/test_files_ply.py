@@ -8,6 +8,7 @@ import pytest
 
 from tofuse.errors import InputError
 from tofuse.files import ply as plys
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import read_ply, write_ply
 
 CUBE = """ply
@@ -77,33 +78,39 @@ def test_round_trip_of_everything(tmp_path: Path) -> None:
     amplitude = rng.normal(size=100)
     write_ply(
         tmp_path / "a.ply",
-        points,
-        normals=normals,
-        color=color,
-        scalars={"amplitude": amplitude, "views": views},
-        faces=faces,
+        GeometryRecord(
+            points,
+            normals=normals,
+            color=color,
+            scalars={"amplitude": amplitude, "views": views},
+            faces=faces,
+        ),
     )
     ply = read_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(ply.points, points)
     np.testing.assert_array_equal(ply.normals, normals)
     np.testing.assert_array_equal(ply.color, color)
     np.testing.assert_array_equal(ply.faces, faces)
-    np.testing.assert_array_equal(ply.vertex["views"], views)
-    np.testing.assert_array_equal(ply.vertex["amplitude"], amplitude)
+    np.testing.assert_array_equal(ply.scalars["views"], views)
+    np.testing.assert_array_equal(ply.scalars["amplitude"], amplitude)
     first = (tmp_path / "a.ply").read_bytes()
     write_ply(
         tmp_path / "a.ply",
-        points,
-        normals=normals,
-        color=color,
-        scalars={"amplitude": amplitude, "views": views},
-        faces=faces,
+        GeometryRecord(
+            points,
+            normals=normals,
+            color=color,
+            scalars={"amplitude": amplitude, "views": views},
+            faces=faces,
+        ),
     )
     assert (tmp_path / "a.ply").read_bytes() == first
 
 
 def test_header_is_what_other_programs_expect(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", np.zeros((2, 3)), color=np.zeros((2, 3), np.uint8))
+    write_ply(
+        tmp_path / "a.ply", GeometryRecord(np.zeros((2, 3)), color=np.zeros((2, 3), np.uint8))
+    )
     data = (tmp_path / "a.ply").read_bytes()
     assert data.startswith(
         b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
@@ -116,16 +123,16 @@ def test_header_is_what_other_programs_expect(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("ply\n", "plx\n", "no PLY"),
+        ("ply\n", "plx\n", "not a PLY"),
         ("element vertex 4", "element vertex 400000000000", "cut off"),
-        ("element vertex 4", "element vertex -4", "can't be understood"),
-        ("element vertex 4", "element vertex many", "can't be understood"),
-        ("property double x", "property huge x", "can't be understood"),
+        ("element vertex 4", "element vertex -4", "invalid PLY header line"),
+        ("element vertex 4", "element vertex many", "invalid PLY header line"),
+        ("property double x", "property huge x", "invalid PLY header line"),
         ("property double x", "property double w", "no vertices with x"),
         ("property double x", "property double y", "declares 'y' twice"),
         ("format ascii", "format morse", "format 'morse'"),
-        ("end_header", "end", "no end"),
-        ("4 0 1 2 3 0.25", "4 0 1 2 9 0.25", "vertices other than 0 to 3"),
+        ("end_header", "end", "without an end"),
+        ("4 0 1 2 3 0.25", "4 0 1 2 9 0.25", "indices outside 0 to 3"),
         ("4 0 1 2 3 0.25", "400 0 1 2 3 0.25", "too short"),
         ("1 1 0 0 0 255", "1 1 zero 0 0 255", "damaged"),
     ],
@@ -138,7 +145,7 @@ def test_bad_files_say_what_is_wrong(tmp_path: Path, old: str, new: str, words: 
 
 
 def test_truncated_binary(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", np.ones((10, 3)), faces=np.zeros((4, 3), int))
+    write_ply(tmp_path / "a.ply", GeometryRecord(np.ones((10, 3)), faces=np.zeros((4, 3), int)))
     data = (tmp_path / "a.ply").read_bytes()
     for cut in (1, 60, len(data) - 100):
         (tmp_path / "a.ply").write_bytes(data[:-cut])
@@ -148,7 +155,7 @@ def test_truncated_binary(tmp_path: Path) -> None:
 
 def test_shapes_are_checked_when_writing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="normals"):
-        write_ply(tmp_path / "a.ply", np.zeros((2, 3)), normals=np.zeros((3, 3)))
+        write_ply(tmp_path / "a.ply", GeometryRecord(np.zeros((2, 3)), normals=np.zeros((3, 3))))
     assert not (tmp_path / "a.ply").exists()
 
 
@@ -156,10 +163,10 @@ def test_written_in_parts_it_has_the_same_bytes(tmp_path: Path, monkeypatch) -> 
     rng = np.random.default_rng(0)
     points, faces = rng.normal(size=(23, 3)), rng.integers(0, 23, (41, 3))
     more = {"color": rng.integers(0, 256, (23, 3)), "scalars": {"views": np.arange(23)}}
-    write_ply(tmp_path / "a.ply", points, faces=faces, **more)
+    write_ply(tmp_path / "a.ply", GeometryRecord(points, faces=faces, **more))
     for at_once in (1, 7, 23, 41):
-        monkeypatch.setattr(plys, "_AT_ONCE", at_once)
-        write_ply(tmp_path / "b.ply", points, faces=faces, **more)
+        monkeypatch.setattr(plys, "_BLOCK_ROWS", at_once)
+        write_ply(tmp_path / "b.ply", GeometryRecord(points, faces=faces, **more))
         assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
-    write_ply(tmp_path / "b.ply", points[:0], faces=faces[:0])
+    write_ply(tmp_path / "b.ply", GeometryRecord(points[:0], faces=faces[:0]))
     assert len(read_ply(tmp_path / "b.ply")) == 0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tofuse.cli import main
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
@@ -238,7 +239,7 @@ def test_textures_come_back_from_files(tmp_path: Path) -> None:
     points, normals = mesh.vertices[atlas.vertices], mesh.normals[atlas.vertices]
     for write, name in ((write_glb, "m.glb"), (write_obj, "m.obj")):
         path = tmp_path / name
-        write(path, points, atlas.faces, normals=normals, uv=atlas.uv, texture=image)
+        write(path, GeometryRecord(points, atlas.faces, normals, uv=atlas.uv, texture=image))
         (read,) = trimesh.load_scene(path, process=False).geometry.values()
         np.testing.assert_allclose(read.triangles, points[atlas.faces], atol=1e-6)
         material = read.visual.material

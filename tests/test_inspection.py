@@ -15,6 +15,7 @@ import made_rooms
 import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import read_image
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
@@ -87,7 +88,9 @@ def test_poses_that_are_known() -> None:
 def test_facts_of_clouds(tmp_path) -> None:
     rng = np.random.default_rng(0)
     for k in range(3):
-        write_ply(tmp_path / f"{k}.ply", rng.uniform(1, 2, (500, 3)).astype(np.float32))
+        write_ply(
+            tmp_path / f"{k}.ply", GeometryRecord(rng.uniform(1, 2, (500, 3)).astype(np.float32))
+        )
     facts = inspect_recording(tofuse.open(tmp_path)).facts
     assert facts["views"] == "clouds of about 500 points"
     assert facts["format"] == "ply"

@@ -14,6 +14,7 @@ import tofuse
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.evaluation.trajectory import displacement
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.odometry.given import GivenPoses
@@ -141,7 +142,7 @@ def tofuse_ply(path, points) -> None:
     from tofuse.files.ply import write_ply
 
     path.parent.mkdir(exist_ok=True)
-    write_ply(path, points)
+    write_ply(path, GeometryRecord(points))
 
 
 def test_command(room_recording, truth, tmp_path, capsys) -> None:

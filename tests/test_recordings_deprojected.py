@@ -9,6 +9,7 @@ import pytest
 
 from tofuse.arrays import Float32, Intp
 from tofuse.errors import UnreadableFrameError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.geometry.cameras import BrownConrady, Camera, Pinhole, Rational
 from tofuse.recordings.deprojected import find_deprojection
@@ -96,8 +97,11 @@ def test_other_clouds_stay_clouds(spoilt: str) -> None:
 def test_a_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
     frames = [seen(LENSES["brown"], k) for k in range(4)]
     for k, frame in enumerate(frames[:3]):
-        write_ply(tmp_path / f"{k}.ply", frame.points, scalars={"amplitude": frame.amplitude})
-    write_ply(tmp_path / "3.ply", np.zeros((0, 3)))
+        write_ply(
+            tmp_path / f"{k}.ply",
+            GeometryRecord(frame.points, scalars={"amplitude": frame.amplitude}),
+        )
+    write_ply(tmp_path / "3.ply", GeometryRecord(np.zeros((0, 3))))
     recording = open_recording(tmp_path)
     assert recording.format == "ply"
     for k, frame in enumerate(frames[:3]):
@@ -112,7 +116,7 @@ def test_a_folder_with_another_kind_of_cloud_stays_clouds(tmp_path: Path) -> Non
     frames = [seen(PINHOLE, k) for k in range(3)]
     for k, frame in enumerate(frames):
         points = np.concatenate([frame.points, moved(frame.points)]) if k else frame.points
-        write_ply(tmp_path / f"{k}.ply", points)
+        write_ply(tmp_path / f"{k}.ply", GeometryRecord(points))
     assert isinstance(open_recording(tmp_path)[0], CloudFrame)
 
 
@@ -120,7 +124,7 @@ def test_a_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
     frames = [seen(PINHOLE, k % 5) for k in range(24)]
     for k, frame in enumerate(frames):
         points = moved(frame.points) if k == 4 else frame.points
-        write_ply(tmp_path / f"{k:02d}.ply", points)
+        write_ply(tmp_path / f"{k:02d}.ply", GeometryRecord(points))
     recording = open_recording(tmp_path)
     assert isinstance(recording[5], RangeFrame)
     with pytest.raises(UnreadableFrameError, match="off the rays of those before it"):

@@ -15,6 +15,7 @@ from made_exports import BEHIND_M, CAMERA
 from test_recordings_fuzz import damage
 from test_recordings_fuzz_cameras import read_through
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import read_ply, write_ply
 from tofuse.files.tiff import read_tiff
 from tofuse.recordings.frames import CloudFrame, RangeFrame
@@ -59,7 +60,7 @@ def test_axes_that_run_against_the_pixels_are_turned(
 ) -> None:
     made.make_royale(tmp_path / "a")
     for file in (tmp_path / "a").iterdir():
-        write_ply(file, read_ply(file).points * np.array(signs, np.float32))
+        write_ply(file, GeometryRecord(read_ply(file).points * np.array(signs, np.float32)))
     recording = open_recording(tmp_path / "a")
     assert any("against the pixels" in line for line in recording.warnings)
     z = made.depths()
@@ -75,7 +76,7 @@ def test_other_clouds_stay_clouds(tmp_path: Path) -> None:
     for k, points in enumerate((rng.normal(size=(768, 3)), field.reshape(-1, 3))):
         folder = tmp_path / str(k)
         folder.mkdir()
-        write_ply(folder / "0.ply", points)
+        write_ply(folder / "0.ply", GeometryRecord(points))
         recording = open_recording(folder)
         assert recording.format == "ply"
         assert isinstance(recording[0], CloudFrame)
@@ -90,7 +91,7 @@ def test_points_that_were_left_out_leave_the_others_on_their_pixels(tmp_path: Pa
     ply = read_ply(path)
     kept = ply.points[:, 2] > 0
     assert not kept.all()
-    write_ply(path, ply.points[kept], scalars={"intensity": ply.amplitude[kept]})
+    write_ply(path, GeometryRecord(ply.points[kept], scalars={"intensity": ply.amplitude[kept]}))
     whole, thinned = (open_recording(tmp_path / name)[1] for name in ("whole", "thinned"))
     both = (whole.depth > 0) & (thinned.depth > 0)
     # Pixels that saw nothing in the first file have no ray.
@@ -104,7 +105,7 @@ def test_points_off_the_rays_are_one_bad_frame(tmp_path: Path) -> None:
     path = tmp_path / "a" / "Image_1.ply"
     points = read_ply(path).points
     points = points[points[:, 2] > 0]
-    write_ply(path, points + np.array([0.5 * points[:, 2].mean() / 32, 0, 0]))
+    write_ply(path, GeometryRecord(points + np.array([0.5 * points[:, 2].mean() / 32, 0, 0])))
     recording = open_recording(tmp_path / "a")
     assert len(recording[0]) > 100
     with pytest.raises(UnreadableFrameError, match="export all points"):

@@ -19,6 +19,7 @@ from made_recordings import (
     pcd_points,
 )
 from tofuse.errors import TofuseError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.geometry.cameras import RayTable
 from tofuse.recordings.frames import RangeFrame
@@ -60,7 +61,7 @@ def make_pcd(folder: Path) -> None:
 def make_ply(folder: Path) -> None:
     folder.mkdir()
     points = np.random.default_rng(1).normal(size=(30, 3))
-    write_ply(folder / "0.ply", points, normals=points, faces=np.zeros((3, 3), int))
+    write_ply(folder / "0.ply", GeometryRecord(points, normals=points, faces=np.zeros((3, 3), int)))
     text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
     text += "property float z\nelement face 1\nproperty list uchar int vertex_index\nend_header\n"
     (folder / "1.ply").write_text(text + "0 0 0\n1 1 1\n3 0 1 1\n")

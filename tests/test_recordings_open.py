@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import write_png
 from tofuse.files.ply import write_ply
 from tofuse.geometry.cameras import Pinhole
@@ -63,14 +64,14 @@ def test_a_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
 def test_recordings_of_different_formats_are_not_joined_unasked(tmp_path: Path) -> None:
     write(tmp_path / "a", [1])
     (tmp_path / "b").mkdir()
-    write_ply(tmp_path / "b" / "0.ply", np.ones((3, 3)))
+    write_ply(tmp_path / "b" / "0.ply", GeometryRecord(np.ones((3, 3))))
     with pytest.raises(InputError, match=r"several recordings: a \(native\), b \(ply\)"):
         open_recording(tmp_path)
     assert open_recording(tmp_path / "a", tmp_path / "b").format == "native+ply"
 
 
 def test_a_path_that_could_be_several_formats(tmp_path: Path) -> None:
-    write_ply(tmp_path / "0.ply", np.ones((3, 3)))
+    write_ply(tmp_path / "0.ply", GeometryRecord(np.ones((3, 3))))
     (tmp_path / "0.xyz").write_text("1 2 3\n")
     with pytest.raises(InputError, match="--format ply or xyz"):
         open_recording(tmp_path)
@@ -79,7 +80,7 @@ def test_a_path_that_could_be_several_formats(tmp_path: Path) -> None:
 
 def test_a_cloud_beside_a_native_recording_is_passed_over(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1])
-    write_ply(folder / "model.ply", np.ones((3, 3)))
+    write_ply(folder / "model.ply", GeometryRecord(np.ones((3, 3))))
     assert open_recording(folder).format == "native"
     assert open_recording(tmp_path).format == "native"
 
@@ -105,7 +106,7 @@ def test_limits_of_depth(tmp_path: Path) -> None:
 
 
 def test_a_result_is_no_recording(tmp_path: Path) -> None:
-    write_ply(tmp_path / "cloud.ply", np.ones((3, 3)))
+    write_ply(tmp_path / "cloud.ply", GeometryRecord(np.ones((3, 3))))
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(InputError, match="a result of tofuse"):
         open_recording(tmp_path)

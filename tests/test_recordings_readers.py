@@ -21,6 +21,7 @@ from made_recordings import (
     pcd_points,
 )
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory import write_tum
 from tofuse.geometry.cameras import BrownConrady, Pinhole, RayTable
@@ -305,8 +306,9 @@ def test_ply_folder(tmp_path: Path) -> None:
     for k in (10, 9, 1):
         write_ply(
             tmp_path / f"scan{k}.ply",
-            points[(10, 9, 1).index(k)],
-            scalars={"intensity": np.full(20, k, np.float32)},
+            GeometryRecord(
+                points[(10, 9, 1).index(k)], scalars={"intensity": np.full(20, k, np.float32)}
+            ),
         )
     (tmp_path / "timestamps.txt").write_text("0.5\n1.5\n2.5\n")
     recording = open_recording(tmp_path)
@@ -420,7 +422,7 @@ def test_slam6d_pose_that_is_none(tmp_path: Path) -> None:
 
 
 def test_camera_means_nothing_for_clouds(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", np.ones((3, 3)))
+    write_ply(tmp_path / "a.ply", GeometryRecord(np.ones((3, 3))))
     with pytest.raises(InputError, match="--camera"):
         open_recording(tmp_path / "a.ply", camera=tmp_path / "camera.json")
 

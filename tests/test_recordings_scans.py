@@ -11,6 +11,7 @@ import pytest
 import tofuse
 from made_sens import BASELINE_M, COLORS, DEPTH, HEIGHT, WIDTH, make_sens, pose
 from tofuse.errors import InputError, UnreadableFrameError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.las import write_las
 from tofuse.geometry.quaternion import to_matrix
 from tofuse.recordings.frames import CloudFrame, RangeFrame
@@ -123,7 +124,7 @@ def test_las_written_by_laspy(tmp_path: Path, suffix: str) -> None:
 
 def test_las_of_our_own_comes_back(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
-    write_las(tmp_path / "a.las", POINTS, color=RGB)
+    write_las(tmp_path / "a.las", GeometryRecord(POINTS, color=RGB))
     frame = tofuse.open(tmp_path / "a.las")[0]
     assert isinstance(frame, CloudFrame)
     assert np.allclose(frame.points, POINTS, atol=1e-4)
@@ -150,7 +151,7 @@ def test_coordinates_of_maps_keep_their_millimetres(tmp_path: Path) -> None:
 
 def test_las_that_claims_too_much(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
-    write_las(tmp_path / "a.las", POINTS)
+    write_las(tmp_path / "a.las", GeometryRecord(POINTS))
     data = bytearray((tmp_path / "a.las").read_bytes())
     data[247:255] = struct.pack("<Q", 1 << 40)
     (tmp_path / "a.las").write_bytes(data)

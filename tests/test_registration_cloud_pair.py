@@ -10,6 +10,7 @@ import pytest
 import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
 from tofuse.errors import RegistrationError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
@@ -381,7 +382,7 @@ def test_a_folder_of_scans_becomes_one_model(tmp_path):
     taken = [scanned(at, heading, seed=k) for k, (at, heading) in enumerate(places)]
     (tmp_path / "scans").mkdir()
     for k, (_, points) in enumerate(taken):
-        write_ply(tmp_path / "scans" / f"{k}.ply", points)
+        write_ply(tmp_path / "scans" / f"{k}.ply", GeometryRecord(points))
     result = tofuse.reconstruct(tofuse.open(tmp_path / "scans"))
     assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 3
     for k, (T, points) in enumerate(taken):

@@ -20,6 +20,7 @@ from tofuse.cli import main
 from tofuse.cli.parser import EXPORTS
 from tofuse.errors import InputError, OutputError
 from tofuse.files import las
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import read_glb
 from tofuse.files.ply import read_ply, write_ply
 from tofuse.files.tileset import read_tileset
@@ -59,8 +60,8 @@ def result(tmp_path: Path) -> Path:
             "sigma": rng.uniform(0.001, 0.02, 30).astype(np.float32),
         },
     }
-    write_ply(folder / "cloud.ply", points, **columns)
-    write_ply(folder / "mesh.ply", points, faces=faces, **columns)
+    write_ply(folder / "cloud.ply", GeometryRecord(points, **columns))
+    write_ply(folder / "mesh.ply", GeometryRecord(points, faces=faces, **columns))
     return folder
 
 
@@ -71,8 +72,8 @@ def expected(result: Path) -> SimpleNamespace:
         points=ply.points,
         normals=ply.normals,
         color=ply.color,
-        views=ply.vertex["views"],
-        sigma=ply.vertex["sigma"],
+        views=ply.scalars["views"],
+        sigma=ply.scalars["sigma"],
         faces=read_ply(result / "mesh.ply").faces,
     )
 
@@ -303,7 +304,9 @@ def test_simplified_surfaces_keep_their_colours(result: Path) -> None:
     a = (np.arange(n - 1) + n * np.arange(n - 1)[:, None]).ravel()
     faces = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
     normals = np.tile(np.float32([0, 0, -1]), (n * n, 1))
-    write_ply(result / "mesh.ply", points, faces=faces, normals=normals, color=color)
+    write_ply(
+        result / "mesh.ply", GeometryRecord(points, faces=faces, normals=normals, color=color)
+    )
     write_tum(result / "trajectory.txt", TIMES, np.tile(np.eye(4), (3, 1, 1)))
     glb, stl = export(result, ["glb", "stl"], faces=200)
     (mesh,) = trimesh.load_scene(glb, process=False).geometry.values()
@@ -328,7 +331,7 @@ def test_laz_has_the_same_bytes_again_in_parts(result: Path, monkeypatch) -> Non
     first = path.read_bytes()
     export(result, ["laz"], overwrite=True)
     assert path.read_bytes() == first
-    monkeypatch.setattr(las, "_AT_ONCE", 7)
+    monkeypatch.setattr(las, "_BLOCK_POINTS", 7)
     export(result, ["laz", "las"], overwrite=True)
     np.testing.assert_array_equal(
         laspy.read(path).points.array, laspy.read(result / "cloud.las").points.array
@@ -354,7 +357,7 @@ def test_tiles(result: Path, expected) -> None:
     with pytest.raises(OutputError, match="other than tiles"):
         export(result, ["3dtiles"], overwrite=True)
     assert (path.parent / "mine.txt").read_text() == "kept"
-    write_ply(result / "mesh.ply", np.zeros((3, 3)))
+    write_ply(result / "mesh.ply", GeometryRecord(np.zeros((3, 3))))
     with pytest.raises(InputError, match="no triangles"):
         export(result, ["3dtiles"], tmp_out := result / "new")
     assert not (tmp_out / "tiles").exists()
@@ -414,7 +417,7 @@ def test_what_is_not_there(result: Path, monkeypatch) -> None:
 
 
 def test_an_empty_cloud(result: Path) -> None:
-    write_ply(result / "cloud.ply", np.zeros((0, 3)))
+    write_ply(result / "cloud.ply", GeometryRecord(np.zeros((0, 3))))
     laspy = pytest.importorskip("laspy")
     pypcd4 = pytest.importorskip("pypcd4")
     las, pcd = export(result, ["las", "pcd"])

@@ -19,6 +19,7 @@ import made_dumps
 import made_phones
 from tofuse.cli import main
 from tofuse.errors import InputError, OutputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import read_ply, write_ply
 from tofuse.files.trajectory import write_tum
 from tofuse.files.trajectory_formats import read_poses
@@ -88,7 +89,7 @@ def made_result(folder: Path, camera: Camera, *, color: str = "color", config=No
     (result / "run.json").write_text(json.dumps(run))
     write_tum(result / "trajectory.txt", 0.1 * np.array(POSED), POSES[POSED])
     points = np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
-    write_ply(result / "cloud.ply", points, color=np.full((40, 3), 77, np.uint8))
+    write_ply(result / "cloud.ply", GeometryRecord(points, color=np.full((40, 3), 77, np.uint8)))
     return result
 
 
@@ -244,7 +245,7 @@ def test_colour_of_phones_is_as_large_as_recorded(tmp_path: Path) -> None:
     run = {"schema": 1, "version": "0", "verdict": "good", "frames": frames, "input": about}
     (result / "run.json").write_text(json.dumps(run | {"config": {}}))
     write_tum(result / "trajectory.txt", 5 + 0.25 * np.arange(3), POSES[:3])
-    write_ply(result / "cloud.ply", np.zeros((1, 3), np.float32))
+    write_ply(result / "cloud.ply", GeometryRecord(np.zeros((1, 3), np.float32)))
     (folder,) = export(result, ["nerfstudio"])
     data = json.loads((folder / "transforms.json").read_text())
     names = [Path(frame["file_path"]).name for frame in data["frames"]]

@@ -15,6 +15,7 @@ from made_results import contents
 from test_files_glb import parse
 from test_report_html import make_room
 from tofuse.errors import InputError, OutputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import read_glb, write_glb
 from tofuse.files.ply import read_ply
 from tofuse.files.tileset import R_TILES_GLTF, Tile, read_tileset, write_tileset
@@ -262,7 +263,9 @@ def test_glb_of_ours_comes_back_and_others_are_told(tmp_path) -> None:
     mesh = waves(4)
     path = tmp_path / "a.glb"
     color = np.repeat(np.arange(25, dtype=np.uint8)[:, None] * 10, 3, 1)
-    write_glb(path, mesh.vertices, mesh.faces, color=color, scalars={"sigma": mesh.sigma})
+    write_glb(
+        path, GeometryRecord(mesh.vertices, mesh.faces, color=color, scalars={"sigma": mesh.sigma})
+    )
     found = read_glb(path)
     np.testing.assert_array_equal(found.points, mesh.vertices)
     np.testing.assert_array_equal(found.faces, mesh.faces)
@@ -274,7 +277,7 @@ def test_glb_of_ours_comes_back_and_others_are_told(tmp_path) -> None:
         path.write_bytes(wrong)
         with pytest.raises(InputError, match="no mesh of ours"):
             read_glb(path)
-    write_glb(path, np.zeros((0, 3)), np.zeros((0, 3), int))
+    write_glb(path, GeometryRecord(np.zeros((0, 3)), np.zeros((0, 3), int)))
     assert len(read_glb(path).faces) == 0
 
 
@@ -398,7 +401,10 @@ def test_moves_that_were_stopped_are_finished_with_all_tiles(
 
 def test_the_overview_is_as_fine_as_fits(tmp_path, small_limits) -> None:
     tiled: Tiled = write_tiles(waves(), np.eye(3), tmp_path)
-    write_glb(tmp_path / "o.glb", tiled.overview.vertices, tiled.overview.faces, color=None)
+    write_glb(
+        tmp_path / "o.glb",
+        GeometryRecord(tiled.overview.vertices, tiled.overview.faces, color=None),
+    )
     size = 32 * len(tiled.overview) + 12 * len(tiled.overview.faces)
     assert 300_000 < size <= 600_000
     assert max(path.stat().st_size for path in tmp_path.glob("0-*.glb")) < 600_000

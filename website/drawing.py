@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Float64, UInt8
-from tofuse.files.ply import Ply
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.geometry import se3
 from tofuse.kernels import bvh
 
@@ -36,7 +36,7 @@ class Picture:
         self.image: UInt8 = np.empty((SIZE[1], SIZE[0], 3), np.uint8)
         self.image[:] = BACKGROUND
 
-    def surface(self, mesh: Ply) -> None:
+    def surface(self, mesh: GeometryRecord) -> None:
         """Draw the triangles whose front is to be seen: walls and ceilings don't hide the room."""
         assert mesh.faces is not None
         vertices = mesh.points.astype(float) @ self.R.T
@@ -76,7 +76,7 @@ class Picture:
         flat = self.image.reshape(-1, 3)
         flat[seen] = np.clip(mixed * shade[:, None], 0, 255)[:, ::-1].astype(np.uint8)
 
-    def points(self, cloud: Ply) -> None:
+    def points(self, cloud: GeometryRecord) -> None:
         """Draw points as two pixels, near ones over far ones."""
         seen = cloud.points.astype(float) @ self.R.T
         order = np.argsort(-seen[:, 2], kind="stable")

@@ -101,6 +101,7 @@ def _tiffs(folder: Path) -> None:
 
 def _scans() -> dict[str, Subject]:
     from tofuse.files.e57 import write_e57
+    from tofuse.files.geometry_record import GeometryRecord
     from tofuse.files.las import write_las
 
     points = np.random.default_rng(5).normal(size=(60, 3))
@@ -115,9 +116,9 @@ def _scans() -> dict[str, Subject]:
         data.write(path)
 
     makers: dict[str, Callable[[Path], Any]] = {
-        "las": lambda path: write_las(path, points),
+        "las": lambda path: write_las(path, GeometryRecord(points)),
         "laz": laz,
-        "e57": lambda path: write_e57(path, points),
+        "e57": lambda path: write_e57(path, GeometryRecord(points)),
     }
     return _possible(makers, lambda name: f"original/a.{name}")
 

@@ -1,4 +1,4 @@
-"""E57 (ASTM E2807): clouds, by the library of the extra `scan`."""
+"""E57 (ASTM E2807): clouds, written by pye57 (extra `scan`)."""
 
 from __future__ import annotations
 
@@ -9,65 +9,57 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tofuse.errors import InputError
 from tofuse.files.atomic import replacing
+from tofuse.files.geometry_record import GeometryRecord
 
 _NORMALS = "http://www.libe57.org/E57_EXT_surface_normals.txt"
 _OWN = "https://tofuse.org/e57"
 
 
-def write_e57(
-    path: str | Path,
-    points: ArrayLike,
-    *,
-    normals: ArrayLike | None = None,
-    color: ArrayLike | None = None,
-    scalars: Mapping[str, ArrayLike] | None = None,
-    name: str = "model",
-) -> None:
-    """Write a cloud as one scan.
+def write_e57(path: str | Path, cloud: GeometryRecord, *, name: str = "model") -> None:
+    """Write a cloud as one scan, in single precision.
+
+    Normals use the extension for surface normals, scalars an extension of tofuse, `tofuse:`.
 
     Parameters
     ----------
     path
         The file; see `replacing` for errors.
-    points
-        (N, 3) in m, written in single precision; one at least.
-    normals
-        (N, 3), by the extension for surface normals.
-    color
-        (N, 3) uint8 RGB.
-    scalars
-        More (N,) columns by name, by an extension of our own, `tofuse:`.
+    cloud
+        Of at least one point.
+    name
+        Of the scan.
 
     Raises
     ------
     InputError
-        If the library is not installed, or there are no points.
+        If the shapes disagree, the library is not installed, or there are no points.
     """
+    cloud.check(path)
     try:
         from pye57 import E57, libe57
     except ImportError as error:
         raise InputError(
             "needs the package pye57", where=path, remedy="pip install 'tofuse[scan]'"
         ) from error
-    xyz = np.asarray(points, np.float32)
-    if not len(xyz):
-        raise InputError("there are no points", where=path, remedy="E57 can't hold an empty cloud")
+    if not len(cloud):
+        raise InputError("there are no points", where=path, remedy="E57 can't store an empty cloud")
+    xyz = np.asarray(cloud.points, np.float32)
     columns: dict[str, NDArray[Any]] = {f"cartesian{a}": xyz[:, k] for k, a in enumerate("XYZ")}
-    if normals is not None:
-        table = np.asarray(normals, np.float32)
+    if cloud.normals is not None:
+        table = np.asarray(cloud.normals, np.float32)
         columns |= {f"nor:normal{a}": table[:, k] for k, a in enumerate("XYZ")}
-    if color is not None:
-        rgb = np.asarray(color, np.uint8)
+    if cloud.color is not None:
+        rgb = np.asarray(cloud.color, np.uint8)
         columns |= {f"color{c}": rgb[:, k] for k, c in enumerate(("Red", "Green", "Blue"))}
-    columns |= {f"tofuse:{key}": np.asarray(values) for key, values in (scalars or {}).items()}
-    with replacing(path) as beside:
-        file = E57(str(beside), mode="w")
+    columns |= {f"tofuse:{key}": np.asarray(values) for key, values in cloud.scalars.items()}
+    with replacing(path) as temporary:
+        file = E57(str(temporary), mode="w")
         try:
-            _write(file, libe57, columns, name, with_normals=normals is not None)
+            _write(file, libe57, columns, name, with_normals=cloud.normals is not None)
         finally:
             file.close()
 
@@ -100,10 +92,11 @@ def _write(
         bounds[f"{axis.lower()}Maximum"] = float(column.max())
     scan.set("cartesianBounds", structure(**bounds))
     if "colorRed" in columns:
-        parts = [
-            f"color{c}{end}" for c in ("Red", "Green", "Blue") for end in ("Minimum", "Maximum")
-        ]
-        limits = {part: 255 if part.endswith("Maximum") else 0 for part in parts}
+        limits = {
+            f"color{channel}{end}": limit
+            for channel in ("Red", "Green", "Blue")
+            for end, limit in (("Minimum", 0), ("Maximum", 255))
+        }
         scan.set("colorLimits", structure(**limits))
     pose = lib.StructureNode(image)
     pose.set("rotation", structure(w=1.0, x=0.0, y=0.0, z=0.0))
@@ -113,20 +106,20 @@ def _write(
     prototype = lib.StructureNode(image)
     buffers = lib.VectorSourceDestBuffer()
     count = len(columns["cartesianX"])
-    kept = []
+    referenced = []  # by the buffers, which do not keep their arrays alive
     for key, column in columns.items():
         low, high = column.min().item(), column.max().item()
         if column.dtype.kind == "f":
             values: NDArray[Any] = np.ascontiguousarray(column, np.float32)
             node = lib.FloatNode(image, low, lib.E57_SINGLE, low, high)
         else:
-            # The library takes bytes and floats as they are, and converts to what the file holds.
+            # The library takes uint8 and floats, and converts them to the type in the file.
             small = column.dtype == np.uint8
             low, high = (0, 255) if small else (low, high)
             values = np.ascontiguousarray(column, np.uint8 if small else np.float64)
             node = lib.IntegerNode(image, low, low, high)
         prototype.set(key, node)
-        kept.append(values)  # the buffer does not
+        referenced.append(values)
         buffers.append(lib.SourceDestBuffer(image, key, values, count, True, True))
     points = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
     scan.set("points", points)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_bytes
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.reading import read_bytes
 
 MAX_POINTS = 1 << 28
@@ -30,19 +30,19 @@ _TYPES = {
 
 @dataclass(frozen=True, eq=False)
 class Pcd:
-    """What a PCD file holds.
+    """The content of a PCD file.
 
     Attributes
     ----------
-    fields
-        Columns by name, (N,), or (N, C) where a field has several values.
+    cloud
+        Points are not finite where nothing was measured.
     width, height
-        As declared; an organised cloud has height > 1 and N = width x height, row by row.
+        As declared; an organised cloud has height > 1 and N = width x height, in row-major order.
     viewpoint
-        (7,) tx ty tz qw qx qy qz of the sensor, as declared. Points are not moved by it.
+        (7,) tx ty tz qw qx qy qz of the sensor, as declared. The points are not transformed by it.
     """
 
-    fields: dict[str, NDArray[Any]]
+    cloud: GeometryRecord
     width: int
     height: int
     viewpoint: Float64
@@ -51,44 +51,6 @@ class Pcd:
     def organised(self) -> bool:
         """Whether the points form an image."""
         return self.height > 1 and self.width > 1
-
-    @property
-    def points(self) -> Float32:
-        """(N, 3) float32, not finite where nothing was measured."""
-        return np.stack([self.fields[name] for name in "xyz"], -1).astype(np.float32)
-
-    @property
-    def coordinates(self) -> Float64:
-        """(N, 3) float64, for coordinates that float32 can't hold."""
-        with np.errstate(invalid="ignore"):  # damage can be any kind of not-a-number
-            return np.stack([self.fields[name] for name in "xyz"], -1).astype(np.float64)
-
-    @property
-    def normals(self) -> Float32 | None:
-        """(N, 3) float32, or None."""
-        if not all(name in self.fields for name in _NORMALS):
-            return None
-        return np.stack([self.fields[name] for name in _NORMALS], -1).astype(np.float32)
-
-    @property
-    def color(self) -> UInt8 | None:
-        """(N, 3) uint8 RGB of a packed rgb or rgba field, or None."""
-        for name in ("rgb", "rgba"):
-            packed = self.fields.get(name)
-            if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:
-                bits = np.ascontiguousarray(packed).view(np.uint32)
-                return np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], -1).astype(
-                    np.uint8
-                )
-        return None
-
-    @property
-    def amplitude(self) -> Float32 | None:
-        """(N,) float32 of a field called intensity, amplitude or i, or None."""
-        for name in ("intensity", "amplitude", "i"):
-            if name in self.fields and self.fields[name].ndim == 1:
-                return self.fields[name].astype(np.float32)
-        return None
 
 
 @dataclass(frozen=True)
@@ -114,7 +76,8 @@ def read_pcd(path: str | Path) -> Pcd:
     Raises
     ------
     InputError
-        If it is no PCD, is cut off or damaged, promises more than it holds, or lacks x, y, z.
+        If it is not a PCD file, is cut off or damaged, declares more than it contains, or lacks
+        x, y or z.
     """
     data = read_bytes(path)
     header = _read_header(data, path)
@@ -132,9 +95,32 @@ def read_pcd(path: str | Path) -> Pcd:
             fields[name] = column
     for name in "xyz":
         if fields[name].ndim != 1:
-            raise InputError(f"has several values of {name!r} in a point", where=path)
-    viewpoint = np.array(header.viewpoint, float)
-    return Pcd(fields, header.width, header.height, viewpoint)
+            raise InputError(f"has several values of {name!r} per point", where=path)
+    color = _unpacked_color(fields)
+    points = _taken(fields, ("x", "y", "z"))
+    normals: Float32 | None = None
+    if all(name in fields for name in _NORMALS):
+        normals = _taken(fields, _NORMALS).astype(np.float32)
+    cloud = GeometryRecord(points, normals=normals, color=color, scalars=fields)
+    return Pcd(cloud, header.width, header.height, np.array(header.viewpoint, float))
+
+
+def _taken(fields: dict[str, NDArray[Any]], names: tuple[str, ...]) -> NDArray[np.floating]:
+    """Remove columns (N,) from the fields, and return them as (N, C) float32 or float64."""
+    columns = [fields.pop(name) for name in names]
+    dtype = np.result_type(np.float32, *(c.dtype for c in columns))
+    with np.errstate(invalid="ignore"):  # damaged data can contain signalling NaNs
+        return np.stack(columns, -1).astype(dtype, copy=False)
+
+
+def _unpacked_color(fields: dict[str, NDArray[Any]]) -> UInt8 | None:
+    """Remove a packed rgb or rgba field, and return it as (N, 3)."""
+    for name in ("rgb", "rgba"):
+        packed = fields.get(name)
+        if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:
+            bits = np.ascontiguousarray(fields.pop(name)).view(np.uint32)
+            return np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], -1).astype(np.uint8)
+    return None
 
 
 def _read_header(data: bytes, path: str | Path) -> _Header:
@@ -181,7 +167,7 @@ def _read_header(data: bytes, path: str | Path) -> _Header:
 
 def _cut_off(header: _Header, path: str | Path) -> InputError:
     return InputError(
-        f"is cut off: its header promises {header.points} points, more than it holds",
+        f"is cut off: its header declares {header.points} points, more than it contains",
         where=path,
         remedy=_COPY_AGAIN,
     )
@@ -207,7 +193,7 @@ def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDA
         raise _cut_off(header, path)
     compressed, size = struct.unpack_from("<II", body)
     expected = header.points * header.stride
-    # No stream of LZF grows more than 88-fold: 264 bytes from 3.
+    # LZF expands by at most a factor of 88: 264 bytes from 3.
     if compressed > len(body) - 8 or size != expected or size > 88 * compressed + 264:
         raise InputError(
             f"is cut off or damaged: {len(body) - 8} of {compressed} bytes for {expected}",
@@ -217,7 +203,7 @@ def _compressed(body: memoryview, header: _Header, path: str | Path) -> list[NDA
     out = np.empty(size, np.uint8)
     source = np.frombuffer(body, np.uint8, compressed, 8)
     if lzf_decompress(source, out) != size:
-        raise InputError("holds damaged compressed data", where=path, remedy=_COPY_AGAIN)
+        raise InputError("contains damaged compressed data", where=path, remedy=_COPY_AGAIN)
     columns: list[NDArray[Any]] = []
     at = 0
     for dtype, count in zip(header.dtypes, header.counts, strict=True):
@@ -235,10 +221,10 @@ def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[
     try:
         table = np.loadtxt(lines[: header.points], ndmin=2, comments=None)
         if header.points and table.shape[1] != total:
-            raise ValueError(f"{table.shape[1]} numbers in a row, not {total}")
+            raise ValueError(f"{table.shape[1]} numbers per row, not {total}")
     except (ValueError, OverflowError) as error:
         raise InputError(
-            f"holds damaged points ({str(error).split('; use')[0]})",
+            f"contains damaged points ({str(error).split('; use')[0]})",
             where=path,
             remedy=_COPY_AGAIN,
         ) from error
@@ -253,39 +239,27 @@ def _ascii(body: memoryview, header: _Header, path: str | Path) -> list[NDArray[
     return columns
 
 
-def write_pcd(
-    path: str | Path,
-    points: ArrayLike,
-    *,
-    normals: ArrayLike | None = None,
-    color: ArrayLike | None = None,
-    scalars: Mapping[str, ArrayLike] | None = None,
-) -> None:
-    """Write an unordered cloud, version 0.7, binary.
+def write_pcd(path: str | Path, cloud: GeometryRecord) -> None:
+    """Write an unorganised cloud, version 0.7, binary; see `replacing` for errors.
 
-    Parameters
-    ----------
-    path
-        The file; see `replacing` for errors.
-    points
-        (N, 3), written as float32.
-    normals
-        (N, 3), written as normal_x normal_y normal_z.
-    color
-        (N, 3) uint8 RGB, written as PCL does: packed into the bits of a float called rgb.
-    scalars
-        More (N,) columns by name; whole numbers are written as 32 bits, others as float32.
+    Points and normals are written as float32, colours as PCL does (packed into the bits of a float
+    called rgb), integer scalars with 32 bits, and other scalars as float32.
+
+    Raises
+    ------
+    InputError
+        If the shapes disagree.
     """
+    cloud.check(path)
     columns: dict[str, NDArray[Any]] = {}
-    for names, values in ((("x", "y", "z"), points), (_NORMALS, normals)):
+    for names, values in ((("x", "y", "z"), cloud.points), (_NORMALS, cloud.normals)):
         if values is not None:
             table = np.asarray(values, "<f4")
             columns |= {name: table[:, k] for k, name in enumerate(names)}
-    if color is not None:
-        r, g, b = np.asarray(color, np.uint32).T
+    if cloud.color is not None:
+        r, g, b = np.asarray(cloud.color, np.uint32).T
         columns["rgb"] = (r << 16 | g << 8 | b).astype("<u4").view("<f4")
-    for name, values in (scalars or {}).items():
-        column = np.asarray(values)
+    for name, column in cloud.scalars.items():
         columns[name] = column.astype({"i": "<i4", "u": "<u4"}.get(column.dtype.kind, "<f4"))
     count = len(columns["x"])
     rows = np.empty(count, [(name, column.dtype) for name, column in columns.items()])

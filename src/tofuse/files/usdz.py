@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tofuse.files.atomic import write_bytes
-from tofuse.files.glb import check_mesh, linear
+from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.glb import linear
 
-_ALIGNED = 64
-_HEADER_BYTES = 30  # of a file in an archive, before its name
-_PADDING_TAG = 0x1986  # of the extra field that moves a file on; as OpenUSD's own packages have it
+_ALIGNMENT = 64  # bytes
+_HEADER_BYTES = 30  # of an archive member, before its name
+_PADDING_TAG = 0x1986  # of the extra field used as padding, as in OpenUSD's own packages
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 _SCENE = """#usda 1.0
@@ -93,33 +94,25 @@ _COLORED = """        def Shader "color"
 
 
 def write_usdz(
-    path: str | Path,
-    points: ArrayLike,
-    faces: ArrayLike,
-    *,
-    normals: ArrayLike | None = None,
-    color: ArrayLike | None = None,
-    uv: ArrayLike | None = None,
-    texture: bytes | None = None,
-    name: str = "model",
-    generator: str = "tofuse",
+    path: str | Path, mesh: GeometryRecord, *, name: str = "model", generator: str = "tofuse"
 ) -> None:
     """Write a mesh; see `write_glb` for the parameters, errors and axes.
 
-    Colours of vertices, in linear light as USD asks, are shown by few programs; take a texture.
+    Vertex colours, in linear light as USD requires, are shown by few programs; prefer a texture.
     """
-    columns = {"normals": normals, "color": color, "uv": uv}
-    check_mesh(path, points, faces, {k: v for k, v in columns.items() if v is not None})
-    p, f = np.asarray(points, np.float32), np.asarray(faces)
+    mesh.check(path)
+    texture = mesh.texture
+    p = np.asarray(mesh.points, np.float32)
+    f = np.zeros((0, 3), int) if mesh.faces is None else mesh.faces
     texts = []
-    if normals is not None:
-        texts.append(("normal3f[] normals", _tuples(np.asarray(normals, float), "%.4f")))
+    if mesh.normals is not None:
+        texts.append(("normal3f[] normals", _tuples(np.asarray(mesh.normals, float), "%.4f")))
     image = "texture.png" if texture is not None and texture[:4] == b"\x89PNG" else "texture.jpg"
     if texture is not None:
-        places = np.asarray(uv, float) * [1, -1] + [0, 1]  # from the lower left corner
-        texts.append(("texCoord2f[] primvars:st", _tuples(places, "%.5f")))
-    elif color is not None:
-        light = linear(np.asarray(color, np.uint8))[:, :3] / 65535
+        from_below = np.asarray(mesh.uv, float) * [1, -1] + [0, 1]  # from the lower left corner
+        texts.append(("texCoord2f[] primvars:st", _tuples(from_below, "%.5f")))
+    elif mesh.color is not None:
+        light = linear(np.asarray(mesh.color, np.uint8))[:, :3] / 65535
         texts.append(("color3f[] primvars:displayColor", _tuples(light, "%.4f")))
     shaders, reader = _COLORED, "color.outputs:result"
     if texture is not None:
@@ -134,8 +127,8 @@ def write_usdz(
         faces=", ".join(map(str, f.ravel().tolist())),
         points=_tuples(p, "%.5f"),
         columns="".join(
-            f'        {what} = [{text}] (\n            interpolation = "vertex"\n        )\n'
-            for what, text in texts
+            f'        {primvar} = [{text}] (\n            interpolation = "vertex"\n        )\n'
+            for primvar, text in texts
         ),
         reader=reader,
         shaders=shaders.format(name=name, image=image),
@@ -146,8 +139,8 @@ def write_usdz(
     write_bytes(path, _package(files))
 
 
-def _tuples(table: NDArray[Any], style: str) -> str:
-    row = "(" + ", ".join([style] * table.shape[1]) + ")"
+def _tuples(table: NDArray[Any], number_format: str) -> str:
+    row = "(" + ", ".join([number_format] * table.shape[1]) + ")"
     return ", ".join([row % tuple(values) for values in table.tolist()])
 
 
@@ -156,9 +149,9 @@ def _package(files: Iterable[tuple[str, bytes]]) -> bytes:
     with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files:
             info = zipfile.ZipInfo(name, _DATE)
-            # The content begins after the header, the name and a field of 4 bytes and padding.
+            # The content follows the header, the name, and an extra field of 4 bytes plus padding.
             begin = out.tell() + _HEADER_BYTES + len(name.encode()) + 4
-            padding = -begin % _ALIGNED
+            padding = -begin % _ALIGNMENT
             info.extra = struct.pack("<HH", _PADDING_TAG, padding) + bytes(padding)
             archive.writestr(info, content)
     return out.getvalue()

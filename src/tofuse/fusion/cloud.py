@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, Int32, Int64, UInt8
-from tofuse.fusion.exchange import Shape
+from tofuse.files.geometry_record import GeometryRecord
+from tofuse.fusion import exchange
 from tofuse.fusion.options import Fusion
 from tofuse.geometry import se3
 from tofuse.kernels.threads import thread_count
@@ -53,23 +54,23 @@ class Cloud:
     def __repr__(self) -> str:
         return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
 
-    def shape(self) -> Shape:
-        """Return it for other programs: `save`, `to_trimesh`, `to_open3d`."""
+    def record(self) -> GeometryRecord:
+        """Return it as the writers of files take it, in the world frame, float64."""
         scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
         points = self.points.astype(np.float64) + self.offset
-        return Shape(points, self.normals, self.color, scalars)
+        return GeometryRecord(points, normals=self.normals, color=self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
-        """Write it as .ply, .pcd, .las, .laz or .e57, see `Shape.save`."""
-        self.shape().save(path)
+        """Write it as .ply, .pcd, .las, .laz or .e57, see `exchange.save`."""
+        exchange.save(self.record(), path)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.PointCloud` in the world frame."""
-        return self.shape().to_trimesh()
+        return exchange.to_trimesh(self.record())
 
     def to_open3d(self) -> Any:
         """Return an `open3d.geometry.PointCloud` in the world frame."""
-        return self.shape().to_open3d()
+        return exchange.to_open3d(self.record())
 
     @property
     def diagonal_m(self) -> float:

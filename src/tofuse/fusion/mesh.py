@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.arrays import Bool, Float32, Float64, Int32, Int64, Intp, UInt8
+from tofuse.files.geometry_record import GeometryRecord
+from tofuse.fusion import exchange
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import has_color
-from tofuse.fusion.exchange import Shape
 from tofuse.kernels.clustering import connect, number_keys, plane_sums, settle
 
 # A place is held at its middle by so much of what the planes around it hold.
@@ -60,23 +61,23 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
 
-    def shape(self) -> Shape:
-        """Return it for other programs: `save`, `to_trimesh`, `to_open3d`."""
+    def record(self) -> GeometryRecord:
+        """Return it as the writers of files take it, in the world frame, float64."""
         scalars = {"views": self.views, "sigma": self.sigma}
         points = self.vertices.astype(np.float64) + self.offset
-        return Shape(points, self.normals, self.color, scalars, self.faces)
+        return GeometryRecord(points, self.faces, self.normals, self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
-        """Write it as .glb, .gltf, .ply, .obj, .stl or .usdz, see `Shape.save`."""
-        self.shape().save(path)
+        """Write it as .glb, .gltf, .ply, .obj, .stl or .usdz, see `exchange.save`."""
+        exchange.save(self.record(), path)
 
     def to_trimesh(self) -> Any:
         """Return a `trimesh.Trimesh` in the world frame."""
-        return self.shape().to_trimesh()
+        return exchange.to_trimesh(self.record())
 
     def to_open3d(self) -> Any:
         """Return an `open3d.geometry.TriangleMesh` in the world frame."""
-        return self.shape().to_open3d()
+        return exchange.to_open3d(self.record())
 
     def cloud(self) -> Cloud:
         """Return the vertices as a cloud."""

@@ -308,7 +308,7 @@ def truth_points(recording: Recording, count: int = 100_000) -> Float32 | None:
         return None
     truth = read_ply(path)
     if truth.faces is None or len(truth.faces) == 0:
-        return truth.points
+        return truth.points.astype(np.float32)
     corners = truth.points[truth.faces].astype(float)
     area = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from tofuse.arrays import Float32, Float64, UInt16
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, replacing, write_text
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import read_color, read_header, read_image, write_png
 from tofuse.files.ply import write_ply
 from tofuse.files.reading import files_with, is_file, is_folder, list_folder
@@ -503,10 +504,12 @@ class RecordingWriter:
         self._check_channels(frame, "cloud")
         write_ply(
             self._name("cloud", ".ply"),
-            frame.points,
-            normals=frame.normals,
-            color=frame.color,
-            scalars=None if frame.amplitude is None else {"amplitude": frame.amplitude},
+            GeometryRecord(
+                frame.points,
+                normals=frame.normals,
+                color=frame.color,
+                scalars={} if frame.amplitude is None else {"amplitude": frame.amplitude},
+            ),
         )
 
     def _write_images(self, frame: RangeFrame) -> None:

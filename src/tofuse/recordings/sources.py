@@ -150,11 +150,11 @@ def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = 
     `shift` (3,) is taken off the coordinates, m.
     """
     ply = read_ply(path)
-    points = ply.points if shift is None else ply.coordinates
+    dtype: type[np.floating] = np.float32 if shift is None else np.float64
     return cloud_frame(
         index,
         timestamp,
-        points,
+        ply.points.astype(dtype),
         ply.normals,
         amplitude=ply.amplitude,
         color=ply.color,

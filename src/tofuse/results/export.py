@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,11 +15,12 @@ import numpy as np
 from tofuse.arrays import Float64, Intp, UInt8
 from tofuse.errors import InputError, OutputError
 from tofuse.files.atomic import make_folder, new_folder, output_error
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import jpeg_bytes
 from tofuse.files.ply import read_ply
 from tofuse.files.stamps import stamp
 from tofuse.files.trajectory import associate, read_tum, write_kitti, write_log
-from tofuse.fusion.exchange import Shape
+from tofuse.fusion import exchange
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import baked
 from tofuse.fusion.upright import upright
@@ -49,11 +50,11 @@ class _Result:
     pinhole: bool
 
     @cached_property
-    def cloud(self) -> Shape:
+    def cloud(self) -> GeometryRecord:
         """The cloud, with columns that say how far each point is to be trusted."""
         ply = read_ply(self.folder / "cloud.ply")
-        scalars = {name: ply.vertex[name] for name in _SCALARS if name in ply.vertex}
-        return Shape(ply.points, ply.normals, ply.color, scalars)
+        scalars = {name: ply.scalars[name] for name in _SCALARS if name in ply.scalars}
+        return replace(ply, faces=None, scalars=scalars)
 
     @cached_property
     def trajectory(self) -> tuple[Float64, Float64]:
@@ -73,12 +74,12 @@ class _Result:
         normals = np.zeros((len(ply), 3), np.float32) if ply.normals is None else ply.normals
         unknown = np.zeros(len(ply))
         return Mesh(
-            ply.points,
+            ply.points.astype(np.float32),
             faces,
             normals,
             ply.color,
-            ply.vertex.get("sigma", unknown).astype(np.float32),
-            ply.vertex.get("views", unknown).astype(np.int32),
+            ply.scalars.get("sigma", unknown).astype(np.float32),
+            ply.scalars.get("views", unknown).astype(np.int32),
             np.zeros(3),
         )
 
@@ -92,23 +93,21 @@ class _Result:
         return R
 
     @cached_property
-    def painted(self) -> Shape:
+    def painted(self) -> GeometryRecord:
         """The mesh as it is looked at: simplified, its colours in a texture where that is quick."""
         most = self.faces or FACES
         if self.mesh.color is None or not len(self.mesh.faces):
-            return self.mesh.decimated(most).shape()
+            return self.mesh.decimated(most).record()
         if min(most, len(self.mesh.faces)) > _MOST_PAINTED:
-            return self.mesh.decimated(most).shape()
+            return self.mesh.decimated(most).record()
         found = baked(self.mesh, most, _TEXTURE_SIZE)
         rows = found.atlas.vertices
-        return Shape(
+        return GeometryRecord(
             found.mesh.vertices[rows],
-            found.mesh.normals[rows],
-            None,
-            {},
             found.atlas.faces,
-            found.atlas.uv,
-            _jpeg(found.image, len(rows), len(found.atlas.faces)),
+            found.mesh.normals[rows],
+            uv=found.atlas.uv,
+            texture=_jpeg(found.image, len(rows), len(found.atlas.faces)),
         )
 
     @cached_property
@@ -135,16 +134,16 @@ def _jpeg(image: UInt8, vertices: int, faces: int) -> bytes:
 
 
 def _cloud(result: _Result, path: Path) -> None:
-    result.cloud.save(path)
+    exchange.save(result.cloud, path)
 
 
 def _mesh(result: _Result, path: Path) -> None:
-    result.painted.save(path, result.R_up_world)
+    exchange.save(result.painted, path, result.R_up_world)
 
 
 def _stl(result: _Result, path: Path) -> None:
     mesh = result.mesh if result.faces is None else result.mesh.decimated(result.faces)
-    mesh.shape().save(path, result.R_up_world)
+    exchange.save(mesh.record(), path, result.R_up_world)
 
 
 def _nerfstudio(result: _Result, path: Path) -> None:

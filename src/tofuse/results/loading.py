@@ -158,12 +158,12 @@ def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
 
 def _cloud(path: Path) -> Cloud:
     ply = read_ply(path)
-    sigma = ply.vertex.get("sigma")
+    sigma = ply.scalars.get("sigma")
     return Cloud(
-        ply.points,
+        ply.points.astype(np.float32),
         ply.normals,
         ply.color,
-        np.asarray(ply.vertex["views"], np.int32),
+        np.asarray(ply.scalars["views"], np.int32),
         np.zeros(3),
         None if sigma is None else np.asarray(sigma, np.float32),
     )
@@ -175,11 +175,11 @@ def _mesh(path: Path) -> Mesh | None:
     ply = read_ply(path)
     normals, faces = ply.normals, ply.faces
     return Mesh(
-        ply.points,
+        ply.points.astype(np.float32),
         np.zeros((0, 3), np.int32) if faces is None else faces,
         np.zeros((len(ply), 3), np.float32) if normals is None else normals,
         ply.color,
-        np.asarray(ply.vertex["sigma"], np.float32),
-        np.asarray(ply.vertex["views"], np.int32),
+        np.asarray(ply.scalars["sigma"], np.float32),
+        np.asarray(ply.scalars["views"], np.int32),
         np.zeros(3),
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.ply import write_ply
 from tofuse.files.trajectory_formats import OPENGL
 from tofuse.geometry.cameras import DISTORTION_ORDER, BrownConrady, Camera, Fisheye, Pinhole
@@ -77,7 +78,7 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
         "ply_file_path": "points.ply",
     }
     points, color = some_points(result)
-    write_ply(folder / "points.ply", points, color=color)
+    write_ply(folder / "points.ply", GeometryRecord(points, color=color))
     about |= {"frames": []}
     text = json.dumps(about, indent=1, allow_nan=False).removesuffix("[]\n}")
     lines = ",\n  ".join(json.dumps(frame, allow_nan=False) for frame in frames)

@@ -14,6 +14,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import write_glb
 from tofuse.files.images import png_bytes
 from tofuse.files.obj import write_obj
@@ -87,10 +88,13 @@ def _write_model(
     cloud = result.cloud
     write_ply(
         folder / "cloud.ply",
-        cloud.points,
-        normals=cloud.normals,
-        color=cloud.color,
-        scalars={"views": cloud.views} | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
+        GeometryRecord(
+            cloud.points,
+            normals=cloud.normals,
+            color=cloud.color,
+            scalars={"views": cloud.views}
+            | ({} if cloud.sigma is None else {"sigma": cloud.sigma}),
+        ),
     )
     tiled = None
     if result.mesh is not None:
@@ -109,9 +113,11 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
     colors = np.array([CHANGED[change.kind] for change in found], np.uint8)
     write_ply(
         path,
-        np.concatenate([change.points for change in found]).astype(np.float32),
-        color=np.repeat(colors, counts, axis=0),
-        scalars={"change": np.repeat(np.arange(len(found), dtype=np.int32), counts)},
+        GeometryRecord(
+            np.concatenate([change.points for change in found]).astype(np.float32),
+            color=np.repeat(colors, counts, axis=0),
+            scalars={"change": np.repeat(np.arange(len(found), dtype=np.int32), counts)},
+        ),
     )
 
 
@@ -125,11 +131,13 @@ def _write_mesh(
     """
     write_ply(
         folder / "mesh.ply",
-        mesh.vertices,
-        normals=mesh.normals,
-        color=mesh.color,
-        scalars={"views": mesh.views, "sigma": mesh.sigma},
-        faces=mesh.faces,
+        GeometryRecord(
+            mesh.vertices,
+            normals=mesh.normals,
+            color=mesh.color,
+            scalars={"views": mesh.views, "sigma": mesh.sigma},
+            faces=mesh.faces,
+        ),
     )
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
@@ -140,10 +148,12 @@ def _write_mesh(
         shown = tiles.overview(mesh) if tiled is None else tiled.overview
         write_glb(
             folder / "mesh.glb",
-            shown.vertices,
-            shown.faces,
-            normals=shown.normals,
-            color=None if shown.color is None else seen_colors(shown.color),
+            GeometryRecord(
+                shown.vertices,
+                shown.faces,
+                normals=shown.normals,
+                color=None if shown.color is None else seen_colors(shown.color),
+            ),
             generator=generator,
             **upright,
         )
@@ -154,22 +164,14 @@ def _write_mesh(
     )
     write_glb(
         folder / "mesh.glb",
-        points,
-        atlas.faces,
-        normals=normals,
-        uv=atlas.uv,
-        texture=image,
+        GeometryRecord(points, atlas.faces, normals=normals, uv=atlas.uv, texture=image),
         generator=generator,
         **upright,
     )
     R = result.T_up_world[:3, :3].T
     write_obj(
         folder / "mesh.obj",
-        points @ R,
-        atlas.faces,
-        normals=normals @ R,
-        uv=atlas.uv,
-        texture=image,
+        GeometryRecord(points @ R, atlas.faces, normals=normals @ R, uv=atlas.uv, texture=image),
     )
     return tiled
 

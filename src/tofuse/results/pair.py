@@ -14,6 +14,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.arrays import Float64
 from tofuse.files.atomic import write_text
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.moving import Names
 from tofuse.files.ply import write_ply
 from tofuse.files.pose import pose_text
@@ -279,9 +280,11 @@ def write_aligned(result: PairResult, path: Path) -> None:
         normals = (normals @ result.found.T_target_source[:3, :3].T).astype(np.float32)
     write_ply(
         path,
-        points,
-        normals=normals,
-        color=frame.color,
-        scalars=None if frame.amplitude is None else {"intensity": frame.amplitude},
+        GeometryRecord(
+            points,
+            normals=normals,
+            color=frame.color,
+            scalars={} if frame.amplitude is None else {"intensity": frame.amplitude},
+        ),
         double=bool(np.abs(points).max(initial=0) > MAP_COORDINATES_M),
     )

@@ -10,6 +10,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.arrays import Float64
 from tofuse.files.atomic import make_folder
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import write_glb
 from tofuse.files.tileset import Tile, write_tileset
 from tofuse.fusion.colors import seen_colors
@@ -114,11 +115,13 @@ def _written(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Til
         points = (mesh.vertices @ R_up_world.T).astype(np.float32)
         write_glb(
             folder / name,
-            points,
-            mesh.faces,
-            normals=mesh.normals @ R_up_world.T,
-            color=None if mesh.color is None else seen_colors(mesh.color),
-            scalars={"sigma": mesh.sigma, "views": mesh.views},
+            GeometryRecord(
+                points,
+                mesh.faces,
+                normals=mesh.normals @ R_up_world.T,
+                color=None if mesh.color is None else seen_colors(mesh.color),
+                scalars={"sigma": mesh.sigma, "views": mesh.views},
+            ),
             generator=f"tofuse {__version__}",
         )
         low, high = points.min(0).astype(float), points.max(0).astype(float)

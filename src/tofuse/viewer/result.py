@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Float32, Float64, Int32, UInt8
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.glb import read_glb
-from tofuse.files.ply import Ply, read_ply
+from tofuse.files.ply import read_ply
 from tofuse.files.tileset import Tile, read_tileset
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
@@ -55,15 +56,15 @@ class Layer:
     views: Float64 | None
 
     @classmethod
-    def of(cls, ply: Ply) -> Layer:
-        """Take what a PLY of ours holds."""
+    def of(cls, ply: GeometryRecord) -> Layer:
+        """Return the layer of a PLY file that tofuse wrote."""
         scalars = {
-            name: ply.vertex[name].astype(float)
+            name: ply.scalars[name].astype(float)
             for name in ("sigma", "views")
-            if name in ply.vertex
+            if name in ply.scalars
         }
         return cls(
-            ply.points,
+            ply.points.astype(np.float32),
             ply.normals,
             ply.faces,
             ply.color,
@@ -126,8 +127,8 @@ class TiledLayer:
         R = self.R_up_world.astype(np.float32)
         known = {name: glb.scalars[name].astype(float) for name in glb.scalars}
         return Layer(
-            glb.points @ R,
-            None if glb.normals is None else glb.normals @ R,
+            glb.points.astype(np.float32) @ R,
+            None if glb.normals is None else glb.normals.astype(np.float32) @ R,
             glb.faces,
             glb.color,
             known.get("sigma"),

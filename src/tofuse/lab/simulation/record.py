@@ -11,6 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.images import write_png
 from tofuse.files.ply import write_ply
 from tofuse.geometry import se3
@@ -279,7 +280,10 @@ def write(
         write_png(depths / f"{k:06d}.png", np.where(counts < 65535, counts, 0).astype(np.uint16))
     vertices, faces = made.scene.truth_mesh()
     T = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
-    write_ply(truth / "surface.ply", se3.transform(T, vertices), faces=faces)
+    write_ply(
+        truth / "surface.ply",
+        GeometryRecord(se3.transform(T, vertices), faces=faces.astype(np.int32)),
+    )
     times = made.raw / made.sequence.frame_rate_hz
     return writer.finish(
         groundtruth=made.poses,
@@ -301,7 +305,7 @@ def _write_peaks(
         writer.add(frame)
     T_camera_object = se3.inverse(peaks_cameras()[0])
     truth = make_folder(writer.folder / "truth")
-    write_ply(truth / "surface.ply", se3.transform(T_camera_object, peaks_points()))
+    write_ply(truth / "surface.ply", GeometryRecord(se3.transform(T_camera_object, peaks_points())))
     return writer.finish(groundtruth=recording.reference)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, UInt8
 from tofuse.errors import InputError
+from tofuse.files.geometry_record import GeometryRecord
 from tofuse.files.pcd import read_pcd
 from tofuse.files.ply import read_ply
 from tofuse.files.reading import is_file, is_folder, read_text
@@ -123,15 +124,17 @@ def _read(path: Path) -> Cells:
     suffix = path.suffix.lower()
     if suffix == ".pcd":
         pcd = read_pcd(path)
-        return Cells(pcd.points, pcd.amplitude, pcd.color, pcd.width if pcd.organised else None)
+        return _cells(pcd.cloud, pcd.width if pcd.organised else None)
     if suffix == ".ply":
         ply = read_ply(path)
         told = dict(line.split(None, 1) for line in ply.comments if len(line.split()) == 2)
         width = told.get("num_cols", "")
-        return Cells(
-            ply.points, ply.amplitude, ply.color, int(width) if width.isdecimal() else None
-        )
+        return _cells(ply, int(width) if width.isdecimal() else None)
     return _read_csv(path)
+
+
+def _cells(cloud: GeometryRecord, width: int | None) -> Cells:
+    return Cells(cloud.points.astype(np.float32), cloud.amplitude, cloud.color, width)
 
 
 def _read_csv(path: Path) -> Cells:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.pcd import Pcd, read_pcd
@@ -46,13 +48,14 @@ class PcdClouds:
 def pcd_cloud(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
     """Read a file as a cloud, less `shift` (3,); its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
+    cloud = pcd.cloud
     return cloud_frame(
         index,
         timestamp,
-        pcd.points if shift is None else pcd.coordinates,
-        pcd.normals,
-        amplitude=pcd.amplitude,
-        color=pcd.color,
+        cloud.points.astype(np.float32 if shift is None else np.float64),
+        cloud.normals,
+        amplitude=cloud.amplitude,
+        color=cloud.color,
         origin=pcd.viewpoint[:3],
         shift=shift,
     )
@@ -67,9 +70,9 @@ def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame
         index,
         timestamp,
         path,
-        amplitude=pcd.amplitude,
-        color=pcd.color,
-        normals=pcd.normals,
+        amplitude=pcd.cloud.amplitude,
+        color=pcd.cloud.color,
+        normals=pcd.cloud.normals,
     )
 
 
@@ -89,4 +92,4 @@ def _camera(files: list[Path]) -> Camera | None:
 
 
 def _image(pcd: Pcd) -> Float32:
-    return pcd.points.reshape(pcd.height, pcd.width, 3)
+    return pcd.cloud.points.astype(np.float32).reshape(pcd.height, pcd.width, 3)

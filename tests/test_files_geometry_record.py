@@ -1,0 +1,62 @@
+"""The record that readers and writers of geometry share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.errors import InputError
+from tofuse.files.e57 import write_e57
+from tofuse.files.geometry_record import GeometryRecord
+from tofuse.files.glb import write_glb, write_gltf
+from tofuse.files.las import write_las, write_laz
+from tofuse.files.obj import write_obj
+from tofuse.files.pcd import write_pcd
+from tofuse.files.ply import write_ply
+from tofuse.files.stl import write_stl
+from tofuse.files.usdz import write_usdz
+
+POINTS = np.zeros((3, 3), np.float32)
+FACE = np.array([[0, 1, 2]], np.int32)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        write_e57,
+        write_glb,
+        write_gltf,
+        write_las,
+        write_laz,
+        write_obj,
+        write_pcd,
+        write_ply,
+        write_stl,
+        write_usdz,
+    ],
+)
+def test_every_writer_checks_the_shapes(tmp_path, write) -> None:
+    for record, words in (
+        (GeometryRecord(POINTS[:, :2]), "points of shape"),
+        (GeometryRecord(POINTS, FACE + 1), "faces of shape"),
+        (GeometryRecord(POINTS, FACE[0]), "faces of shape"),
+        (GeometryRecord(POINTS, normals=POINTS[:2]), "normals of shape"),
+        (GeometryRecord(POINTS, color=np.zeros((3, 4), np.uint8)), "color of shape"),
+        (GeometryRecord(POINTS, uv=POINTS), "uv of shape"),
+        (GeometryRecord(POINTS, scalars={"sigma": POINTS}), "sigma of shape"),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            write(tmp_path / "a.x", record)
+        assert "a.x" in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_amplitude_has_several_names() -> None:
+    column = np.arange(3, dtype=np.uint16)
+    for name in ("amplitude", "intensity", "scalar_Intensity"):
+        amplitude = GeometryRecord(POINTS, scalars={"views": column + 1, name: column}).amplitude
+        assert amplitude is not None
+        assert amplitude.dtype == np.float32
+        np.testing.assert_array_equal(amplitude, column)
+    table = np.zeros((3, 2))
+    assert GeometryRecord(POINTS, scalars={"intensity": table}).amplitude is None
