@@ -108,7 +108,7 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
     """Some of the power cuts."""
     mutation.subjects()  # which finds the tests
     import made_results
-    from tofuse.results.folder import OutputFolder, is_result, settle
+    from tofuse.results.folder import OutputFolder, finish_interrupted, is_result
     from tofuse.results.output import write_result
 
     def write(folder: Path, number: int) -> None:
@@ -129,14 +129,16 @@ def cuts(first: int, count: int, seed: int) -> tuple[int, list[str]]:
             folder = Path(base) / f"cut-{k:06}"
             write(folder, 1)
             (folder / "mine.txt").write_bytes(b"mine")
-            for job in itertools.chain([lambda f: write(f, 2)], [settle] * int(rng.integers(4))):
+            for job in itertools.chain(
+                [lambda f: write(f, 2)], [finish_interrupted] * int(rng.integers(4))
+            ):
                 power = Power(int(rng.integers(60)))
                 with power.connected(), suppress(PowerCut):
                     job(folder)
                 if power.off:
                     power.lose(folder)
             try:
-                settle(folder)
+                finish_interrupted(folder)
                 OutputFolder(folder, overwrite=True).discard()
                 found = made_results.contents(folder)
                 mine = found.pop("mine.txt", None)

@@ -34,7 +34,7 @@ from tofuse.lab.simulation.scenes import flat, furniture
 from tofuse.lab.simulation.scenes.assembly import Assembly, placed
 from tofuse.pipeline.merging import MergeOptions, merge_files
 from tofuse.pipeline.run import Options, run
-from tofuse.results.sessions import probability
+from tofuse.results.sessions import probability_text
 from tofuse.results.types import Reconstruction
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
@@ -283,7 +283,9 @@ def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
         f"{1e3 * metres:.1f} mm, {np.degrees(angle):.2f}°" if joined else "-",
         *(f"{1e3 * a:.1f} mm" if np.isfinite(a) else "-" for a in (*ates, ate)),
         f"{1e3 * result.diagnostics.accuracy.position_m:.0f} mm",
-        "-" if pair.probability is None else f"{probability(pair.probability)}, {pair.links} links",
+        "-"
+        if pair.probability is None
+        else f"{probability_text(pair.probability)}, {pair.links} links",
         ", ".join(c.change.kind for c in result.changes) or "-",
     ]
     return "| " + " | ".join(cells) + " |"

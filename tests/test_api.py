@@ -92,7 +92,7 @@ def test_a_saved_result_is_loaded_as_it_was(result, tmp_path):
 
 def test_saving_refuses_what_is_not_ours(result, tmp_path):
     (tmp_path / "diary.txt").write_text("dear")
-    with pytest.raises(tofuse.OutputError, match="holds no earlier result"):
+    with pytest.raises(tofuse.OutputError, match="contains no earlier result"):
         result.save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["diary.txt"]
 

@@ -436,7 +436,7 @@ def test_overwrite_replaces_an_earlier_result_and_nothing_else(
     (out / "notes.txt").write_text("mine")
     (out / "aligned.ply").unlink()
     refuses(
-        capfd, "register", *clouds, "--out", out, says=("holds an earlier result", "--overwrite")
+        capfd, "register", *clouds, "--out", out, says=("contains an earlier result", "--overwrite")
     )
     assert call("register", clouds[1], clouds[1], "--out", out, "--overwrite") == 0
     assert {p.name for p in out.iterdir()} == {*FILES, "notes.txt"}

@@ -20,7 +20,7 @@ from tofuse.files.atomic import new_folder, write_text
 from tofuse.files.moving import is_stopped
 from tofuse.pipeline.checkpoint import Checkpoints
 from tofuse.recordings.rig import Rig, RigCamera, write_rig
-from tofuse.results.folder import STAGING, OutputFolder, is_result, settle
+from tofuse.results.folder import STAGING, OutputFolder, finish_interrupted, is_result
 from tofuse.results.output import write_result
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -86,7 +86,7 @@ def test_a_result_is_the_old_or_the_new_one(memory, power, old, reader_first) ->
         else:  # nobody takes it for whole
             assert shown(folder) in (before, after) or not is_result(folder), calls
         if reader_first:
-            settle(folder)
+            finish_interrupted(folder)
             assert shown(folder) in (before, after), calls
         OutputFolder(folder, overwrite=True).discard()
         assert shown(folder) in (before, after), calls
@@ -128,18 +128,18 @@ def test_what_goes_on_may_be_cut_off_again(memory, power, monkeypatch, way) -> N
         return folder
 
     whole = prepare()
-    settle(whole)
+    finish_interrupted(whole)
     wanted = shown(whole)
     assert is_result(whole)
     assert MINE.items() <= wanted.items()
 
     def check(folder: Path, calls: int) -> None:
-        settle(folder)
+        finish_interrupted(folder)
         assert shown(folder) == wanted, calls
         OutputFolder(folder, overwrite=True).discard()
         assert contents(folder) == wanted, calls
 
-    assert power.cut_everywhere(prepare, settle, check) > 10
+    assert power.cut_everywhere(prepare, finish_interrupted, check) > 10
 
 
 def _record(folder: Path, state: str, job: Job) -> None:

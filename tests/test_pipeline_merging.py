@@ -30,7 +30,7 @@ from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.opening import Opening
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import read_run_json, run_json, write_result
-from tofuse.results.sessions import sentences
+from tofuse.results.sessions import session_sentences
 
 TRUE = np.array([*HERE, *THERE])
 
@@ -93,7 +93,7 @@ def test_it_says_which_overlap_and_how_sure(both) -> None:
     assert pair.probability > 0.99
     assert pair.support > 0.99
     assert 0.5 < pair.overlap <= 1
-    (text,) = sentences(both)
+    (text,) = session_sentences(both)
     assert "overlap" in text
     assert "probability" in text
 
@@ -114,8 +114,8 @@ def test_a_flat_of_the_same_plan_is_not_joined(results) -> None:
     assert not pair.joined
     assert (pair.links, pair.probability, pair.support) == (0, None, None)
     assert found.sessions[1].T_main_session is None
-    assert sentences(found) == [
-        "elsewhere stays apart: no overlap with the first session could be confirmed."
+    assert session_sentences(found) == [
+        "elsewhere is not joined: no overlap with the first session could be confirmed."
     ]
     (told,) = [r for r in found.diagnostics.reasons if r.code == "disconnected"]
     assert "between here and elsewhere" in told.text
@@ -284,7 +284,7 @@ def test_a_recording_is_added_to_a_map(results, tmp_path, monkeypatch, capsys) -
     runs_to(results["elsewhere"])
     assert main(words) == 3
     assert (into / "run.json").read_bytes() == before
-    assert "stays apart" in capsys.readouterr().out
+    assert "is not joined" in capsys.readouterr().out
     assert main([*words[:-1], str(tmp_path / "new")]) == 2
     assert "--out as well" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "nothing")]) == 2

@@ -36,9 +36,7 @@ def test_what_would_improve_it() -> None:
         Reason("uncertain_poses", ((0, 1),), "The poses may be off."),
     )
     (last,) = card(of(KNOWN, "degraded", reasons))[-1:]
-    assert (
-        last == "to improve: come back to these places, or keep corners and texture in view there"
-    )
+    assert last == "to improve: revisit these places, or keep corners and texture in view there"
 
 
 def test_what_is_not_bounded_or_not_assessed() -> None:

@@ -273,7 +273,7 @@ def test_usdz_by_openusd(result: Path, upright) -> None:
 
 def test_many_triangles_have_colours_of_vertices(result: Path, upright, monkeypatch) -> None:
     trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr("tofuse.results.export._MOST_PAINTED", 10)
+    monkeypatch.setattr("tofuse.results.export._MAX_TEXTURED_FACES", 10)
     glb, obj, usdz = export(result, ["glb", "obj", "usdz"])
     (mesh,) = trimesh.load_scene(obj, process=False, maintain_order=True).geometry.values()
     color = mesh.visual.vertex_colors[:, :3]
@@ -354,7 +354,7 @@ def test_tiles(result: Path, expected) -> None:
         export(result, ["3dtiles"])
     export(result, ["3dtiles"], overwrite=True)
     (path.parent / "mine.txt").write_text("kept")
-    with pytest.raises(OutputError, match="other than tiles"):
+    with pytest.raises(OutputError, match="files that are not tiles"):
         export(result, ["3dtiles"], overwrite=True)
     assert (path.parent / "mine.txt").read_text() == "kept"
     write_ply(result / "mesh.ply", GeometryRecord(np.zeros((3, 3))))
@@ -401,14 +401,14 @@ def test_by_the_command_line(result: Path, tmp_path: Path, capsys) -> None:
     assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
     assert (out / "cloud.las").read_bytes() == before
     assert main(["export", str(tmp_path), "las"]) == 2
-    assert "holds no result" in capsys.readouterr().err
+    assert "is not a result" in capsys.readouterr().err
     assert main(["export", str(result), "doc"]) == 2
     assert "use one of" in capsys.readouterr().err
 
 
 def test_what_is_not_there(result: Path, monkeypatch) -> None:
     (result / "mesh.ply").unlink()
-    with pytest.raises(InputError, match="clouds without a camera make no surface"):
+    with pytest.raises(InputError, match="clouds without a camera model give no surface"):
         export(result, ["obj"])
     monkeypatch.setitem(__import__("sys").modules, "pye57", None)
     with pytest.raises(InputError, match=r"needs the package pye57; pip install 'tofuse\[scan\]'"):

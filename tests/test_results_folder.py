@@ -16,7 +16,7 @@ from tofuse.errors import InputError, OutputError
 from tofuse.files import locking
 from tofuse.files.locking import Claim
 from tofuse.lab.demo import _replacing_recording
-from tofuse.results.folder import LOCK, STAGING, OutputFolder, is_result, settle
+from tofuse.results.folder import LOCK, STAGING, OutputFolder, finish_interrupted, is_result
 from tofuse.results.output import write_result
 from tofuse.results.pair import pair_folder
 
@@ -87,7 +87,7 @@ def test_no_plan_of_somebody_else_is_followed(tmp_path, plan, theirs, name) -> N
         assert contents(tmp_path) == before
     if plan not in ("not what it was", "no result made"):  # which a reader would not ask
         with pytest.raises(InputError):
-            settle(out)
+            finish_interrupted(out)
     assert contents(tmp_path) == before
     assert not (out / LOCK).exists()
 
@@ -213,7 +213,7 @@ def test_a_reader_waits_for_no_moves_and_finishes_stopped_ones(tmp_path, monkeyp
             moves.append(target)
             if len(moves) > 3:
                 with pytest.raises(InputError, match=f"pid {os.getpid()}"):
-                    settle(tmp_path)  # while they go on
+                    finish_interrupted(tmp_path)  # while they go on
                 raise OSError(5, "gone")
         move(source, target)
 
@@ -225,8 +225,8 @@ def test_a_reader_waits_for_no_moves_and_finishes_stopped_ones(tmp_path, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(os, "open", lambda *_a, **_o: (_ for _ in ()).throw(OSError(30, "read-only")))
         with pytest.raises(InputError, match="read-only"):
-            settle(tmp_path)
-    settle(tmp_path)
+            finish_interrupted(tmp_path)
+    finish_interrupted(tmp_path)
     assert is_result(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {p.name for p in tmp_path.iterdir()} - {STAGING}
 

@@ -41,7 +41,7 @@ def test_folders_that_were_made_go_when_nothing_is_written(tmp_path) -> None:
 def test_an_earlier_result_is_only_replaced_when_asked(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     before = contents(tmp_path)
-    with pytest.raises(OutputError, match="holds an earlier result; give --overwrite"):
+    with pytest.raises(OutputError, match="contains an earlier result; pass --overwrite"):
         OutputFolder(tmp_path)
     assert contents(tmp_path) == before
     write_result(result(seed=5), OutputFolder(tmp_path, overwrite=True))
@@ -52,7 +52,7 @@ def test_an_earlier_result_is_only_replaced_when_asked(tmp_path) -> None:
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, name, overwrite) -> None:
     (tmp_path / name).write_text('{"a": 1}')
-    with pytest.raises(OutputError, match="is not empty and holds no earlier result"):
+    with pytest.raises(OutputError, match="is not empty and contains no earlier result"):
         OutputFolder(tmp_path, overwrite=overwrite)
     assert contents(tmp_path) == {name: b'{"a": 1}'}
 
@@ -60,7 +60,7 @@ def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, name, overwrite) -> N
 def test_a_file_or_a_place_below_a_file(tmp_path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
-    with pytest.raises(OutputError, match="is a file; give --out a folder"):
+    with pytest.raises(OutputError, match="is a file; pass a folder as --out"):
         OutputFolder(file)
     with pytest.raises(OutputError, match="can't be written"):
         OutputFolder(file / "below")

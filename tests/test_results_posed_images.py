@@ -282,7 +282,11 @@ def _damaged(result: Path) -> None:
 
 @pytest.mark.parametrize(
     ("spoil", "says"),
-    [(_gone, "which is gone"), (_longer, "is not of the frames"), (_damaged, "is damaged")],
+    [
+        (_gone, "which doesn't exist"),
+        (_longer, "does not match the frames"),
+        (_damaged, "is damaged"),
+    ],
 )
 def test_what_can_not_be_exported_is_told(
     tmp_path: Path, spoil: Callable[[Path], None], says: str, capsys
@@ -312,7 +316,7 @@ def test_folders_are_replaced_only_where_they_are_ours(tmp_path: Path) -> None:
     export(result, ["colmap"], overwrite=True)
     assert (folder / "images" / "frame_000001.png").is_file()
     (folder / "trained.ckpt").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds trained\.ckpt"):
+    with pytest.raises(OutputError, match=r"contains trained\.ckpt"):
         export(result, ["colmap"], overwrite=True)
     assert (folder / "trained.ckpt").read_text() == "mine"
     assert not [p for p in result.iterdir() if p.name.startswith(".")]

@@ -27,7 +27,7 @@ from tofuse.geometry import se3
 from tofuse.results import tiles
 from tofuse.results.folder import STAGING, OutputFolder, settle
 from tofuse.results.output import write_result
-from tofuse.results.tiles import Tiled, is_tiles, write_tiles
+from tofuse.results.tiles import TilingSummary, is_tiles, write_tiles
 from tofuse.results.types import Component
 
 N = 180
@@ -283,7 +283,7 @@ def test_glb_of_ours_comes_back_and_others_are_told(tmp_path) -> None:
 
 @pytest.fixture
 def small_limits(monkeypatch) -> None:
-    monkeypatch.setattr(tiles, "MOST_FACES", 10_000)
+    monkeypatch.setattr(tiles, "MAX_UNTILED_FACES", 10_000)
     monkeypatch.setattr(tiles, "OVERVIEW_BYTES", 600_000)
     monkeypatch.setattr(detail, "_ACROSS", 32)
 
@@ -400,7 +400,7 @@ def test_moves_that_were_stopped_are_finished_with_all_tiles(
 
 
 def test_the_overview_is_as_fine_as_fits(tmp_path, small_limits) -> None:
-    tiled: Tiled = write_tiles(waves(), np.eye(3), tmp_path)
+    tiled: TilingSummary = write_tiles(waves(), np.eye(3), tmp_path)
     write_glb(
         tmp_path / "o.glb",
         GeometryRecord(tiled.overview.vertices, tiled.overview.faces, color=None),

@@ -36,7 +36,7 @@ def folder(tmp_path_factory) -> Iterator[Path]:
     out = tmp_path_factory.mktemp("view") / "out"
     pictures = draw(result.diagnostics.samples)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiles, "MOST_FACES", 10_000)
+        patch.setattr(tiles, "MAX_UNTILED_FACES", 10_000)
         patch.setattr(detail, "_ACROSS", 32)
         write_result(
             replace(result, mesh=flipped),

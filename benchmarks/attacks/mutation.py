@@ -316,12 +316,12 @@ def _stopped(out: Path) -> None:
 
 
 def _settle(out: Path) -> None:
-    from tofuse.results.folder import OutputFolder, settle
+    from tofuse.results.folder import OutputFolder, finish_interrupted
 
     mine = out / "precious.txt"
     before = mine.read_bytes() if mine.is_file() else None
     try:
-        settle(out)
+        finish_interrupted(out)
         OutputFolder(out, overwrite=True).discard()
     finally:
         if before is not None and mine.read_bytes() != before:

@@ -413,10 +413,10 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     from tofuse.results.folder import component_name
     from tofuse.results.output import accuracy_json, plain, reasons_json
     from tofuse.results.ranges import in_words
-    from tofuse.results.sessions import sentences
+    from tofuse.results.sessions import session_sentences
 
     d = result.diagnostics
-    sessions = sentences(result)
+    sessions = session_sentences(result)
     counts = {s: sum(f.status == s for f in d.frames) for s in ("tracked", "predicted", "lost")}
     skipped = sum(f.status == "skipped" for f in d.frames)
     if as_json:

@@ -19,7 +19,7 @@ from tofuse.files.trajectory_formats import Clock, TimedPoses, read_poses
 from tofuse.recordings.open import open_recording, read_reference
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import is_result
-from tofuse.results.output import clock_of, read_run_json
+from tofuse.results.output import frame_clock, read_run_json
 
 Poses = str | Path | Float64
 
@@ -96,7 +96,7 @@ def evaluate(
         str(p) if isinstance(p, str | Path) else n
         for p, n in ((estimate, "estimate"), (reference, "reference"))
     ]
-    clock = clock_of(Path(estimate)) if isinstance(estimate, str | Path) else None
+    clock = frame_clock(Path(estimate)) if isinstance(estimate, str | Path) else None
     if recording is not None:
         clock = recording.timestamps, recording.indices
     found, known = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)

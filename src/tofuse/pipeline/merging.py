@@ -34,7 +34,7 @@ from tofuse.recordings.sources import JoinedSource
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
-from tofuse.results.sessions import sentences
+from tofuse.results.sessions import session_sentences
 from tofuse.results.types import (
     Reason,
     Reconstruction,
@@ -334,7 +334,7 @@ def _report(result: Reconstruction, folder: Path) -> None:
     names = ", ".join(session.name for session in result.sessions)
     extras = ReportExtras(
         title=f"{names} merged" if names else f"{folder.name} of a merged result",
-        headline=" ".join(sentences(result)),
+        headline=" ".join(session_sentences(result)),
         pictures=pictures,
     )
     write_report(result, folder / "report.html", extras)

@@ -14,7 +14,7 @@ from tofuse.evaluation.sightings import Sightings, compared
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import evenly
 from tofuse.registration.prepared_view import PreparedView
-from tofuse.results.sessions import AS_GOOD_AS_CERTAIN
+from tofuse.results.sessions import MAX_STATED_PROBABILITY
 from tofuse.results.types import Reconstruction, SessionChange, SessionPair, SessionRecord
 
 View = PosedView[PreparedView]
@@ -67,7 +67,7 @@ class Model:
             and any(one.has(k) for k in (join.link.i, join.link.j))
             and any(other.has(k) for k in (join.link.i, join.link.j))
         ]
-        return min(max(said), AS_GOOD_AS_CERTAIN) if said else None
+        return min(max(said), MAX_STATED_PROBABILITY) if said else None
 
     def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> Sightings:
         """What views of two sessions say of each other."""

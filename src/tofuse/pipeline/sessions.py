@@ -19,9 +19,9 @@ from tofuse.pipeline.progress import Progress
 from tofuse.pipeline.reconstruct import fitted
 from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
-from tofuse.results.folder import component_name, is_result, settle
+from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.output import main_poses, read_run_json
-from tofuse.results.reopening import RecordedPart, recorded_parts, reopened, where_it_lies
+from tofuse.results.reopening import StoredRecording, locate_recording, reopen, stored_recordings
 
 _REMEDY = "give the --out of `tofuse run`"
 
@@ -109,20 +109,22 @@ def sessions_of(
     ]
 
 
-def _read_parts(folder: Path, components: int) -> list[tuple[RecordedPart, dict[int, StatedPose]]]:
+def _read_parts(
+    folder: Path, components: int
+) -> list[tuple[StoredRecording, dict[int, StatedPose]]]:
     """Read what a result says of its recordings and of their frames, by index in the recording.
 
     Its components are numbered from `components`.
     """
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy=_REMEDY)
-    settle(folder)
+    finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError("holds no result (no run.json)", where=folder, remedy=_REMEDY)
     run = read_run_json(folder / "run.json")
     try:
         stated = _stated(folder, run, components)
-        parts = list(recorded_parts(folder, run))
+        parts = list(stored_recordings(folder, run))
         return [(p, {k: stated[p.first + k] for k in p.frames}) for p in parts]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
@@ -131,14 +133,14 @@ def _read_parts(folder: Path, components: int) -> list[tuple[RecordedPart, dict[
 
 
 def _session(
-    part: RecordedPart,
+    part: StoredRecording,
     stated: dict[int, StatedPose],
     folder: Path,
     threads: int | None,
     progress: Progress,
 ) -> Session:
     """Open the recording of a part of a result again."""
-    recording = reopened(part, folder)
+    recording = reopen(part, folder)
     frame = recording.first_readable()
     if frame is not None and kind_of(frame) != "range":
         raise InputError(
@@ -147,7 +149,7 @@ def _session(
             remedy="give their clouds together to one `tofuse run`",
         )
     config = _config(part.config, recording, folder, threads, progress)
-    opening = where_it_lies(part.opening, folder)
+    opening = locate_recording(part.opening, folder)
     return Session(part.name, folder, opening, recording, config, stated)
 
 

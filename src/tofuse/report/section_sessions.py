@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from tofuse.report import words
 from tofuse.report.subject import ROWS, Subject, Values
-from tofuse.results.output import CHANGED
-from tofuse.results.sessions import probability
+from tofuse.results.output import CHANGE_COLORS
+from tofuse.results.sessions import probability_text
 from tofuse.results.types import SessionChange, SessionPair
 
 
@@ -58,7 +58,7 @@ def _change(found: SessionChange, names: list[str]) -> Values:
     change = found.change
     return {
         "kind": change.kind,
-        "color": "#{:02x}{:02x}{:02x}".format(*CHANGED[change.kind]),
+        "color": "#{:02x}{:02x}{:02x}".format(*CHANGE_COLORS[change.kind]),
         "sessions": f"{names[found.a]}, then {names[found.b]}",
         "centre": ", ".join(f"{x:.2f}" for x in change.centre).replace("-", "−"),
         "size": " × ".join(words.length(float(x)) for x in change.size),
@@ -76,6 +76,6 @@ def _pair(pair: SessionPair, names: list[str]) -> Values:
         "joined": joined,
         "overlap": words.share(pair.overlap) if pair.joined else "–",
         "links": f"{pair.links:,}" if pair.joined else "–",
-        "probability": "–" if pair.probability is None else probability(pair.probability),
+        "probability": "–" if pair.probability is None else probability_text(pair.probability),
         "support": "–" if pair.support is None else words.share(pair.support),
     }

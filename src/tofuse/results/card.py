@@ -1,4 +1,4 @@
-"""The accuracy card: how accurate the result is, in one line."""
+"""The accuracy card: the accuracy of a result in one line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEPARATOR = " · "
 
 
 def card(result: Reconstruction) -> list[str]:
-    """Return the parts of the line: accuracy, what it rests on, the weakest frame, what to do."""
+    """Return the parts of the line: accuracy, coverage, the weakest frame, how to improve it."""
     d = result.diagnostics
     parts = [bound(d.accuracy, result.cloud.diagonal_m)]
     readable = sum(f.status != "skipped" for f in d.frames)
@@ -30,7 +30,15 @@ def card(result: Reconstruction) -> list[str]:
 
 
 def bound(a: Accuracy, diagonal_m: float) -> str:
-    """Say how accurate the poses are: "±24 mm (95 %) over 6.2 m, 0.4 %"."""
+    """Return the accuracy of the poses as text: "±24 mm (95 %) over 6.2 m, 0.4 %".
+
+    Parameters
+    ----------
+    a
+        The accuracy.
+    diagonal_m
+        Diagonal of the model, m.
+    """
     if not a.assessed:
         return "accuracy not assessed"
     if not np.isfinite(a.position_m):
@@ -39,7 +47,7 @@ def bound(a: Accuracy, diagonal_m: float) -> str:
 
 
 def weakest_frame(a: Accuracy) -> str:
-    """Say which frames are known least, and how well; empty where nothing was assessed."""
+    """Return the frames with the largest pose error, and that; empty where not assessed."""
     if a.unbounded:
         where = runs_of(range(a.unbounded[0], a.unbounded[-1] + 1), a.unbounded)
         return f"{in_words(where)}, not bounded"
@@ -49,7 +57,7 @@ def weakest_frame(a: Accuracy) -> str:
 
 
 def length(metres: float) -> str:
-    """Say a length: "2.3 mm", "24 mm", "1.20 m"."""
+    """Return a length as text: "2.3 mm", "24 mm", "1.20 m"."""
     if metres >= 1:
         return f"{metres:.2f} m"
     return f"{metres * 1e3:.0f} mm" if metres >= 0.01 else f"{metres * 1e3:.1f} mm"

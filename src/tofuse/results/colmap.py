@@ -16,19 +16,30 @@ from tofuse.results.posed_images import (
     some_points,
 )
 
-# What COLMAP calls a lens, and its numbers after fx, fy, cx, cy.
+# COLMAP's name of a lens model, and its parameters after fx, fy, cx, cy.
 _MODELS: dict[type, tuple[str, tuple[str, ...]]] = {
     Pinhole: ("PINHOLE", ()),
     BrownConrady: ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "", "", "")),
     Rational: ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     Fisheye: ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
-# COLMAP's word for an error that was not computed.
+# COLMAP's value for an error that was not computed.
 _NO_ERROR = -1
 
 
 def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) -> None:
-    """Write the main model of a result into a new folder; with `pinhole` images are rectified.
+    """Write the main model of a result as a COLMAP model.
+
+    Parameters
+    ----------
+    result
+        The result.
+    folder
+        A new folder.
+    every
+        Every n-th of the frames with a pose.
+    pinhole
+        Whether to rectify all images.
 
     Raises
     ------
@@ -36,22 +47,22 @@ def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) 
         See `posed_images`; or if no image can be read.
     """
     images = ImageFolder(folder)
-    suited = {Pinhole} if pinhole else set(_MODELS)
+    supported = {Pinhole} if pinhole else set(_MODELS)
     cameras: dict[str, int] = {}
     lines: list[str] = []
     for number, posed in enumerate(
-        posed_images(result, every, lambda camera: type(camera) in suited), 1
+        posed_images(result, every, lambda camera: type(camera) in supported), 1
     ):
         images.write(posed)
         camera = cameras.setdefault(lens(posed.camera), len(cameras) + 1)
         T = se3.inverse(posed.T_world_camera)
         x, y, z, w = quaternion.from_matrix(T[:3, :3])
         row = " ".join(exact(value) for value in (w, x, y, z, *T[:3, 3]))
-        # The second line of an image, of its points, is empty.
+        # The second line of an image, its 2D points, is empty.
         lines += [f"{number} {row} {camera} {posed.name}", ""]
     images.finish()
     if not lines:
-        raise InputError("holds no frame with a pose that can be read", where=result)
+        raise InputError("has no readable frame with a pose", where=result)
     sparse = make_folder(folder / "sparse" / "0")
     table = [f"{number} {camera}" for camera, number in cameras.items()]
     _write(sparse / "cameras.txt", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", table)
@@ -68,10 +79,10 @@ def write_colmap(result: Path, folder: Path, every: int, pinhole: bool = False) 
 
 
 def lens(camera: Pinhole) -> str:
-    """Return what `cameras.txt` says of a camera; there pixels have their corner at (0, 0)."""
+    """Return a camera as in `cameras.txt`, where (0, 0) is the corner of the first pixel."""
     model, names = _MODELS[type(camera)]
     if isinstance(camera, BrownConrady) and not isinstance(camera, Rational) and not camera.k3:
-        model, names = "OPENCV", names[:4]  # which more programs know
+        model, names = "OPENCV", names[:4]  # supported by more programs
     numbers = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
     numbers += [getattr(camera, name) if name else 0.0 for name in names]
     return f"{model} {camera.width} {camera.height} " + " ".join(exact(n) for n in numbers)

@@ -25,24 +25,32 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import baked
 from tofuse.fusion.upright import upright
 from tofuse.results.colmap import write_colmap
-from tofuse.results.folder import RESULT, TILES, TILESET, claimed, home, is_result, settle
+from tofuse.results.folder import (
+    RESULT,
+    TILES,
+    TILESET,
+    claimed,
+    finish_interrupted,
+    is_result,
+    lock_folder,
+)
 from tofuse.results.nerfstudio import write_nerfstudio
 from tofuse.results.output import read_run_json
 from tofuse.results.tiles import is_tiles, write_tiles
 
-# Triangles unless more are asked for, and what they take with their texture as .glb at most.
+# Default number of triangles, and the maximum size of a .glb with their texture.
 FACES = 60_000
-_MOST_BYTES = 8_000_000
+_MAX_BYTES = 8_000_000
 _VERTEX_BYTES, _FACE_BYTES, _OTHER_BYTES = 32, 12, 4096
 _QUALITIES = (92, 85, 75, 60, 40)
-# To lay out a texture for more would take minutes.
-_MOST_PAINTED = 120_000
+# The layout of a texture for more faces would take minutes.
+_MAX_TEXTURED_FACES = 120_000
 _TEXTURE_SIZE = 2048
 
 
 @dataclass(frozen=True)
 class _Result:
-    """The files of a result, read when they are asked for."""
+    """The files of a result, read on demand."""
 
     folder: Path
     faces: int | None
@@ -51,7 +59,7 @@ class _Result:
 
     @cached_property
     def cloud(self) -> GeometryRecord:
-        """The cloud, with columns that say how far each point is to be trusted."""
+        """The cloud, with the number of views and sigma of each point."""
         ply = read_ply(self.folder / "cloud.ply")
         scalars = {name: ply.scalars[name] for name in _SCALARS if name in ply.scalars}
         return replace(ply, faces=None, scalars=scalars)
@@ -65,7 +73,7 @@ class _Result:
         path = self.folder / "mesh.ply"
         if not path.is_file():
             raise InputError(
-                "is not there: clouds without a camera make no surface",
+                "doesn't exist: clouds without a camera model give no surface",
                 where=path,
                 remedy="choose a format for clouds",
             )
@@ -87,20 +95,20 @@ class _Result:
     def R_up_world(self) -> Float64:
         """The rotation (3, 3) that makes the mesh upright."""
         T = read_run_json(self.folder / "run.json").get("T_up_world")
-        if T is None:  # of an earlier version
+        if T is None:  # written by version 0.1
             return upright(self.mesh, self.trajectory[1])
         R: Float64 = np.array(T, float)[:3, :3]
         return R
 
     @cached_property
-    def painted(self) -> GeometryRecord:
-        """The mesh as it is looked at: simplified, its colours in a texture where that is quick."""
-        most = self.faces or FACES
+    def textured(self) -> GeometryRecord:
+        """The simplified mesh, with its colours in a texture unless that takes too long."""
+        limit = self.faces or FACES
         if self.mesh.color is None or not len(self.mesh.faces):
-            return self.mesh.decimated(most).record()
-        if min(most, len(self.mesh.faces)) > _MOST_PAINTED:
-            return self.mesh.decimated(most).record()
-        found = baked(self.mesh, most, _TEXTURE_SIZE)
+            return self.mesh.decimated(limit).record()
+        if min(limit, len(self.mesh.faces)) > _MAX_TEXTURED_FACES:
+            return self.mesh.decimated(limit).record()
+        found = baked(self.mesh, limit, _TEXTURE_SIZE)
         rows = found.atlas.vertices
         return GeometryRecord(
             found.mesh.vertices[rows],
@@ -112,7 +120,7 @@ class _Result:
 
     @cached_property
     def frame_numbers(self) -> Intp:
-        """Number of the frame that each pose is of."""
+        """(N,) frame index of each pose."""
         frames = read_run_json(self.folder / "run.json")["frames"]
         index = np.array([frame["index"] for frame in frames], np.intp)
         times = np.array([frame["timestamp"] for frame in frames], float)
@@ -123,8 +131,8 @@ _SCALARS = ("views", "sigma")
 
 
 def _jpeg(image: UInt8, vertices: int, faces: int) -> bytes:
-    """The best picture that is small enough beside so many vertices and triangles."""
-    room = _MOST_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
+    """The best JPEG that keeps a mesh of this size below `_MAX_BYTES`, or the smallest one."""
+    room = _MAX_BYTES - _VERTEX_BYTES * vertices - _FACE_BYTES * faces - _OTHER_BYTES
     picture = b""
     for quality in _QUALITIES:
         picture = jpeg_bytes(image, quality)
@@ -138,7 +146,7 @@ def _cloud(result: _Result, path: Path) -> None:
 
 
 def _mesh(result: _Result, path: Path) -> None:
-    exchange.save(result.painted, path, result.R_up_world)
+    exchange.save(result.textured, path, result.R_up_world)
 
 
 def _stl(result: _Result, path: Path) -> None:
@@ -156,16 +164,16 @@ def _colmap(result: _Result, path: Path) -> None:
         write_colmap(result.folder, folder, result.every, result.pinhole)
 
 
-# Folders that hold images with poses, and what is in them.
-_KINDS = frozenset({"images", "depth", "sigma", "masks"})
+# Exports that are folders of images with poses, and their content.
+_IMAGE_FOLDERS = frozenset({"images", "depth", "sigma", "masks"})
 FOLDERS = {
-    "nerfstudio": _KINDS | {"transforms.json", "points.ply"},
-    "colmap": _KINDS | {"sparse"},
+    "nerfstudio": _IMAGE_FOLDERS | {"transforms.json", "points.ply"},
+    "colmap": _IMAGE_FOLDERS | {"sparse"},
 }
 
 
 def foreign(folder: Path) -> tuple[str, ...]:
-    """Return what is in the folder of an export that does not belong there, its own name if all."""
+    """Return names in an export folder that no export wrote; its own name if it is no folder."""
     if folder.is_symlink() or not folder.is_dir():
         return (folder.name,)
     return tuple(sorted({p.name for p in folder.iterdir()} - FOLDERS[folder.name]))
@@ -173,12 +181,12 @@ def foreign(folder: Path) -> tuple[str, ...]:
 
 @contextmanager
 def _folder(path: Path) -> Iterator[Path]:
-    """Give a new folder that takes the place of an earlier one, of which everything is ours."""
+    """Yield a new folder that then replaces an earlier export in its place."""
     if os.path.lexists(path) and (others := foreign(path)):
         raise OutputError(
-            f"is in the way: it holds {others[0]}, which no export wrote",
+            f"contains {others[0]}, which is not part of an export",
             where=path,
-            remedy="move it away, or give another --out",
+            remedy="move it away, or pass another --out",
         )
     made = path.with_name(f".{path.name}-{os.getpid()}")
     with new_folder(made) as folder:
@@ -192,18 +200,18 @@ def _folder(path: Path) -> Iterator[Path]:
 
 def _tiles(result: _Result, path: Path) -> None:
     if len(result.mesh.faces) == 0:
-        raise InputError("holds no triangles to be tiled", where=result.folder / "mesh.ply")
+        raise InputError("has no triangles", where=result.folder / "mesh.ply")
     folder = path.parent
     if os.path.lexists(folder):
         if not is_tiles(folder):
             raise OutputError(
-                "holds something other than tiles",
+                "contains files that are not tiles",
                 where=folder,
-                remedy="move it away, or give another --out",
+                remedy="move it away, or pass another --out",
             )
         shutil.rmtree(folder, ignore_errors=True)
-    with new_folder(folder) as beside:
-        write_tiles(result.mesh, result.R_up_world, beside)
+    with new_folder(folder) as new:
+        write_tiles(result.mesh, result.R_up_world, new)
 
 
 def _kitti(result: _Result, path: Path) -> None:
@@ -214,7 +222,7 @@ def _log(result: _Result, path: Path) -> None:
     write_log(path, result.trajectory[1], result.frame_numbers)
 
 
-# The file that each format makes, and how.
+# The file of each format, and the function that writes it.
 FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "pcd": ("cloud.pcd", _cloud),
     "las": ("cloud.las", _cloud),
@@ -243,9 +251,9 @@ def export(
     pinhole: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write a result in other formats; returns the files.
+    """Write a result in other formats, and return the paths of the files.
 
-    Where the files go, no other process may write meanwhile.
+    The target folder is locked against other processes.
 
     Parameters
     ----------
@@ -254,31 +262,34 @@ def export(
     formats
         Names in `FORMATS`.
     out
-        Where to; beside the result unless given.
+        Folder for the files; by default that of the result.
     faces
-        Triangles of a surface at most; `FACES` unless given, and all for STL.
+        Maximum number of triangles; by default `FACES`, for STL all.
     every
-        Of the images that have a pose, each so-many-th.
+        Every n-th of the images with a pose.
     pinhole
-        Whether images are rectified, as some programs know no distortion.
+        Whether to rectify images, for programs without distortion models.
     overwrite
-        Whether files may be replaced.
+        Whether existing files may be replaced.
 
     Raises
     ------
     InputError
-        If the folder holds no result, a format is unknown, or lacks what it needs; or the result
-        was replaced while it was read.
+        If the folder contains no result, a format is unknown or lacks its input, or the result was
+        replaced while it was read.
     OutputError
-        If a file is there already, or can't be written, or another process writes into the folder.
+        If a file exists already, or can't be written, or another process writes into the folder.
     """
     folder = Path(folder)
-    settle(home(folder))
+    finish_interrupted(lock_folder(folder))
     if not is_result(folder):
-        raise InputError("holds no result", where=folder, remedy="give the --out of `tofuse run`")
+        raise InputError("is not a result", where=folder, remedy="pass the --out of `tofuse run`")
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
-        raise InputError(f"is {unknown[0]!r}", where="FORMAT", remedy=f"use one of {list(FORMATS)}")
+        known = ", ".join(FORMATS)
+        raise InputError(
+            f"unknown format {unknown[0]}", where="FORMAT", remedy=f"use one of {known}"
+        )
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     make_folder(target)
@@ -286,7 +297,7 @@ def export(
         for path in files.values():
             if path.exists() and not overwrite:
                 raise OutputError(
-                    "is there already", where=path, remedy="give --overwrite to replace it"
+                    "already exists", where=path, remedy="pass --overwrite to replace it"
                 )
         result = _Result(folder, faces, every, pinhole)
         for name, path in files.items():
@@ -296,9 +307,9 @@ def export(
 
 @contextmanager
 def _unchanged(folder: Path) -> Iterator[None]:
-    """Refuse what was read of a result in the block if a run replaced it meanwhile.
+    """Raise an error if a run replaced the result while the block read it.
 
-    Whoever writes elsewhere holds no lock of the result, which may be read-only.
+    The result itself is not locked: it may be read-only.
     """
     before = stamp(folder / RESULT.marker)
     yield

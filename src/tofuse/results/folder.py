@@ -1,8 +1,8 @@
-"""The output folder of a run: claimed first, staged inside, moved into place at the end.
+"""The output folder of a run: locked first, staged inside, moved into place at the end.
 
-Nothing in a folder is touched before it is known to be ours. One process at a time may write into
-it. A program that was stopped while it moved a result into place leaves a plan by which the next,
-one that reads or one that writes, finishes the moves (`files.moving`).
+Nothing in a folder is touched before it is known to contain an earlier result. One process at a
+time may write into it. A process that is stopped while it moves a result into place leaves a plan
+by which the next one, reading or writing, finishes the moves (`files.moving`).
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from tofuse.files.reading import read_text
 
 STAGING = f"{UNFINISHED}unfinished"
 LOCK = f"{UNFINISHED}lock"
-CHECKPOINT = f"{UNFINISHED}checkpoint"  # what a run has so far
-RECORDING = "recording"  # what `tofuse demo` puts beside its result
+CHECKPOINT = f"{UNFINISHED}checkpoint"  # state of an interrupted run
+RECORDING = "recording"  # written by `tofuse demo` next to its result
 
-# What `tofuse run` and `tofuse export` may write; of an earlier result nothing of it stays.
+# Files of a result, by `tofuse run` and `tofuse export`; all of them are removed with it.
 FILES = (
     "trajectory.txt",
     "pose_graph.g2o",
@@ -69,54 +69,60 @@ FILES = (
 TILES, TILESET = "tiles", "tileset.json"
 _TILES = Names(frozenset({TILESET}), more=re.compile(r"\d{1,4}(-\d{1,9}){3}\.glb", re.ASCII))
 _WITH_TILES = (re.compile(re.escape(TILES)), _TILES)
-# Components that have a model of their own have it in a folder, with the same files.
+# A component with its own model has it in a folder, with the same files.
 _COMPONENT = re.compile(r"component-[1-9]\d{0,5}", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Contract:
-    """What one kind of result is made of.
+    """The files of one kind of result.
 
     Attributes
     ----------
+    names
+        Names of the files and folders that it may contain.
     marker
-        The file that is moved into place last: where it is, everything else is.
-    ours
-        Whether a folder holds, or by this file held, a result of this kind.
+        The file that is moved into place last: if it exists, the result is complete.
+    is_ours
+        Whether a folder contains a result of this kind, by its marker.
     """
 
     names: Names
     marker: str
-    ours: Callable[[Path], bool]
+    is_ours: Callable[[Path], bool]
 
 
 class OutputFolder:
-    """A folder that a run may write into, and that nobody else may meanwhile.
+    """A folder that a run may write into, locked against other processes.
 
-    Making one checks everything that can be checked before hours of work: that the folder is
-    ours or empty, that nobody else writes into it, and that it can be written.
+    The constructor checks everything that can be checked before hours of work: that the folder is
+    empty or has an earlier result, that no other process writes into it, and that it is writable.
 
-    What a run puts into place are files, and folders (`tiles`, `component-1` and so on), which are
-    moved as a whole. Links are moved as what they are, and never followed.
+    Files and folders (`tiles`, `component-1` and so on) are moved into place as a whole. Links are
+    moved as links, and never followed.
 
-    The folder is given back when the result is written; used in a `with`, at the end of its block.
+    The lock is released when the result is written; in a `with` statement, at its end.
     """
 
     def __init__(
         self, path: str | Path, *, overwrite: bool = False, contract: Contract | None = None
     ) -> None:
-        """Check, create and claim the folder.
+        """Check, create and lock the folder.
 
         Parameters
         ----------
+        path
+            The folder.
+        overwrite
+            Whether an earlier result may be replaced.
         contract
-            What will be written; the files of a run unless given.
+            What will be written; by default the files of a run.
 
         Raises
         ------
         OutputError
-            If it holds something other than an earlier result, or a result and `overwrite` is
-            not given, or another process writes into it, or it can't be written.
+            If it contains anything but an earlier result, or a result and `overwrite` is not set,
+            or another process writes into it, or it can't be written.
         """
         self.path = Path(path)
         self._contract = contract or RESULT
@@ -126,7 +132,7 @@ class OutputFolder:
         self._claim: Claim | None = None
         self._entered = False
         try:
-            self._check(overwrite)  # before anything is touched, and then what nobody else changes
+            self._check(overwrite)  # before anything is touched, and again under the lock
             self._made = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
             self._claim = Claim(self.path / LOCK, what=self.path)
@@ -154,27 +160,29 @@ class OutputFolder:
 
     def _check(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
-            raise OutputError("is a file", where=self.path, remedy="give --out a folder")
+            raise OutputError("is a file", where=self.path, remedy="pass a folder as --out")
         contract = self._contract
         if is_stopped(self._staging):
             check_stopped(self._staging, self._names, contract.marker)
-            if any(contract.ours(place) for place in places(self._staging, self.path)):
+            if any(contract.is_ours(place) for place in places(self._staging, self.path)):
                 return
         entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
         entries -= {name for name in entries if name.startswith(UNFINISHED)}
         if not entries:
             return
-        if not contract.ours(self.path) and entries - {RECORDING}:
+        if not contract.is_ours(self.path) and entries - {RECORDING}:
             raise OutputError(
-                "is not empty and holds no earlier result of this command",
+                "is not empty and contains no earlier result of this command",
                 where=self.path,
-                remedy="give --out a new or empty folder",
+                remedy="pass a new or empty folder as --out",
             )
         if not overwrite:
             raise OutputError(
-                "holds an earlier result" if contract.marker in entries else "holds a recording",
+                "contains an earlier result"
+                if contract.marker in entries
+                else "contains a recording",
                 where=self.path,
-                remedy="give --overwrite to replace it, or another --out",
+                remedy="pass --overwrite to replace it, or another --out",
             )
         for name in sorted(entries):
             if self._names.folder(name) and not self._names.is_whole(self.path / name):
@@ -182,15 +190,15 @@ class OutputFolder:
 
     @contextmanager
     def staging(self) -> Iterator[Path]:
-        """Give a folder to write into; on success all of it is moved into place, else nothing.
+        """Yield a folder to write into; on success all of it is moved into place, else nothing.
 
-        What has the names of such a result is gone afterwards, written anew or not.
+        Files of an earlier result that were not written again are removed.
         """
         try:
             yield self._staging
             move_all(self._staging, self.path, self._names, self._contract.marker)
         except OutputError as error:
-            # Named as it would have been called in the end.
+            # The path in its final place, not in the staging folder.
             where = self._final(error.where or "")
             raise OutputError(error.problem, where=where, remedy=error.remedy) from error
         except OSError as error:
@@ -212,7 +220,7 @@ class OutputFolder:
             clear(self._staging, self._names)
 
     def discard(self) -> None:
-        """Remove what is unfinished, and the folders made for it if nothing else is in them."""
+        """Remove unfinished files, and folders that were created for them if they are empty."""
         try:
             self._clear()
         finally:
@@ -225,20 +233,20 @@ class OutputFolder:
 
 
 def check_free(path: str | Path) -> None:
-    """Refuse a folder that another process writes into, at once; later, `OutputFolder` will too.
+    """Refuse a folder that another process writes into, before `OutputFolder` would.
 
     Raises
     ------
     OutputError
-        If there is one; its number, machine and start are told.
+        If there is one; the message names its process id, host and start time.
     """
     lock = Path(path) / LOCK
     if os.path.lexists(lock):
         Claim(lock, what=path).release()
 
 
-def home(folder: Path) -> Path:
-    """Return the folder whose lock a folder is under: that of its result, for a component's."""
+def lock_folder(folder: Path) -> Path:
+    """Return the folder whose lock protects a folder: for a component's folder, its result's."""
     parent = folder.resolve().parent
     if component_number(folder.resolve()) is not None and is_result(parent):
         return parent
@@ -247,14 +255,14 @@ def home(folder: Path) -> Path:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder in the block: no run replaces what is in it.
+    """Hold the lock of a folder in the block, so that no run replaces its content.
 
     Raises
     ------
     OutputError
         If another process writes into it, or it can't be written.
     """
-    place = home(folder)
+    place = lock_folder(folder)
     claim = Claim(place / LOCK, what=place)
     try:
         yield
@@ -263,12 +271,12 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def _recover(folder: Path, contract: Contract) -> None:
-    """Finish the moves of a program that was stopped at them."""
+    """Finish the moves of an interrupted process."""
     staging = folder / STAGING
     if not is_stopped(staging):
         return
     check_stopped(staging, contract.names, contract.marker)
-    if not any(contract.ours(place) for place in places(staging, folder)):
+    if not any(contract.is_ours(place) for place in places(staging, folder)):
         raise check_error(folder)
     recover(staging, folder, contract.names, contract.marker)
 
@@ -277,17 +285,17 @@ def _output_error(path: Path, error: OSError) -> OutputError:
     return OutputError(
         f"can't be written ({error.strerror or error})",
         where=path,
-        remedy="check the permissions and the free space, or give another --out",
+        remedy="check the permissions and the free space, or pass another --out",
     )
 
 
-def settle(folder: Path, contract: Contract | None = None) -> None:
-    """Finish what a program that was stopped left, so that a result can be read.
+def finish_interrupted(folder: Path, contract: Contract | None = None) -> None:
+    """Finish moves that were interrupted, so that a result can be read.
 
     Raises
     ------
     InputError
-        If a result is just being moved into place, or that was stopped and can't be finished.
+        If another process is moving a result into place, or interrupted moves can't be finished.
     """
     staging = folder / STAGING
     if not is_stopped(staging):
@@ -302,27 +310,27 @@ def settle(folder: Path, contract: Contract | None = None) -> None:
             claim.release()
     except OutputError as error:
         raise InputError(
-            f"a result was being moved into place, which isn't finished: {error.problem}",
+            f"a result is being moved into place: {error.problem}",
             where=error.where,
             remedy=error.remedy,
         ) from error
     except OSError as error:
         raise InputError(
-            f"a program was stopped while it moved a result into place, and that can't be finished "
+            f"moving a result into place was interrupted, and can't be finished "
             f"({error.strerror or error})",
             where=folder,
-            remedy="copy the folder, with its hidden ones, to where you may write, and try again",
+            remedy="copy the folder, with hidden files, to a writable place, and try again",
         ) from error
 
 
 def is_result(folder: Path) -> bool:
-    """Say whether a folder holds the result of an earlier run."""
-    data = json_of(folder / RESULT.marker)
+    """Whether a folder contains the result of a run."""
+    data = read_json_object(folder / RESULT.marker)
     return data is not None and {"schema", "version", "verdict"} <= set(data)
 
 
-def json_of(path: Path) -> dict[str, object] | None:
-    """Return the table in a JSON file; None where there is none."""
+def read_json_object(path: Path) -> dict[str, object] | None:
+    """Return the object in a JSON file; None if it can't be read or is something else."""
     try:
         data = json.loads(read_text(path))
     except (InputError, ValueError, RecursionError):
@@ -331,7 +339,7 @@ def json_of(path: Path) -> dict[str, object] | None:
 
 
 def component_name(number: int) -> str:
-    """Return the name of the folder of a component that has a model of its own."""
+    """Return the name of the folder of a component with its own model."""
     return f"component-{number}"
 
 

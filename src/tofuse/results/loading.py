@@ -1,4 +1,4 @@
-"""A result as its output folder has it."""
+"""Reading a result from its output folder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tofuse.posegraph.accuracy import Accuracy, WorstFrame
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
 from tofuse.posegraph.outside import OutsideRecord
-from tofuse.results.folder import component_name, is_result, settle
+from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.types import (
     Component,
@@ -32,26 +32,26 @@ from tofuse.results.types import (
 def load_result(folder: str | Path) -> Reconstruction:
     """Read the output folder of a run.
 
-    What the folder does not hold is empty: poses before loops were closed (NaN), values of the
-    optimiser's objective, the refinement, sample images, and the model before optimisation.
+    Not stored, and so empty: poses before loop closure (NaN), the values of the optimiser's
+    objective, the refinement, sample images, and the model before optimisation.
 
     Raises
     ------
     InputError
-        If it is no such folder, or what it holds is damaged or of different runs.
+        If it is not an output folder, or its files are damaged or of different runs.
     """
     folder = Path(folder)
-    settle(folder)
+    finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(
-            "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"
+            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
         )
     run = read_run_json(folder / "run.json")
     try:
         return _reconstruction(folder, run)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise InputError(
-            f"can't be understood ({type(error).__name__}: {error})",
+            f"is not a valid run.json ({type(error).__name__}: {error})",
             where=folder / "run.json",
             remedy="copy the whole folder, or run again",
         ) from error

@@ -30,18 +30,29 @@ _FILES = {"file_path": IMAGES, "depth_file_path": DEPTH, "sigma_file_path": SIGM
 
 
 def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = False) -> None:
-    """Write the main model of a result into a new folder; with `pinhole` images are rectified.
+    """Write the main model of a result as a nerfstudio data set.
+
+    Parameters
+    ----------
+    result
+        The result.
+    folder
+        A new folder.
+    every
+        Every n-th of the frames with a pose.
+    pinhole
+        Whether to rectify all images.
 
     Raises
     ------
     InputError
-        See `posed_images`; or if no image can be read, or only some are of a fisheye lens.
+        See `posed_images`; or if no image can be read, or only some have a fisheye lens.
     """
     images = ImageFolder(folder)
-    suited = {Pinhole} if pinhole else set(_MODELS)
+    supported = {Pinhole} if pinhole else set(_MODELS)
     frames: list[dict[str, Any]] = []
     lenses: list[dict[str, Any]] = []
-    for posed in posed_images(result, every, lambda camera: type(camera) in suited):
+    for posed in posed_images(result, every, lambda camera: type(camera) in supported):
         images.write(posed)
         lenses.append(lens(posed.camera))
         frames.append(
@@ -55,13 +66,13 @@ def write_nerfstudio(result: Path, folder: Path, every: int, pinhole: bool = Fal
             frames[-1]["pose_covariance"] = posed.covariance.ravel().tolist()
     images.finish()
     if not frames:
-        raise InputError("holds no frame with a pose that can be read", where=result)
+        raise InputError("has no readable frame with a pose", where=result)
     about: dict[str, Any] = {"camera_model": lenses[0]["camera_model"]}
     if any(each["camera_model"] != about["camera_model"] for each in lenses):
         raise InputError(
-            "has fisheye lenses and others, which this format can't hold together",
+            "mixes fisheye and other lenses, which this format does not support",
             where=result,
-            remedy="export the results of the single recordings",
+            remedy="export the results of the recordings one by one",
         )
     if all(each == lenses[0] for each in lenses):
         about = lenses[0]
@@ -93,7 +104,7 @@ _MODELS: dict[type[Camera], str] = {
 
 
 def lens(camera: Pinhole) -> dict[str, Any]:
-    """Return what `transforms.json` says of a camera; there pixels have their corner at (0, 0)."""
+    """Return a camera as in `transforms.json`, where (0, 0) is the corner of the first pixel."""
     order = DISTORTION_ORDER[camera.model]
     return {
         "camera_model": _MODELS[type(camera)],

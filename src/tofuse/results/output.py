@@ -1,4 +1,4 @@
-"""What a run writes into its output folder, and how it is read again."""
+"""The files of an output folder: written, and `run.json` and the poses read again."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from tofuse.results import tiles
 from tofuse.results.folder import TILES, TILESET, OutputFolder, component_name, is_result
 from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
 
-# Colours of surfaces that changed between sessions; people who are colour-blind tell them apart.
-CHANGED = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
+# Colours of surfaces that changed between sessions, distinguishable by colour-blind people.
+CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
 
 def write_result(
@@ -43,16 +43,26 @@ def write_result(
     report: Callable[[Reconstruction, Path], None] | None = None,
     texture: Textured | None = None,
 ) -> None:
-    """Write every file of the contract; `report` writes what is for people into the folder it gets.
+    """Write all files of a result.
 
-    Components that are not connected to the main one, and have a model of their own, are written
-    into `component-1` and so on, by their numbers. With a `texture`, the `mesh.glb` of the main
-    model has it, and so has `mesh.obj`, which is written then.
+    Components that are not connected to the main one but have their own model are written to
+    `component-1` and so on, by their numbers.
+
+    Parameters
+    ----------
+    result
+        The result.
+    folder
+        Where to; existing files are replaced together, once all new ones are complete.
+    report
+        Writes the report of a result into a folder; None: no report.
+    texture
+        Texture of the main model for `mesh.glb`; `mesh.obj` is written with it as well.
 
     Raises
     ------
     OutputError
-        If a file can't be written; then nothing that was there before has changed.
+        If a file can't be written; existing files are unchanged then.
     """
     with folder.staging() as staging:
         for number, component in enumerate(result.components):
@@ -69,9 +79,9 @@ def _write_files(
     report: Callable[[Reconstruction, Path], None] | None,
     texture: Textured | None,
 ) -> None:
-    # Much of either is copying and drawing in which the other can go on.
-    with side_threads(1, "tofuse-writer") as beside:
-        model = beside.submit(_write_model, result, folder, texture)
+    # Both release the interpreter lock for much of their time.
+    with side_threads(1, "tofuse-writer") as background:
+        model = background.submit(_write_model, result, folder, texture)
         posed = result.has_pose
         write_tum(folder / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])
         write_g2o(folder / "pose_graph.g2o", result.graph)
@@ -83,8 +93,8 @@ def _write_files(
 
 def _write_model(
     result: Reconstruction, folder: Path, texture: Textured | None
-) -> tiles.Tiled | None:
-    """Write clouds and surfaces; what there is in tiles, or None if all is in single files."""
+) -> tiles.TilingSummary | None:
+    """Write clouds and surfaces; returns a summary of the tiles, or None without tiles."""
     cloud = result.cloud
     write_ply(
         folder / "cloud.ply",
@@ -107,10 +117,10 @@ def _write_model(
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:
-    """Write the surfaces that changed between sessions, in the colours of `CHANGED`."""
+    """Write the surfaces that changed between sessions, in the colours of `CHANGE_COLORS`."""
     found = [c.change for c in result.changes]
     counts = [len(change.points) for change in found]
-    colors = np.array([CHANGED[change.kind] for change in found], np.uint8)
+    colors = np.array([CHANGE_COLORS[change.kind] for change in found], np.uint8)
     write_ply(
         path,
         GeometryRecord(
@@ -123,11 +133,11 @@ def _write_changes(result: Reconstruction, path: Path) -> None:
 
 def _write_mesh(
     mesh: Mesh, result: Reconstruction, folder: Path, texture: Textured | None
-) -> tiles.Tiled | None:
-    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node turns it upright.
+) -> tiles.TilingSummary | None:
+    """Write `mesh.ply`, in the world frame, and `mesh.glb`, whose node makes it upright.
 
-    Of large surfaces `mesh.glb` is an overview, small enough to be sent and shown anywhere; of very
-    large ones there are tiles as well.
+    For a surface that is too large for one file, `mesh.glb` is a simplified overview, and the full
+    detail is written as tiles.
     """
     write_ply(
         folder / "mesh.ply",
@@ -142,7 +152,7 @@ def _write_mesh(
     upright: dict[str, Any] = {"T_scene_node": result.T_up_world}
     generator = f"tofuse {__version__}"
     tiled = None
-    if len(mesh.faces) > tiles.MOST_FACES:
+    if len(mesh.faces) > tiles.MAX_UNTILED_FACES:
         tiled = tiles.write_tiles(mesh, result.T_up_world[:3, :3], folder / TILES)
     if texture is None:
         shown = tiles.overview(mesh) if tiled is None else tiled.overview
@@ -176,8 +186,16 @@ def _write_mesh(
     return tiled
 
 
-def run_json(result: Reconstruction, tiled: tiles.Tiled | None = None) -> dict[str, Any]:
-    """Return the content of `run.json`, schema 1: SI units and radians, no NaN (null instead)."""
+def run_json(result: Reconstruction, tiled: tiles.TilingSummary | None = None) -> dict[str, Any]:
+    """Return the content of `run.json`, schema 1: SI units and radians, null instead of NaN.
+
+    Parameters
+    ----------
+    result
+        The result.
+    tiled
+        Summary of its tiles, if it has any.
+    """
     d = result.diagnostics
     return plain(
         {
@@ -282,8 +300,8 @@ def run_json(result: Reconstruction, tiled: tiles.Tiled | None = None) -> dict[s
     )
 
 
-def _tiles(tiled: tiles.Tiled | None) -> dict[str, Any] | None:
-    """What there is in tiles; `mesh.glb` is an overview then."""
+def _tiles(tiled: tiles.TilingSummary | None) -> dict[str, Any] | None:
+    """The summary of the tiles; None without tiles."""
     if tiled is None:
         return None
     return {
@@ -296,12 +314,12 @@ def _tiles(tiled: tiles.Tiled | None) -> dict[str, Any] | None:
 
 
 def _session_of(index: int, result: Reconstruction) -> int | None:
-    """Number of the session that a frame is of; None where there is only one."""
+    """Number of the session that a frame belongs to; None where there is only one recording."""
     return next((k for k, session in enumerate(result.sessions) if session.has(index)), None)
 
 
-def clock_of(folder: Path) -> tuple[Float64, Intp] | None:
-    """(N,) times in s and (N,) numbers of the frames of a result; None where `folder` is none."""
+def frame_clock(folder: Path) -> tuple[Float64, Intp] | None:
+    """Return (N,) timestamps in s and (N,) indices of a result's frames; None for other folders."""
     if not is_result(folder):
         return None
     frames = read_run_json(folder / "run.json").get("frames", [])
@@ -313,7 +331,7 @@ def clock_of(folder: Path) -> tuple[Float64, Intp] | None:
 
 
 def accuracy_json(a: Accuracy) -> dict[str, Any]:
-    """Return the accuracy as in `run.json`, but for numbers that are inf."""
+    """Return the accuracy as in `run.json`, except that infinite bounds are not yet null."""
     worst = None
     if a.worst is not None:
         w = a.worst
@@ -350,7 +368,7 @@ def _component(c: Component) -> dict[str, Any]:
 
 
 def _refinement(r: Refinement | None) -> dict[str, Any] | None:
-    """What became of the refinement; None where no views took part."""
+    """Outcome of the global refinement; None where no view took part."""
     if r is None or not r.views:
         return None
     return {
@@ -367,7 +385,7 @@ def _refinement(r: Refinement | None) -> dict[str, Any] | None:
 
 
 def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
-    """How the camera was corrected; None where it was not."""
+    """The self-calibration; None where there was none."""
     if found is None:
         return None
     return {
@@ -380,7 +398,7 @@ def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
 
 
 def _suspicion(s: Suspicion | None) -> dict[str, Any] | None:
-    """What the views say of their camera; None where they were not asked."""
+    """The check of the camera's calibration; None where it was not made."""
     if s is None:
         return None
     gap = s.gap
@@ -404,7 +422,7 @@ def _suspicion(s: Suspicion | None) -> dict[str, Any] | None:
 
 
 def plain(value: Any) -> Any:
-    """Turn arrays and NumPy numbers into JSON values; NaN and infinity become null."""
+    """Convert arrays and NumPy numbers to JSON values; NaN and infinity become null."""
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -425,7 +443,7 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If it can't be read or is not one of ours.
+        If it can't be read, or is not a `run.json` of schema 1.
     """
     path = Path(path)
     data = parsed(json.loads, read_text(path), where=path, what="JSON")
@@ -435,18 +453,25 @@ def read_run_json(path: str | Path) -> dict[str, Any]:
 
 
 def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
-    """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a folder.
+    """Return the frame indices and poses (N, 4, 4) T_world_camera of the main model of a result.
+
+    Parameters
+    ----------
+    folder
+        The result.
+    run
+        Its `run.json`.
 
     Raises
     ------
     InputError
-        If its `run.json`, read before, and its `trajectory.txt` are of different runs.
+        If `run.json` and `trajectory.txt` are of different runs.
     """
     indices = [int(frame["index"]) for frame in frames_in_main_model(run)]
     _, poses = read_tum(folder / "trajectory.txt")
     if len(indices) != len(poses):
         raise InputError(
-            f"says that {len(indices)} frames have a pose, and trajectory.txt holds {len(poses)}",
+            f"lists {len(indices)} frames with a pose, but trajectory.txt has {len(poses)}",
             where=folder / "run.json",
             remedy="copy the whole folder, or run again",
         )
@@ -454,9 +479,9 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
 
 
 def frames_in_main_model(run: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return what a `run.json` says of the frames with a line in `trajectory.txt`, in order.
+    """Return the entries of `run.json` for the frames with a line in `trajectory.txt`, in order.
 
-    Those of version 0.1 know no components: there every pose is in the one model.
+    Results of version 0.1 have no components: every pose is in the main model.
     """
     connected = [c["T_main_component"] is not None for c in run.get("components", ())]
     return [

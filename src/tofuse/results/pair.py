@@ -1,4 +1,4 @@
-"""What registering one pair of views gives: poses in the files' coordinates, and the folder."""
+"""The result of registering one pair of views: poses in the files' coordinates, and the folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tofuse.recordings.cloud_files import MAP_COORDINATES_M
 from tofuse.recordings.frames import Frame
 from tofuse.recordings.single import SingleView
 from tofuse.registration.base import Registration
-from tofuse.results.folder import Contract, OutputFolder, json_of
+from tofuse.results.folder import Contract, OutputFolder, read_json_object
 from tofuse.results.output import plain
 
 MARKER = "registration.json"
@@ -32,14 +32,14 @@ FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)
 
 @dataclass(frozen=True, eq=False)
 class LocalView:
-    """A view moved near the origin, where single precision is enough.
+    """A view translated to the origin, where single precision is sufficient.
 
     Attributes
     ----------
     view
-        As it was read.
+        The view as it was read.
     frame
-        The same with `center` at its origin.
+        The same view, with `center` as its origin.
     center
         (3,) m, in the coordinates of the file; zero for images, and for clouds near the origin.
     """
@@ -60,11 +60,11 @@ class PairResult:
     found
         The registration of the local frames.
     start
-        (4, 4) where it started, of the local frames.
+        (4, 4) initial guess T_target_source of the local frames.
     guess
-        The file that the start was read from, or None.
+        The file of the initial guess, or None.
     seconds
-        How long registering took.
+        Time that registration took.
     """
 
     source: LocalView
@@ -75,49 +75,49 @@ class PairResult:
     seconds: float = 0.0
 
     def in_files(self, T: Float64) -> Float64:
-        """Turn a (4, 4) motion between the local frames into one between the files' coordinates."""
+        """Convert T_target_source (4, 4) of the local frames to the coordinates of the files."""
         out = np.array(T, float)
         out[:3, 3] += self.target.center - out[:3, :3] @ self.source.center
         return out
 
     @property
     def T_target_source(self) -> Float64:
-        """(4, 4), maps coordinates of the source's file into those of the target's."""
+        """(4, 4), maps coordinates of the source's file to those of the target's."""
         return self.in_files(self.found.T_target_source)
 
     @property
     def moved_m(self) -> Float64:
-        """(3,) how the source's `center` moves: the translation, where that is the origin."""
+        """(3,) displacement of the source's `center`, m: the translation if that is the origin."""
         center = self.source.center
-        moved: Float64 = se3.transform(self.T_target_source, center[None])[0] - center
-        return moved
+        displacement: Float64 = se3.transform(self.T_target_source, center[None])[0] - center
+        return displacement
 
     @property
     def runner_up(self) -> Float64 | None:
-        """(4, 4) of the best other pose, likewise; None where none was found or looked for."""
+        """(4, 4) T_target_source of the best rival pose; None where there is none."""
         other = self.found.runner_up
         return None if other is None else self.in_files(other)
 
     @property
     def runner_up_distance(self) -> tuple[float, float] | None:
-        """How far the runner-up moves the middle of the source (m), and turns it (rad)."""
+        """Distance of the runner-up at the source's median point (m), and its angle (rad)."""
         other = self.found.runner_up
         if other is None:
             return None
         T = self.found.T_target_source
-        middle = np.median(self.source.frame.points.astype(float), axis=0)[None]
-        step = se3.transform(other, middle) - se3.transform(T, middle)
+        median = np.median(self.source.frame.points.astype(float), axis=0)[None]
+        step = se3.transform(other, median) - se3.transform(T, median)
         return float(np.linalg.norm(step)), float(se3.angle(se3.inverse(T) @ other))
 
     @cached_property
     def lever_m(self) -> float:
-        """How far the source's points are from `center`: what makes metres of radians."""
+        """Median distance of the source's points from `center`: converts radians to metres."""
         distance = np.linalg.norm(self.source.frame.points.astype(float), axis=1)
         return max(float(np.median(distance)), 1e-6) if len(distance) else 1.0
 
     @cached_property
     def covariance(self) -> Float64 | None:
-        """(6, 6) of the right perturbation at the source's `center`; None if not bounded."""
+        """(6, 6) of the right perturbation at the source's `center`; None if unbounded."""
         if len(self.found.unobservable):
             return None
         return self._observed_covariance
@@ -126,13 +126,13 @@ class PairResult:
     def sigma(self) -> tuple[float | None, float | None]:
         """Standard deviations (m, rad) in the worst observable direction.
 
-        None where that is not known, or no direction is observable.
+        None where not known, or where no direction is observable.
         """
         covariance = self._observed_covariance
         if covariance is None:
             return None, None
         worst = [float(np.linalg.eigvalsh(covariance[k, k])[-1]) for k in (_MOVE, _TURN)]
-        # In metres both are about as large; what is nothing beside the other is only rounding.
+        # In metres both are of similar size; one that is negligible is only rounding error.
         limit = 1e-12 * max(worst[0], worst[1] * self.lever_m**2)
         known = worst[0] > limit, worst[1] * self.lever_m**2 > limit
         move, turn = (float(np.sqrt(max(value, 0.0))) for value in worst)
@@ -160,20 +160,20 @@ class PairResult:
 
     @cached_property
     def free_motions(self) -> tuple[Float64, Float64]:
-        """Axes (a, 3) along which the source can slide, and (b, 3) about which it can turn."""
+        """Unobservable directions: axes (a, 3) of translations, and axes (b, 3) of rotations."""
         free = np.asarray(self.found.unobservable, float).reshape(-1, 6)
         if not len(free):
             return np.zeros((0, 3)), np.zeros((0, 3))
-        # An orthonormal basis in metres, turned so that as many as can be are mere slides.
+        # An orthonormal basis in metres, with as many pure translations as possible.
         _, s, vt = np.linalg.svd(free * np.array([1, 1, 1, *[self.lever_m] * 3]))
         basis = vt[: int((s > 1e-9 * s[0]).sum())]
         u, turn, _ = np.linalg.svd(basis[:, 3:])
         basis = u.T @ basis
-        turns = np.concatenate([turn, np.zeros(len(basis))])[: len(basis)] > _MOSTLY_SLIDE
+        turns = np.concatenate([turn, np.zeros(len(basis))])[: len(basis)] > _MAX_ROTATION
         return _unit(basis[~turns, :3]), _unit(basis[turns, 3:])
 
     def aligned(self) -> Float64:
-        """(N, 3) all points of the source, in the coordinates of the target's file."""
+        """(N, 3) points of the source in the coordinates of the target's file, m."""
         points = se3.transform(
             self.found.T_target_source, self.source.frame.points.astype(np.float64)
         )
@@ -181,8 +181,8 @@ class PairResult:
 
 
 _MOVE, _TURN = slice(0, 3), slice(3, 6)
-# Below this share of turning a free direction is called a slide.
-_MOSTLY_SLIDE = 0.4
+# A free direction with less rotation, as a fraction of the whole, counts as a translation.
+_MAX_ROTATION = 0.4
 
 
 def _unit(vectors: Float64) -> Float64:
@@ -190,7 +190,7 @@ def _unit(vectors: Float64) -> Float64:
 
 
 def pair_json(result: PairResult) -> dict[str, Any]:
-    """Return the content of `registration.json`: SI units and radians, null for what is unknown."""
+    """Return the content of `registration.json`: SI units and radians, null where unknown."""
     found = result.found
     sigma_m, sigma_rad = result.sigma
     covariance = result.covariance
@@ -240,8 +240,8 @@ def _view_json(local: LocalView) -> dict[str, Any]:
 
 
 def is_registration(folder: Path) -> bool:
-    """Say whether a folder holds an earlier registration."""
-    data = json_of(folder / MARKER)
+    """Whether a folder contains an earlier registration."""
+    data = read_json_object(folder / MARKER)
     return data is not None and {"schema", "version", "T_target_source"} <= set(data)
 
 
@@ -249,19 +249,28 @@ CONTRACT = Contract(Names(frozenset(FILES)), MARKER, is_registration)
 
 
 def pair_folder(path: Path, *, overwrite: bool = False) -> OutputFolder:
-    """Check and create the folder for a registration; see `OutputFolder` for errors."""
+    """Check, create and lock the folder for a registration; see `OutputFolder`."""
     return OutputFolder(path, overwrite=overwrite, contract=CONTRACT)
 
 
 def write_pair(
     result: PairResult, folder: OutputFolder, report: Callable[[PairResult, Path], None]
 ) -> None:
-    """Write the files of a registration; `report` writes the page to the path that it gets.
+    """Write the files of a registration.
+
+    Parameters
+    ----------
+    result
+        The registration.
+    folder
+        Where to.
+    report
+        Writes the report of a registration to a path.
 
     Raises
     ------
     OutputError
-        If a file can't be written; then nothing that was there before has changed.
+        If a file can't be written; existing files are unchanged then.
     """
     with folder.staging() as staging:
         write_text(staging / "transform.txt", pose_text(result.T_target_source))
@@ -272,7 +281,7 @@ def write_pair(
 
 
 def write_aligned(result: PairResult, path: Path) -> None:
-    """Write the source in the target's coordinates, with all that is known of each point."""
+    """Write the source in the target's coordinates, with normals, colour and intensity."""
     frame = result.source.frame
     points = result.aligned()
     normals = frame.normals

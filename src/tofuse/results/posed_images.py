@@ -1,4 +1,4 @@
-"""The images of a result with their poses, for programs that start from both."""
+"""The images of a result with their poses, for programs that take both as input."""
 
 from __future__ import annotations
 
@@ -24,35 +24,35 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.rectify import Rectifier, pinhole_of
 from tofuse.recordings.sources import FileSource
 from tofuse.results.output import main_poses, read_run_json
-from tofuse.results.reopening import RecordedPart, recorded_parts, reopened
+from tofuse.results.reopening import StoredRecording, reopen, stored_recordings
 
-DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # of a count
+DEPTH_UNIT_M, SIGMA_UNIT_M = 1e-3, 1e-4  # m per count
 IMAGES, DEPTH, SIGMA, MASKS = "images", "depth", "sigma", "masks"
-_MOST = 65535
-_BRIGHT = 99.0  # percentile of the first frame's light that is shown as white
-_MOST_POINTS = 200_000
+_MAX_COUNT = 65535
+_WHITE_PERCENTILE = 99.0  # of the first frame's amplitude
+_MAX_POINTS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """What one frame of a result gives.
+    """One frame of a result with its pose.
 
     Attributes
     ----------
     index
-        Of the frame, as `run.json` counts.
+        Frame index, as in `run.json`.
     frame
-        z depth, with the camera that the result believes in; rectified where asked for.
+        z depth, with the camera as the result calibrated it; rectified if requested.
     camera
-        Of the image: the same, at the resolution of the image.
+        Camera of the image: the same camera at the resolution of the image.
     image
-        (H, W, 3) uint8 RGB: the colour, or what a surface reflects as grey.
+        (H, W, 3) uint8 RGB: the colour, or the albedo as grey.
     sigma
         (H, W) standard deviation of the z depth in m, 0 where invalid.
     T_world_camera
         (4, 4).
     covariance
-        (6, 6) of the pose, see docs/conventions.md; None where not known.
+        (6, 6) of the pose (docs/conventions.md); None where not known.
     """
 
     index: int
@@ -65,52 +65,60 @@ class PosedImage:
 
     @property
     def name(self) -> str:
-        """File name of its images."""
+        """File name of the frame's images."""
         return f"frame_{self.index:06d}.png"
 
 
 def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> Iterator[PosedImage]:
-    """Give every so-many-th image of the main model of a result, in order.
+    """Yield the images of the main model of a result, in order.
 
-    Images of a camera that does not suit are rectified. What can't be read, or has neither colour
-    nor amplitude, is left out. Colour is as large as it was recorded, where it shows what depth
-    shows, and so larger than depth.
+    Frames that can't be read, or have neither colour nor amplitude, are left out. Colour that is
+    registered to depth keeps its recorded resolution, which may be larger than that of depth.
+
+    Parameters
+    ----------
+    folder
+        The result.
+    every
+        Every n-th of the frames with a pose.
+    suits
+        Whether the target format supports a camera's lens model; others are rectified.
 
     Raises
     ------
     InputError
-        If the recording is gone, or another one by now; if it holds clouds, or if no image has
-        colour or amplitude.
+        If the recording is missing or has changed, contains clouds, or no image has colour or
+        amplitude.
     """
     run = read_run_json(folder / "run.json")
     indices, poses = main_poses(folder, run)
     chosen = dict(zip(indices[::every], poses[::every], strict=True))
     try:
         covariances = {f["index"]: f["covariance"] for f in run["frames"]}
-        parts = list(recorded_parts(folder, run))
+        parts = list(stored_recordings(folder, run))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
-            "is damaged, or no run.json of tofuse", where=folder / "run.json", remedy="run again"
+            "is damaged, or not a run.json of tofuse", where=folder / "run.json", remedy="run again"
         ) from error
-    dark: list[str] = []
-    given = 0
+    skipped: list[str] = []
+    n_images = 0
     for part in parts:
-        recording = reopened(part, folder)
-        lighting = _Lighting(recording)
+        recording = reopen(part, folder)
+        renderer = _ImageRenderer(recording)
         camera: Camera | None = None
         rectifier: Rectifier | None = None
         for frame in _frames(part, recording, chosen):
-            image = lighting.image(frame)
+            image = renderer.image(frame)
             if image is None:
-                dark.append(f"{recording.path}: frame {frame.index}")
+                skipped.append(f"{recording.path}: frame {frame.index}")
                 continue
-            frame = replace(frame, sigma_image=lighting.noise.sigma(frame), color_image=image)
+            frame = replace(frame, sigma_image=renderer.noise.sigma(frame), color_image=image)
             if rectifier is None or frame.camera != camera:
                 camera = frame.camera
-                rectifier = Rectifier(_shown_by(camera, suits))
+                rectifier = Rectifier(_image_camera(camera, suits))
             seen = rectifier(frame)
             image_camera = rectifier.pinhole
-            if image_camera == camera and (whole := _whole_color(recording, frame)) is not None:
+            if image_camera == camera and (whole := _full_color(recording, frame)) is not None:
                 image_camera = scaled(image_camera, whole.shape[1], whole.shape[0])
                 image = whole
             else:
@@ -128,19 +136,19 @@ def posed_images(folder: Path, every: int, suits: Callable[[Camera], bool]) -> I
                 chosen[index],
                 None if C is None else np.array(C, float).reshape(6, 6),
             )
-            given += 1
-    if dark and not given:
+            n_images += 1
+    if skipped and not n_images:
         raise InputError(
             "has neither colour nor amplitude",
-            where=dark[0],
-            remedy="record one of them: these programs start from images",
+            where=skipped[0],
+            remedy="record one of them: the target programs need images",
         )
 
 
 def _frames(
-    part: RecordedPart, recording: Recording, chosen: dict[int, Float64]
+    part: StoredRecording, recording: Recording, chosen: dict[int, Float64]
 ) -> Iterator[RangeFrame]:
-    """The chosen frames of a recording that can be read, with the camera as it was found to be."""
+    """The chosen readable frames of a recording, with the camera as it was calibrated."""
     wanted = [k + part.first in chosen for k in recording.indices.tolist()]
     correctors = CameraErrors.made_with(part.config)
     recording = replace(recording, indices=recording.indices[wanted])
@@ -149,7 +157,7 @@ def _frames(
             continue
         if not isinstance(item, RangeFrame):
             raise InputError(
-                "holds clouds", where=recording.path, remedy="choose a format for clouds"
+                "contains clouds", where=recording.path, remedy="choose a format for clouds"
             )
         frame: Any = item
         for corrector in correctors:
@@ -157,13 +165,13 @@ def _frames(
         yield frame
 
 
-def _shown_by(camera: Camera, suits: Callable[[Camera], bool]) -> Pinhole:
-    """The camera itself, or the pinhole camera in its place."""
+def _image_camera(camera: Camera, suits: Callable[[Camera], bool]) -> Pinhole:
+    """The camera itself if it suits, else a pinhole camera that replaces it."""
     return camera if isinstance(camera, Pinhole) and suits(camera) else pinhole_of(camera)
 
 
-def _whole_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
-    """The colour of a frame as large as it was recorded; None where it is no larger than depth."""
+def _full_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
+    """The colour of a frame at its recorded resolution; None where that is not above depth's."""
     source = recording.source
     if frame.color_image is None or not isinstance(source, FileSource):
         return None
@@ -174,15 +182,15 @@ def _whole_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
     return None if whole is None or len(whole) <= len(frame.color_image) else whole
 
 
-class _Lighting:
-    """How frames of one recording are shown, as bright in all of them, and their noise."""
+class _ImageRenderer:
+    """Renders the frames of one recording, with the same white level, and knows their noise."""
 
     def __init__(self, recording: Recording) -> None:
         self.noise = noise_model_for(recording)
         self._white: float | None = None
 
     def image(self, frame: RangeFrame) -> UInt8 | None:
-        """(H, W, 3) RGB of a frame, black where nothing is known; None where all is dark."""
+        """(H, W, 3) RGB of a frame, black where unknown; None without colour and amplitude."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
         view = LitView.of(replace(frame, color_image=None))
@@ -191,15 +199,23 @@ class _Lighting:
         light = view.light[..., 0]
         lit = light > 0
         if self._white is None and lit.any():
-            self._white = float(np.percentile(light[lit], _BRIGHT))
-        share = (np.where(lit, light, 0) / (self._white or 1.0)).clip(0, 1)
-        # Gamma 1/2.2: albedo is linear, screens are not; what is known is not black.
-        grey = np.where(lit, np.maximum(1, np.round(255 * share ** (1 / 2.2))), 0)
+            self._white = float(np.percentile(light[lit], _WHITE_PERCENTILE))
+        level = (np.where(lit, light, 0) / (self._white or 1.0)).clip(0, 1)
+        # Gamma 1/2.2: albedo is linear, screens are not. Known pixels are never black.
+        grey = np.where(lit, np.maximum(1, np.round(255 * level ** (1 / 2.2))), 0)
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
 
 
 class ImageFolder:
-    """Writes images, depth, sigma and masks, each under the name of its frame."""
+    """Writes images, depth, sigma and masks of posed images into a folder.
+
+    Attributes
+    ----------
+    folder
+        The folder.
+    masked
+        Whether any image so far has unknown pixels.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -207,7 +223,7 @@ class ImageFolder:
         self.masked = False
 
     def write(self, posed: PosedImage) -> None:
-        """Write what belongs to one frame."""
+        """Write the files of one frame."""
         self._png(IMAGES, posed.name, posed.image)
         self._png(DEPTH, posed.name, _counts(posed.frame.depth, DEPTH_UNIT_M))
         self._png(SIGMA, posed.name, _counts(posed.sigma, SIGMA_UNIT_M))
@@ -219,7 +235,7 @@ class ImageFolder:
             self._png(MASKS, posed.name, np.where(known, 255, 0).astype(np.uint8))
 
     def finish(self) -> None:
-        """Give the others masks as well, if any frame needs one."""
+        """Write masks for the other frames as well, if any frame has one."""
         for name, shape in self._whole if self.masked else ():
             self._png(MASKS, name, np.full(shape, 255, np.uint8))
 
@@ -228,15 +244,15 @@ class ImageFolder:
 
 
 def _counts(metres: Float32, unit_m: float) -> UInt16:
-    """16-bit counts; 0 where they don't fit."""
+    """16-bit counts; 0 where they exceed the range."""
     counts = np.rint(metres.astype(float) / unit_m)
-    return np.where(counts < _MOST, counts, 0).astype(np.uint16)
+    return np.where(counts < _MAX_COUNT, counts, 0).astype(np.uint16)
 
 
 def some_points(folder: Path) -> tuple[Float32, UInt8]:
-    """Return points (N, 3) of the cloud of a result, evenly chosen, and their colours (N, 3)."""
+    """Return evenly chosen points (N, 3) of the cloud of a result, and their colours (N, 3)."""
     ply = read_ply(folder / "cloud.ply")
-    step = max(1, -(-len(ply) // _MOST_POINTS))
+    step = max(1, -(-len(ply) // _MAX_POINTS))
     points = ply.points[::step].astype(np.float32)
     color = np.full((len(points), 3), 128, np.uint8) if ply.color is None else ply.color[::step]
     return points, color

@@ -1,4 +1,4 @@
-"""Ranges of frame indices, both ends included: found, merged, and written for a person."""
+"""Ranges of frame indices, both ends included: made, merged, and written as text."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 Range = tuple[int, int]
 
-# A line that lists more ranges than these is not read; `run.json` has them all.
+# Nobody reads a line with more ranges; `run.json` has them all.
 _LISTED = 6
 
 
 def runs(frames: Sequence[int], marked: Sequence[bool]) -> tuple[Range, ...]:
-    """Return (first, last) of each unbroken run of marked frames.
+    """Return (first, last) index of each uninterrupted run of marked frames.
 
-    Neighbours in the list count as neighbours, whatever their indices: a recording read with a
-    stride has gaps in them.
+    Frames that follow each other in the list count as consecutive, whatever their indices: a
+    recording read with a stride has gaps in them.
 
     Parameters
     ----------
@@ -34,13 +34,13 @@ def runs(frames: Sequence[int], marked: Sequence[bool]) -> tuple[Range, ...]:
 
 
 def runs_of(frames: Sequence[int], chosen: Collection[int]) -> tuple[Range, ...]:
-    """Return the runs, as `runs` does, of the frames whose index is chosen."""
+    """Return the runs, as `runs` does, of those among `frames` whose index is in `chosen`."""
     indices = set(chosen)
     return runs(frames, [k in indices for k in frames])
 
 
 def union(ranges: Iterable[Range]) -> tuple[Range, ...]:
-    """Return ranges in ascending order, those joined that overlap or touch."""
+    """Return ranges in ascending order, with overlapping and adjacent ones merged."""
     out: list[Range] = []
     for first, last in sorted(ranges):
         if out and first <= out[-1][1] + 1:
@@ -51,12 +51,12 @@ def union(ranges: Iterable[Range]) -> tuple[Range, ...]:
 
 
 def size(ranges: Iterable[Range]) -> int:
-    """Return how many indices the ranges hold, if they do not overlap."""
+    """Return the number of indices in ranges that do not overlap."""
     return sum(last - first + 1 for first, last in ranges)
 
 
 def numbers(ranges: Sequence[Range]) -> str:
-    """Write "3-9, 20, 31-34"; only the first ones of many, and how many more there are."""
+    """Return "3-9, 20, 31-34"; of many ranges the first ones and the number of the others."""
     listed = [str(a) if a == b else f"{a}-{b}" for a, b in ranges[:_LISTED]]
     more = len(ranges) - len(listed)
     if more:
@@ -65,10 +65,10 @@ def numbers(ranges: Sequence[Range]) -> str:
 
 
 def in_words(ranges: Sequence[Range]) -> str:
-    """Write "frame 20" or "frames 3-9, 20, 31-34"."""
+    """Return "frame 20" or "frames 3-9, 20, 31-34"."""
     return f"{'frame' if is_one(ranges) else 'frames'} {numbers(ranges)}"
 
 
 def is_one(ranges: Sequence[Range]) -> bool:
-    """Say whether the ranges hold a single frame, for the verb that follows."""
+    """Whether the ranges are a single frame, for the verb that follows."""
     return len(ranges) == 1 and ranges[0][0] == ranges[0][1]

@@ -14,28 +14,28 @@ from tofuse.recordings.opening import Opening
 from tofuse.recordings.recording import Recording
 from tofuse.results.folder import RECORDING
 
-# Times of frames that differ by more are not those of the same recording, s.
-_SAME_TIME = 1e-6
+# Frames whose times differ by more are not of the same recording, s.
+_MAX_TIME_DIFFERENCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedPart:
-    """What a result says of one of its recordings; but for merged results there is one.
+class StoredRecording:
+    """A recording as a result refers to it; only merged results have more than one.
 
     Attributes
     ----------
     name
-        What it is called in words.
+        A name for display.
     opening
         How it was opened.
     config
-        How its frames were corrected and filtered, as plain data.
+        The configuration that corrects and filters its frames, as plain data.
     first
-        What was added to the indices of its frames.
+        Offset of its frame indices in the result.
     times
-        s, by the index of the frame in the recording; None where other recordings moved them on.
+        s, by the index of the frame in the recording; None in merged results, which shift them.
     frames
-        Indices in the recording of the frames that the result speaks of.
+        Indices in the recording of the frames that the result contains.
     """
 
     name: str
@@ -46,15 +46,22 @@ class RecordedPart:
     frames: list[int]
 
 
-def recorded_parts(folder: Path, run: Mapping[str, Any]) -> Iterator[RecordedPart]:
-    """Read what the `run.json` of a folder says of its recordings.
+def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRecording]:
+    """Yield the recordings of a result.
+
+    Parameters
+    ----------
+    folder
+        The result.
+    run
+        Its `run.json`.
 
     Raises
     ------
     KeyError, TypeError, ValueError, AttributeError, IndexError
-        If it is damaged.
+        If `run.json` is damaged.
     InputError
-        If it does not say how a recording was opened.
+        If it does not state how a recording was opened.
     """
     times = {int(f["index"]): float(f["timestamp"]) for f in run["frames"]}
     if not times:
@@ -62,7 +69,7 @@ def recorded_parts(folder: Path, run: Mapping[str, Any]) -> Iterator[RecordedPar
     several = run.get("sessions") or []
     alone = {
         "name": folder.resolve().name,
-        "opening": run["input"].get("opening") or _of_old(run["input"]),
+        "opening": run["input"].get("opening") or _opening_before_version_0_2(run["input"]),
         "config": run["config"],
         "first": 0,
         "count": max(times) + 1,
@@ -70,7 +77,7 @@ def recorded_parts(folder: Path, run: Mapping[str, Any]) -> Iterator[RecordedPar
     for part in several or [alone]:
         first, count = int(part["first"]), int(part["count"])
         mine = {k - first: t for k, t in times.items() if first <= k < first + count}
-        yield RecordedPart(
+        yield StoredRecording(
             str(part["name"]),
             Opening.from_dict(part["opening"], folder / "run.json"),
             dict(part["config"]),
@@ -80,35 +87,43 @@ def recorded_parts(folder: Path, run: Mapping[str, Any]) -> Iterator[RecordedPar
         )
 
 
-def _of_old(told: Mapping[str, Any]) -> dict[str, Any]:
-    """How the recording of a result of before version 0.2 was opened, as far as it says."""
-    return Opening((Path(told["path"]),)).to_dict()
+def _opening_before_version_0_2(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """How the recording of a result of version 0.1 was opened, as far as `run.json` states it."""
+    return Opening((Path(stated["path"]),)).to_dict()
 
 
-def where_it_lies(opening: Opening, folder: Path) -> Opening:
-    """Return where a recording is: as told, or where `tofuse demo` leaves it, beside its result."""
-    beside = folder / RECORDING
-    lies = all(path.exists() for path in opening.paths)
-    if not lies and beside.is_dir() and [path.name for path in opening.paths] == [RECORDING]:
-        return replace(opening, paths=(beside,))
+def locate_recording(opening: Opening, folder: Path) -> Opening:
+    """Return where a recording is: at the stated path, or next to its result, as of the demo."""
+    next_to_result = folder / RECORDING
+    if all(path.exists() for path in opening.paths) or not next_to_result.is_dir():
+        return opening
+    if [path.name for path in opening.paths] == [RECORDING]:
+        return replace(opening, paths=(next_to_result,))
     return opening
 
 
-def reopened(part: RecordedPart, folder: Path) -> Recording:
-    """Open the recording of a result again: the frames that the result speaks of.
+def reopen(part: StoredRecording, folder: Path) -> Recording:
+    """Open the recording of a result again, with the frames that the result contains.
+
+    Parameters
+    ----------
+    part
+        The recording.
+    folder
+        The result.
 
     Raises
     ------
     InputError
-        If it is gone, can't be opened, or is another one by now.
+        If it is missing, can't be opened, or has changed.
     """
-    opening = where_it_lies(part.opening, folder)
+    opening = locate_recording(part.opening, folder)
     for path in (*opening.paths, *((opening.camera,) if opening.camera else ())):
         if not path.exists():
             raise InputError(
-                f"needs {path}, which is gone",
+                f"needs {path}, which doesn't exist",
                 where=folder,
-                remedy="put it back there, or run `tofuse run` again where it is now",
+                remedy="put it back, or run `tofuse run` again",
             )
     recording = opening.open()
     chosen = np.isin(recording.indices, part.frames)
@@ -116,10 +131,10 @@ def reopened(part: RecordedPart, folder: Path) -> Recording:
     recording = replace(recording, indices=recording.indices[chosen])
     if same and part.times is not None:
         times = np.array([part.times[k] for k in recording.indices.tolist()])
-        same = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_SAME_TIME))
+        same = bool(np.allclose(times, recording.timestamps, rtol=0, atol=_MAX_TIME_DIFFERENCE))
     if not same:
         raise InputError(
-            f"is not of the frames that {recording.path} holds by now",
+            f"does not match the frames of {recording.path}, which has changed",
             where=folder,
             remedy="run `tofuse run` again",
         )

@@ -1,4 +1,4 @@
-"""Small images of some frames, taken while a run works, so that nothing is decoded again."""
+"""Small images of some frames, taken during a run, so that nothing has to be decoded again."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float32, UInt8
 from tofuse.recordings.frames import RangeFrame
 
-MOST, MOST_LOST = 160, 40  # samples of all frames, and of lost ones beside them
-WIDTH = 192  # pixels at most
+MAX_SAMPLES, MAX_LOST_SAMPLES = 160, 40  # of all frames, and of lost ones in addition
+MAX_WIDTH = 192  # pixels
 
-NOTHING, REMOVED, TRACKED, KEPT = range(4)  # what became of a pixel, in `FrameSample.fate`
+NOTHING, REMOVED, TRACKED, KEPT = range(4)  # use of a pixel, in `FrameSample.fate`
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +24,12 @@ class FrameSample:
     Attributes
     ----------
     index
-        Of the frame.
+        Frame index.
     depth
-        (h, w) float16, z in m, before filters; 0 where nothing was measured.
+        (h, w) float16, z in m, before filtering; 0 where nothing was measured.
     fate
         (h, w) uint8: `NOTHING` measured, `REMOVED` by a filter, `TRACKED` but not in the model,
-        or `KEPT`.
+        or `KEPT` in the model.
     amplitude
         (h, w) float32, or None.
     color
@@ -44,8 +44,16 @@ class FrameSample:
 
     @classmethod
     def of(cls, frame: RangeFrame, tracked: RangeFrame, kept: RangeFrame) -> FrameSample:
-        """Thin a corrected frame; `tracked` and `kept` are what filters left of it."""
-        step = -(-frame.depth.shape[1] // WIDTH)
+        """Subsample a corrected frame.
+
+        Parameters
+        ----------
+        frame
+            The frame after corrections, before filters.
+        tracked, kept
+            The same frame after the filters of tracking, and after those of the model.
+        """
+        step = -(-frame.depth.shape[1] // MAX_WIDTH)
         thin = (slice(None, None, step), slice(None, None, step))
         fate = np.where(frame.valid[thin], REMOVED, NOTHING).astype(np.uint8)
         fate[tracked.valid[thin]] = TRACKED
@@ -63,7 +71,7 @@ class FrameSample:
 
 
 class FrameSamples:
-    """At most `MOST` evenly spaced frames of an endless stream, and some of the lost ones."""
+    """At most `MAX_SAMPLES` evenly spaced frames of a stream, and `MAX_LOST_SAMPLES` lost ones."""
 
     def __init__(self) -> None:
         self._even: list[FrameSample] = []
@@ -72,21 +80,23 @@ class FrameSamples:
         self._counts = [0, 0]
 
     def take(self, *, lost: bool, make: Callable[[], FrameSample]) -> None:
-        """Take the next frame, if its turn has come: only then is its sample made."""
+        """Offer the next frame; `make` is called only if it is taken."""
         sample = None
-        for k, (items, most) in enumerate(((self._even, MOST), (self._lost, MOST_LOST))):
+        for k, (items, limit) in enumerate(
+            ((self._even, MAX_SAMPLES), (self._lost, MAX_LOST_SAMPLES))
+        ):
             if k == 1 and not lost:
                 break
             if self._counts[k] % self._steps[k] == 0:
                 sample = sample or make()
                 items.append(sample)
-                if len(items) > most:
+                if len(items) > limit:
                     del items[1::2]
                     self._steps[k] *= 2
             self._counts[k] += 1
 
     @property
     def all(self) -> tuple[FrameSample, ...]:
-        """In the order of their frames."""
+        """All samples, in the order of their frames."""
         both = {sample.index: sample for sample in (*self._even, *self._lost)}
         return tuple(both[index] for index in sorted(both))

@@ -1,4 +1,4 @@
-"""Surfaces that are too large for one file of a browser: an overview, and 3D Tiles."""
+"""Surfaces that are too large for a single file in a browser: an overview, and 3D Tiles."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from tofuse.fusion.levels import Level, Place, levels
 from tofuse.fusion.mesh import Mesh
 from tofuse.results.folder import RESULT, TILESET
 
-# A surface of more triangles is tiled. So many are 110 MB of glTF, all of which has to be there
+# A surface with more triangles is tiled. These take 110 MB of glTF, all of which must be loaded
 # before anything is shown.
-MOST_FACES = 4_000_000
+MAX_UNTILED_FACES = 4_000_000
 OVERVIEW_BYTES = 8_000_000
-# Of a vertex: place, normal, colour; and of a triangle: its corners.
+# A vertex has a position, normal and colour; a triangle has its corners.
 _VERTEX_BYTES, _FACE_BYTES, _HEAD_BYTES = 12 + 12 + 8, 12, 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Tiled:
-    """What has been written.
+class TilingSummary:
+    """A summary of the tiles that were written.
 
     Attributes
     ----------
     levels, tiles
-        How many there are.
+        Number of levels of detail, and of tiles.
     faces
-        Triangles of the whole surface.
+        Number of triangles of the whole surface.
     overview
-        The surface with fewer triangles, no more than `OVERVIEW_BYTES` as one glTF file.
+        The simplified surface, of at most `OVERVIEW_BYTES` as one glTF file.
     """
 
     levels: int
@@ -46,15 +46,17 @@ class Tiled:
     overview: Mesh
 
 
-def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
-    """Write a surface with faces as tiles with y up, a `tileset.json` and the files beside it.
+def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> TilingSummary:
+    """Write a surface as tiles with y up: a `tileset.json` and its .glb files.
 
     Parameters
     ----------
+    mesh
+        A surface with at least one face.
     R_up_world
         (3, 3) from the world into axes with y up; see `upright`.
     folder
-        Made if it is not there.
+        Created if necessary.
 
     Raises
     ------
@@ -68,13 +70,13 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
     for level in levels(mesh):
         number = level.number
         tiles += len(level.places)
-        below = _tree(_written(level, R_up_world, folder), below, level.error_m)
+        below = _parents(_write_level(level, R_up_world, folder), below, level.error_m)
         if not _fits(level.mesh):
             coarse = level.mesh
         error = level.error_m
-    while len(below) > 1:  # what was put together to nothing has tiles below it all the same
+    while len(below) > 1:  # further levels without content, up to a single root
         number, error = number + 1, 2 * error
-        below = _tree({}, below, error)
+        below = _parents({}, below, error)
     (root,) = below.values()
     T = np.eye(4)
     T[:3, :3] = R_up_world
@@ -84,16 +86,16 @@ def write_tiles(mesh: Mesh, R_up_world: Float64, folder: Path) -> Tiled:
         generator=f"tofuse {__version__}",
         extras={"T_up_world": T.tolist()},
     )
-    return Tiled(number + 1, tiles, len(mesh.faces), overview(coarse))
+    return TilingSummary(number + 1, tiles, len(mesh.faces), overview(coarse))
 
 
 def is_tiles(folder: Path) -> bool:
-    """Say whether it is a folder `tiles` that holds nothing but what `write_tiles` writes."""
+    """Whether it is a folder `tiles` with nothing but files of `write_tiles`."""
     return RESULT.names.is_whole(folder)
 
 
 def overview(mesh: Mesh) -> Mesh:
-    """Return the surface with as many triangles as fit into `OVERVIEW_BYTES` of glTF."""
+    """Return the surface, simplified until it fits into `OVERVIEW_BYTES` of glTF."""
     faces = float(OVERVIEW_BYTES / (_FACE_BYTES + _VERTEX_BYTES / 2))
     fitting = mesh
     while not _fits(fitting):
@@ -107,8 +109,8 @@ def _fits(mesh: Mesh) -> bool:
     return size <= OVERVIEW_BYTES
 
 
-def _written(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Tile]:
-    """Write the tiles of a level."""
+def _write_level(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Tile]:
+    """Write the tiles of a level; returns them by place."""
     out = {}
     for place, mesh in level.tiles():
         name = f"{level.number}-{place[0]}-{place[1]}-{place[2]}.glb"
@@ -129,8 +131,10 @@ def _written(level: Level, R_up_world: Float64, folder: Path) -> dict[Place, Til
     return out
 
 
-def _tree(tiles: dict[Place, Tile], below: dict[Place, Tile], error_m: float) -> dict[Place, Tile]:
-    """Put the tiles of the next finer level below those of a level, each within its box."""
+def _parents(
+    tiles: dict[Place, Tile], below: dict[Place, Tile], error_m: float
+) -> dict[Place, Tile]:
+    """Make tiles the parents of those of the next finer level, each within its box."""
     for (i, j, k), child in below.items():
         place = (i // 2, j // 2, k // 2)
         if place not in tiles:
@@ -141,6 +145,6 @@ def _tree(tiles: dict[Place, Tile], below: dict[Place, Tile], error_m: float) ->
         parent.high = np.maximum(parent.high, child.high)
     for tile in tiles.values():
         if below and not tile.children:
-            # What moved over a border is in a finer tile beside it: here it only has to go.
+            # Simplification moved its content into a neighbour: finer detail here is empty.
             tile.children.append(Tile(tile.low, tile.high, 0.0, None, 0))
     return tiles

@@ -1,4 +1,4 @@
-"""What a run gives, in memory and in `run.json`."""
+"""The result of a run, as it is in memory and in `run.json`."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Reason:
     code
         From the closed list in `verdict.REASONS`.
     ranges
-        (first, last) frame index of each stretch that it concerns, ascending; at least one.
+        (first, last) frame index of each range that it concerns, ascending; at least one.
     text
-        What was found, one or a few sentences.
+        What was found, in one or a few sentences.
     """
 
     code: str
@@ -52,10 +52,28 @@ class Reason:
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """What became of one frame; the fields of `run.json`, SI units.
+    """The outcome of one frame, as in `run.json`.
 
-    `component` is the position in `Reconstruction.components`; None where it is in none, or where
-    nothing looked for components.
+    Attributes
+    ----------
+    index, timestamp
+        Frame index in the recording, and s.
+    status
+        "tracked", "predicted", "lost" (no pose) or "skipped" (unreadable).
+    reason
+        Why it was not tracked; may be empty.
+    valid_share
+        Fraction of its pixels that are valid after filtering, 0 to 1.
+    inlier_share
+        Fraction of its points with a correspondence, 0 to 1.
+    rms_m
+        Rms residual of the correspondences, m.
+    covariance
+        (6, 6) of the final pose relative to the first, m and rad; None where not known.
+    unobservable
+        (K, 6) orthonormal directions of the right perturbation that the data does not constrain.
+    component
+        Position in `Reconstruction.components`; None where the frame is in none.
     """
 
     index: int
@@ -65,14 +83,14 @@ class FrameRecord:
     valid_share: float | None = None
     inlier_share: float | None = None
     rms_m: float | None = None
-    covariance: Float64 | None = None  # (6, 6) of the final pose, relative to the first
+    covariance: Float64 | None = None
     unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
     component: int | None = None
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """How the stated calibration of a camera was corrected, because its own views say so.
+    """A correction of the stated calibration, estimated from the recording itself.
 
     Attributes
     ----------
@@ -81,10 +99,10 @@ class SelfCalibration:
     offset_m
         Added to all ranges, m.
     sigmas
-        Standard deviations by how much views differ in it, by name as above.
+        Standard deviations of "focal" and "offset", from the scatter between views.
     bound_m
-        95 % bounds of the poses' rms error with the calibration as stated, and as corrected; inf
-        where the poses are not bounded.
+        95 % bounds of the rms pose error with the stated and with the corrected calibration, m;
+        inf where the poses are not bounded.
     """
 
     focal: float
@@ -95,34 +113,40 @@ class SelfCalibration:
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """Everything that says how far the result can be trusted.
+    """Everything that states how far the result can be trusted.
 
     Attributes
     ----------
+    verdict, reasons
+        "good", "degraded" or "failed", and why; the most severe reason first.
+    frames
+        The outcome of every frame, in the order in which they were read.
+    loops
+        All candidates for loop closures, accepted or rejected.
     sequential
-        (N, 4, 4) T_world_camera before loops were closed, NaN where lost.
+        (N, 4, 4) T_world_camera before loop closure, NaN where lost.
     objective
         Value of the optimiser's objective at every iteration (figure 5.3).
     removed
-        Share of points that each filter removed, by name.
+        Fraction of the points that each filter removed, by name.
     seconds
-        Wall time of each stage.
+        Wall time of each stage, by name.
     cloud_before
-        The model as the sequential poses give it; None where nothing moved them.
+        The model under the sequential poses; None where optimisation changed none of them.
     refinement
-        What became of the refinement over all views.
+        Outcome of the global refinement; None where there was none.
     parts
-        The connected parts of the graph, where the optimiser ran and tells them apart.
+        The connected parts of the pose graph, where the optimiser treats them separately.
     outside
-        What became of sensors beside the camera.
+        Outcome of the external sensors.
     samples
-        Small images of some frames; none of clouds.
+        Small images of some frames; empty for clouds.
     accuracy
-        95 % bounds of the poses' errors.
+        95 % bounds of the pose errors.
     calibrated
-        How the camera's calibration was corrected; None where it was left as stated.
+        The self-calibration; None where the calibration was left as stated.
     joins
-        What joins the components of the main model.
+        The links that join the components of the main model.
     """
 
     verdict: Verdict
@@ -145,20 +169,20 @@ class Diagnostics:
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """A stretch of the recording tracked without a break, or several joined with each other.
+    """A part of the recording that was tracked without interruption, or several joined ones.
 
     Attributes
     ----------
     frames
-        (first, last) frame index of each stretch, ascending.
+        (first, last) frame index of each range, ascending.
     T_main_component
-        (4, 4) the identity for component 0, the main one; None where it is not connected to that.
+        (4, 4), the identity for component 0, the main one; None where it is not connected to it.
     joined
-        How it was connected: by "links" between its views and others, or by the extrapolated
-        "motion" over the gap alone; None for component 0 and where it is not connected.
+        How it was connected: by "links" between its views and others, or by extrapolated "motion"
+        over the gap only; None for component 0 and where it is not connected.
     result
-        A model of its own, where it is not part of the main one and has more than a few frames. It
-        holds the frames of this component only, in a world frame of its own.
+        Its own model, where it is not part of the main one and has more than a few frames: that of
+        its frames only, in its own world frame.
     """
 
     frames: tuple[Range, ...]
@@ -174,21 +198,20 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class SessionRecord:
-    """One of several recordings in one map.
+    """One of the recordings of a merged map.
 
     Attributes
     ----------
     name
-        What it is called in words, unlike the others.
+        A unique name for display.
     result
         Folder of the result that it came from.
     opening
         How its recording was opened, as plain data.
     config
-        By which its frames are corrected and filtered, as plain data.
+        The configuration that corrects and filters its frames, as plain data.
     first, count
-        Index of the first frame of its recording, and how many that has: of the merged frames,
-        those from `first` to before `first + count` are of this session.
+        Its frames have the indices `first` to `first + count - 1` in the merged result.
     T_main_session
         (4, 4) from the world of its own result into this one's; None where it is not part of the
         main model.
@@ -203,31 +226,33 @@ class SessionRecord:
     T_main_session: Float64 | None
 
     def has(self, index: int) -> bool:
-        """Whether a frame is of this session."""
+        """Whether the frame with this index in the merged result is of this session."""
         return self.first <= index < self.first + self.count
 
 
 @dataclass(frozen=True)
 class SessionPair:
-    """Whether two sessions overlap, and how sure that is.
+    """Whether two sessions overlap, and the evidence for it.
 
     Attributes
     ----------
     a, b
         Numbers of the sessions; a < b.
     joined
-        Whether they are in one model; it may be by way of others.
+        Whether both are in the main model, directly or through other sessions.
     before
         Whether an earlier result had joined them.
     links
-        How many registrations between their views hold in the final model.
+        Number of registrations between their views in the final model.
     probability
-        That those which first joined the two are right, 0 to 1; None where others did.
+        Probability that the links which first joined the two are correct, 0 to 1; None where they
+        were joined through others.
     overlap
-        Share of the views of either that see surfaces which the other sees too, the smaller one.
+        Fraction of the views of either that see surfaces which the other sees too; the smaller of
+        the two.
     support
-        Share of what these say that supports the final poses and does not contradict them; None
-        where they don't overlap.
+        Fraction of their overlapping measurements that support the final poses, as opposed to
+        contradicting them; None where they don't overlap.
     """
 
     a: int
@@ -242,12 +267,14 @@ class SessionPair:
 
 @dataclass(frozen=True, eq=False)
 class SessionChange:
-    """A surface that is there in one of two sessions only.
+    """A surface that exists in only one of two sessions.
 
     Attributes
     ----------
     a, b
-        Numbers of the earlier and of the later session, as they were given.
+        Numbers of the earlier and of the later session, in the order in which they were given.
+    change
+        The surface.
     """
 
     a: int
@@ -256,9 +283,9 @@ class SessionChange:
 
 
 def in_main_model(record: FrameRecord, components: Sequence[Component]) -> bool:
-    """Say whether a frame has a pose in the main model, and not only in one of another component.
+    """Whether a frame has a pose in the main model, not only in that of another component.
 
-    Without components every pose is in it.
+    Without components every pose is in the main model.
     """
     if record.status not in ("tracked", "predicted"):
         return False
@@ -272,31 +299,37 @@ class Reconstruction:
     Attributes
     ----------
     trajectory
-        (N, 4, 4) T_world_camera of every frame read, NaN where it has none in the main model; the
-        first pose is the identity.
+        (N, 4, 4) T_world_camera of every frame, NaN where it has none in the main model; the first
+        pose is the identity.
     timestamps
         (N,) seconds.
     graph
         Vertices are frame indices.
     cloud
-        The fused model, in the world frame.
+        The fused point cloud, in the world frame.
+    diagnostics
+        The verdict and its evidence.
     mesh
         The fused surface, in the world frame; None for clouds without a camera.
     config
         The resolved configuration, as plain data.
     recording
-        path, format, frames and the reader's warnings, as plain data.
+        Its path, format, frames and the reader's warnings, as plain data.
+    seed
+        The random seed.
+    threads
+        The number of threads used.
     components
         Component 0 is the main one: trajectory, graph, cloud and mesh are of what is connected to
-        it. Empty where nothing looked for them.
+        it. Empty where the method does not separate components.
     sessions, session_pairs
-        The recordings of several results that were merged, and what connects each two of them;
-        empty for a run.
+        The recordings of a merged map, and the evidence that connects each two of them; empty for
+        a run.
     changes
-        What changed between two sessions in the main model, in its world.
+        Surfaces of the main model that changed between two sessions, in its world frame.
     up
-        (3,) unit vector against gravity in the world, as an accelerometer measured it; None without
-        one.
+        (3,) unit vector against gravity in the world frame, measured by an accelerometer; None
+        without one.
     """
 
     trajectory: Float64

@@ -24,7 +24,7 @@ from tofuse.report.images import viridis
 from tofuse.report.pictures import Pictures
 from tofuse.report.scene import RigCameras
 from tofuse.report.words import length
-from tofuse.results.folder import TILES, TILESET, is_result, settle
+from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.viewer.detail import OVERVIEW_FACES, chosen
 from tofuse.viewer.kept import read_kept
@@ -225,7 +225,7 @@ def read_result(folder: Path) -> Result:
     """
     if not folder.exists():
         raise InputError("doesn't exist", where=folder, remedy="give the --out of `tofuse run`")
-    settle(folder)
+    finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(
             "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"

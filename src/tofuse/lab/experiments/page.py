@@ -22,7 +22,7 @@ from tofuse.lab.experiments.cases import CASES, DRAWS, METHODS, CaseResult, Run,
 from tofuse.lab.experiments.peaks import AXES, SIGMAS_M, PeaksSweep, sweep_peaks
 from tofuse.lab.experiments.statements import Judged, Results, judge_all
 from tofuse.pipeline.progress import Progress, Silent
-from tofuse.results.folder import Contract, OutputFolder, json_of
+from tofuse.results.folder import Contract, OutputFolder, read_json_object
 from tofuse.results.output import plain
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def run_experiments(
 
 def is_experiments(folder: Path) -> bool:
     """Say whether a folder holds the result of earlier experiments."""
-    data = json_of(folder / _MARKER)
+    data = read_json_object(folder / _MARKER)
     return data is not None and data.get("kind") == KIND
 
 
