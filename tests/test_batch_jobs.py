@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from tofuse.batch.jobs import Job, parse_bytes, read_jobs
-from tofuse.cli.run_words import run_words
+from tofuse.cli.run_arguments import run_arguments
 from tofuse.errors import InputError
 
 
 def jobs_of(folder: Path, text: str, name: str = "list.txt") -> tuple[Job, ...]:
     path = folder / name
     path.write_text(text)
-    return read_jobs(path, run_words)
+    return read_jobs(path, run_arguments)
 
 
 @pytest.fixture
@@ -119,12 +119,12 @@ def test_bad_lists_are_refused(name: str, text: str, said: str, recordings: Path
 
 def test_unreadable_lists_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="doesn't exist"):
-        read_jobs(tmp_path / "none.txt", run_words)
+        read_jobs(tmp_path / "none.txt", run_arguments)
     with pytest.raises(InputError, match="is a folder"):
-        read_jobs(tmp_path, run_words)
+        read_jobs(tmp_path, run_arguments)
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is not text"):
-        read_jobs(tmp_path / "list.txt", run_words)
+        read_jobs(tmp_path / "list.txt", run_arguments)
 
 
 def test_a_key_tells_recordings_and_options_apart(tmp_path: Path) -> None:

@@ -146,7 +146,10 @@ def test_an_interrupted_batch_says_what_is_done(
     batch.send_signal(signal.SIGINT)
     _, said = batch.communicate(timeout=60)
     assert batch.returncode == 130
-    assert said == "tofuse: interrupted, 0 of 6 recordings are done; the same command goes on\n"
+    assert (
+        said
+        == "tofuse: interrupted, 0 of 6 recordings are done; run the same command again to resume\n"
+    )
 
 
 Started = AbstractContextManager[tuple[str, Callable[[], list[int]]]]

@@ -365,7 +365,7 @@ def test_dask_that_is_not_installed_is_named(tmp_path: Path, monkeypatch, capsys
         (["--workers", "0"], "0 is not 1 or more"),
         (["--workers", "1", "--scheduler", "x"], "not allowed with"),
         (["--memory", "much"], "no amount of memory"),
-        (["--only", "b"], "there is no job b"),
+        (["--only", "b"], "has no job b"),
         (["--wrkers=2"], "unknown option --wrkers (did you mean --workers?)"),
     ],
 )

@@ -207,7 +207,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["noise", str(tmp_path / "rec"), "--out", str(out), "--name", "mine"]) == 0
     text = capsys.readouterr().out
     assert "raw amplitude" in text
-    assert "mine, 4 frames in 1 still stretch" in text
+    assert "mine, 4 frames in 1 static segment" in text
     recording = open_recording(tmp_path / "rec")
     assert recording.warnings == []
     assert noise_model_for(recording) == NoiseModel.load(out)

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tofuse import cli
-from tofuse.cli import main, told
-from tofuse.cli.streams import Outlet, outlets
+from tofuse.cli import main, run_command
+from tofuse.cli.streams import SafeStream, safe_streams
 from tofuse.errors import Ended
 from tofuse.kernels import cores
 from tofuse.lab.simulation.record import simulate
@@ -92,20 +92,20 @@ class Broken:
 
 
 def test_an_outlet_never_fails(tmp_path: Path) -> None:
-    out = Outlet(Broken())  # type: ignore[arg-type]
+    out = SafeStream(Broken())  # type: ignore[arg-type]
     assert out.write("text") == 4
     out.writelines(["a", "b"])
     out.flush()
     assert isinstance(out.error, BrokenPipeError)
     assert out.encoding == "ascii"
-    assert Outlet(None).write("text") == 4
+    assert SafeStream(None).write("text") == 4
     with (tmp_path / "text").open("w", encoding="ascii") as file:
-        safe = Outlet(file)
+        safe = SafeStream(file)
         safe.write("s\xfcd\udcff")
         assert safe.error is None
     assert (tmp_path / "text").read_text() == "s\\xfcd\\udcff"
     before = sys.stdout
-    with pytest.raises(KeyError), outlets():
+    with pytest.raises(KeyError), safe_streams():
         raise KeyError
     assert sys.stdout is before
 
@@ -116,7 +116,7 @@ def test_an_outlet_never_fails(tmp_path: Path) -> None:
         (RuntimeError("can't start new thread"), 2, "--threads 1"),
         (ImportError("libx.so: cannot map"), 2, "can't be loaded (libx.so"),
         (MemoryError(), 2, "out of memory"),
-        (Ended(15), 143, "asked to end"),
+        (Ended(15), 143, "terminated"),
         (BrokenPipeError(32, "Broken pipe"), 2, "Broken pipe"),
     ],
 )
@@ -124,7 +124,7 @@ def test_what_stops_a_command_is_said_in_a_line(error, status, says, capfd) -> N
     def fail() -> int:
         raise error
 
-    assert told(fail) == status
+    assert run_command(fail) == status
     said = capfd.readouterr().err
     assert says in said
     assert said.count("\n") == 1
@@ -134,21 +134,21 @@ def test_a_fault_of_ours_is_a_line_too_and_can_be_seen(capfd, monkeypatch) -> No
     def fail() -> int:
         raise ZeroDivisionError("in\nsome depth")
 
-    assert cli.faults_told(fail) == 1
-    assert capfd.readouterr().err.startswith("tofuse: a fault of the program (ZeroDivisionError: ")
+    assert cli.report_bugs(fail) == 1
+    assert capfd.readouterr().err.startswith("tofuse: bug in the program (ZeroDivisionError: ")
     monkeypatch.setenv("TOFUSE_TRACEBACK", "1")
     with pytest.raises(ZeroDivisionError):
-        cli.faults_told(fail)
+        cli.report_bugs(fail)
 
 
-@pytest.mark.parametrize("place", ["prepare_process", "faults_told"])
+@pytest.mark.parametrize("place", ["prepare_process", "report_bugs"])
 def test_an_interruption_before_the_command_is_a_line_too(place, capfd, monkeypatch) -> None:
     def interrupted(*_args: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, place, interrupted)
     assert cli.console() == 130
-    assert capfd.readouterr().err == f"tofuse: interrupted; {cli._WHOLE}\n"
+    assert capfd.readouterr().err == f"tofuse: interrupted; {cli._UNCHANGED}\n"
 
 
 def test_signals_that_are_ignored_stay_so(tmp_path: Path) -> None:

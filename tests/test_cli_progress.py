@@ -67,15 +67,15 @@ def test_health_tells_of_the_newest_frame_and_of_what_was_lost() -> None:
         ("skipped", None),
         ("tracked", None),
     ):
-        health.see(FrameRecord(0, 0.0, status, inlier_share=share))
+        health.update(FrameRecord(0, 0.0, status, inlier_share=share))
         seen.append(health.markup)
     assert seen == [
-        "[green]97% fits[/]",
-        "[yellow]60% fits[/]",
+        "[green]97% inliers[/]",
+        "[yellow]60% inliers[/]",
         "[red]lost for 1 frame[/]",
         "[red]lost for 2 frames[/]",
-        "[green]90% fits[/], 2 without a pose",
-        "[yellow]guessing[/], 2 without a pose",
+        "[green]90% inliers[/], 2 without a pose",
+        "[yellow]predicting[/], 2 without a pose",
         "[yellow]unreadable[/], 3 without a pose",
         "[green]tracking[/], 3 without a pose",
     ]
@@ -162,7 +162,7 @@ def test_a_terminal_shows_stages_and_is_clean_afterwards(columns: int) -> None:
     assert any(re.match(r"  tracking .*\d+/40", line) for line in lines)
     assert any(re.match(r"\u2713 tracking ", line) for line in lines)
     assert any(line.startswith("  refining") for line in lines)
-    health = "93% fits, 1 without a pose" if columns == 100 else "93%"
+    health = "93% inliers, 1 without a pose" if columns == 100 else "93%"
     pattern = rf"\d/40 +\d+\.\d/s, \d+\.\d s left +{health}"
     assert any(re.search(pattern, line) for line in lines), lines
     # What was shown is wiped out line by line before the last word.

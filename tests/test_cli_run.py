@@ -604,7 +604,7 @@ def test_a_killed_run_changes_nothing(how, room_recording, tmp_path) -> None:
         _, said = job.communicate(timeout=120)
         if how == signal.SIGINT:
             assert job.returncode == 130
-            assert said == f"tofuse: interrupted; {cli._WHOLE}\n"
+            assert said == f"tofuse: interrupted; {cli._UNCHANGED}\n"
     found = contents(out)
     # A process that was killed can't take its own things away; the next run does.
     left = set() if how == signal.SIGINT else {STAGING, LOCK}

@@ -25,7 +25,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import upright
 from tofuse.geometry import se3
 from tofuse.results import tiles
-from tofuse.results.folder import STAGING, OutputFolder, settle
+from tofuse.results.folder import STAGING, OutputFolder, finish_interrupted
 from tofuse.results.output import write_result
 from tofuse.results.tiles import TilingSummary, is_tiles, write_tiles
 from tofuse.results.types import Component
@@ -392,7 +392,7 @@ def test_moves_that_were_stopped_are_finished_with_all_tiles(
     with pytest.raises(OutputError):
         write_result(second, OutputFolder(out, overwrite=True))
     monkeypatch.setattr(os, "replace", move)
-    settle(out)
+    finish_interrupted(out)
     assert sorted(contents(out).items()) == before
     write_result(second, OutputFolder(out, overwrite=True))
     assert is_tiles(out / "component-1" / "tiles")

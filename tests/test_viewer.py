@@ -302,7 +302,7 @@ def test_command_serves_until_it_is_interrupted(folder):
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
         lines = [p.stderr.readline(), p.stderr.readline()]
         assert re.fullmatch(r"see http://127\.0\.0\.1:\d+\n", lines[0])
-        assert lines[1] == "Ctrl-C ends the page\n"
+        assert lines[1] == "press Ctrl-C to stop\n"
         p.send_signal(signal.SIGINT)
         out, err = p.communicate(timeout=60)
     assert (p.returncode, out, err) == (0, "", "")

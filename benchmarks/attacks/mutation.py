@@ -195,7 +195,7 @@ def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, descriptions, results, states."""
     from tofuse.batch.jobs import read_jobs
     from tofuse.calibration.lens_files import read_lens_file
-    from tofuse.cli.batching import run_words
+    from tofuse.cli.batching import run_arguments
     from tofuse.files.arrays import read_npz, write_npz
     from tofuse.files.pose import read_pose
     from tofuse.files.tables import read_columns
@@ -261,7 +261,7 @@ def _small() -> dict[str, Subject]:
         "loops": ("loops.txt", "0 3 0 0 0 0 0 0 1\n1 2\n", read_loops),
         "columns": ("imu.csv", "t,ax,ay\n" + "0.1,1,2\n" * 5, read_columns),
         "config": ("a.toml", toml, configure),
-        "jobs": ("a.toml", jobs, lambda path: read_jobs(path, run_words)),
+        "jobs": ("a.toml", jobs, lambda path: read_jobs(path, run_arguments)),
         "noise.json": ("noise.json", json.dumps(noise), NoiseModel.load),
     }  # fmt: skip
     found = {}

@@ -26,7 +26,7 @@ _BESIDE = ("camera.json", "rays.npy", "correction.npz")
 _UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "t": 1000**4}
 _BINARY = {"ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30, "ti": 1 << 40}
 
-RunWords = Callable[[Mapping[str, str], Path, str], tuple[str, ...]]
+RunArguments = Callable[[Mapping[str, str], Path, str], tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class _Row:
     options: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_jobs(path: Path, run_words: RunWords) -> tuple[Job, ...]:
+def read_jobs(path: Path, run_arguments: RunArguments) -> tuple[Job, ...]:
     """Read a list of jobs: by its suffix a table (.csv, .toml), else text of one path a line.
 
     Relative paths count from the list's folder. A recording that comes twice with the same options
@@ -91,7 +91,7 @@ def read_jobs(path: Path, run_words: RunWords) -> tuple[Job, ...]:
 
     Parameters
     ----------
-    run_words
+    run_arguments
         Turns the options of a row into words of `tofuse run`; given also what relative paths count
         from, and the place to name in errors.
 
@@ -110,7 +110,7 @@ def read_jobs(path: Path, run_words: RunWords) -> tuple[Job, ...]:
         options = dict(row.options)
         name, memory = options.pop("name", ""), options.pop("memory", "")
         wanted = _bytes_of(memory, row.where) if memory else None
-        words = run_words(options, base, row.where)
+        words = run_arguments(options, base, row.where)
         found = _matches(row, base)
         if name and len(found) > 1:
             raise InputError(

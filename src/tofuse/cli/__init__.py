@@ -2,9 +2,8 @@
 
 Exit status: 0, a result was written and every readable frame has a pose; 3, a result was written
 but some readable frame has none; 2, nothing was written: one line on stderr says why. Of
-`register`: 0, the pose is believed; 3, it is not, or cannot be verified. A command that is asked to
-end by a signal has the status of that (130, 143), one that only prints and is not read, 141, and 1
-is a fault of the program.
+`register`: 0, the pose is believed; 3, it is not, or cannot be verified. Terminated by a signal:
+130 or 143; output to a closed pipe: 141; a bug in the program: 1.
 """
 
 from __future__ import annotations
@@ -17,46 +16,45 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-_NOT_READ = 128 + 13  # what a process has that a broken pipe ended
-_WHOLE = "existing files are unchanged, or the new result is complete"
-_INTERRUPTED = f"interrupted; {_WHOLE}"
+_BROKEN_PIPE = 128 + 13  # as if terminated by SIGPIPE
+_UNCHANGED = "existing files are unchanged, or the new result is complete"
+_INTERRUPTED = f"interrupted; {_UNCHANGED}"
 _MEMORY = "out of memory; use --every, --max-depth or a larger voxel_m"
 
 
 def console() -> int:
-    """Run the command of this process, which ends with it, and return its exit status."""
+    """Run the command of this process and return its exit status."""
     try:
         prepare_process()
         with ended_by_signals():
-            status = faults_told(main)
-        # Else all that is left is looked through for cycles once more, which takes half a second.
+            status = report_bugs(main)
+        # Avoids a last garbage collection at exit, which takes half a second.
         gc.freeze()
     except KeyboardInterrupt:  # before the command began, or after it ended
-        _say(_INTERRUPTED)
+        _print_error(_INTERRUPTED)
         return 130
     return status
 
 
 def prepare_process() -> None:
-    """Set what libraries look at when they are loaded."""
-    # Our threads do the work, and BLAS is held to one anyway; the memory that it sets aside for
-    # others is more than all else, and without enough of it they wait for ever.
+    """Set environment variables that libraries read when they are loaded."""
+    # BLAS is limited to one thread anyway, but reserves memory for more; if that fails, it hangs.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Let what asks this process to end be an exception, so that all is put in order first."""
+    """Turn termination signals into exceptions, so that files are cleaned up."""
     from tofuse.errors import Ended
 
     def end(number: int, _frame: object) -> None:
         raise Ended(number)
 
-    names = ("SIGTERM", "SIGHUP", "SIGBREAK")  # which of them there are depends on the system
+    names = ("SIGTERM", "SIGHUP", "SIGBREAK")  # as far as the system has them
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    here = threading.current_thread() is threading.main_thread()
-    # What is ignored (by nohup) stays so. Only the first thread may change any of it.
-    wanted = [n for n in numbers if here and signal.getsignal(n) == signal.SIG_DFL]
+    is_main = threading.current_thread() is threading.main_thread()
+    # Signals that are ignored (nohup) stay ignored. Only the main thread may set handlers.
+    wanted = [n for n in numbers if is_main and signal.getsignal(n) == signal.SIG_DFL]
     before = {number: signal.signal(number, end) for number in wanted}
     try:
         yield
@@ -65,16 +63,16 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def faults_told(command: Callable[[], int]) -> int:
-    """Return the exit status of a command; a fault of the program is said in a line as well."""
+def report_bugs(command: Callable[[], int]) -> int:
+    """Return the exit status of a command; a bug in the program is reported in one line."""
     try:
         return command()
     except Exception as error:
         if os.environ.get("TOFUSE_TRACEBACK"):
             raise
-        _say(
-            f"a fault of the program ({type(error).__name__}: {error}); please report it, with "
-            "what it says when TOFUSE_TRACEBACK=1 is set"
+        _print_error(
+            f"bug in the program ({type(error).__name__}: {error}); please report it, with the "
+            "traceback that TOFUSE_TRACEBACK=1 prints"
         )
         return 1
 
@@ -88,27 +86,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         try:
             arguments = make_parser().parse_args(argv)
-        except SystemExit as stop:  # it has said what was asked for, or what is wrong
-            raise SystemExit(_delivered(int(stop.code or 0), None)) from None
+        except SystemExit as stop:  # help or an error has been printed
+            raise SystemExit(_status_after_output(int(stop.code or 0), None)) from None
         check_machine(getattr(arguments, "threads", None))
         status: int = arguments.command(arguments)
-        return _delivered(status, getattr(arguments, "out", None))
+        return _status_after_output(status, getattr(arguments, "out", None))
 
-    return told(command)
+    return run_command(command)
 
 
-def _delivered(status: int, out: object) -> int:
-    """The status of a command that ended, if all that it printed could be written."""
+def _status_after_output(status: int, out: object) -> int:
+    """The exit status of a finished command, after its output was flushed."""
     sys.stdout.flush()
     error = getattr(sys.stdout, "error", None)
     if error is None:
         return status
     if out is not None:
-        _say(f"not all could be printed ({_why(error)}); what was asked for is in {out}")
+        _print_error(f"some output could not be printed ({_why(error)}); the result is in {out}")
         return status
     if isinstance(error, BrokenPipeError):
-        return _NOT_READ
-    _say(f"standard output: can't be written ({_why(error)})")
+        return _BROKEN_PIPE
+    _print_error(f"standard output: can't be written ({_why(error)})")
     return 2
 
 
@@ -116,45 +114,45 @@ def _why(error: Exception) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
-def _say(text: str) -> None:
+def _print_error(text: str) -> None:
     print("tofuse: " + " ".join(text.split()), file=sys.stderr)
 
 
-def told(command: Callable[[], int]) -> int:
-    """Return the exit status of a command; what stops it is said in a line."""
-    from tofuse.cli.streams import outlets
+def run_command(command: Callable[[], int]) -> int:
+    """Return the exit status of a command; errors are printed in one line."""
+    from tofuse.cli.streams import safe_streams
     from tofuse.errors import Ended, TofuseError
 
-    with outlets():
+    with safe_streams():
         try:
             return command()
         except TofuseError as error:
-            _say(str(error))
+            _print_error(str(error))
             return 2
         except KeyboardInterrupt:
-            _say(_INTERRUPTED)
+            _print_error(_INTERRUPTED)
             return 130
         except Ended as error:
-            _say(f"asked to end; {_WHOLE}")
+            _print_error(f"terminated; {_UNCHANGED}")
             return 128 + error.number
         except OSError as error:
-            # What the rooms have not turned into a message of their own.
+            # Not converted to a TofuseError where it occurred.
             where = f"{error.filename}: " if error.filename else ""
-            _say(f"{where}{error.strerror or error}")
+            _print_error(f"{where}{error.strerror or error}")
             return 2
         except MemoryError:
-            _say(_MEMORY)
+            _print_error(_MEMORY)
             return 2
         except RecursionError:
-            _say("something that was given is nested too deeply to be understood; check the files")
+            _print_error("an input file is nested too deeply; check the files")
             return 2
         except RuntimeError as error:
             if "start new thread" not in str(error):
                 raise
-            _say("no more threads can be started; use --threads 1, or allow more (ulimit -u)")
+            _print_error("can't start more threads; use --threads 1, or allow more (ulimit -u)")
             return 2
         except ImportError as error:
-            _say(
+            _print_error(
                 f"a part of the program can't be loaded ({error}); is it installed whole, and is "
                 "there enough memory, and enough file handles (ulimit -n)?"
             )

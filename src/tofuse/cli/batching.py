@@ -1,4 +1,4 @@
-"""``tofuse batch``: from the words of the command line to what is said in the end."""
+"""``tofuse batch``: from the arguments of the command line to the summary."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from difflib import get_close_matches
 
-from rich.console import Console
-
 from tofuse.batch.batch import pending, run_batch, status_of
 from tofuse.batch.folder import BatchFolder, Record
 from tofuse.batch.jobs import Job, read_jobs
 from tofuse.batch.table import write_table
 from tofuse.batch.workers import LocalWorkers, Workers
 from tofuse.cli.progress import emit, progress_for
-from tofuse.cli.run_words import run_words
+from tofuse.cli.run_arguments import run_arguments
 from tofuse.errors import Ended, InputError, TofuseError
 from tofuse.kernels.cores import usable_cores
 
 _RETRIES = 3
-_TOLD = 10  # recordings without a result, that are named in the end
+_MAX_LISTED = 10  # recordings without a result that the summary names
 
 
 def batch(arguments: argparse.Namespace) -> int:
-    """Do all jobs that are not done, and say what came out."""
-    jobs = read_jobs(arguments.list, run_words)
+    """Do all pending jobs, and print a summary."""
+    jobs = read_jobs(arguments.list, run_arguments)
     jobs = tuple(replace(j, memory=j.memory or arguments.memory) for j in jobs)
     chosen = _chosen(jobs, arguments)
     folder = BatchFolder(arguments.out.absolute())
@@ -41,17 +39,20 @@ def batch(arguments: argparse.Namespace) -> int:
         write_table(jobs, folder)  # the list may have changed
     else:
         try:
-            _work(arguments, jobs, left, folder)
+            _run(arguments, jobs, left, folder)
         except (KeyboardInterrupt, Ended) as error:
             done = sum(r is not None and r.state == "done" for r in map(folder.record, chosen))
-            words = f"{done} of {len(chosen)} recordings are done; the same command goes on"
-            print(f"tofuse: interrupted, {words}", file=sys.stderr)
+            print(
+                f"tofuse: interrupted, {done} of {len(chosen)} recordings are done; run the same "
+                "command again to resume",
+                file=sys.stderr,
+            )
             return 128 + error.number if isinstance(error, Ended) else 130
         except TofuseError as error:
             if status_of(chosen, folder) == 2:
                 raise
-            print(f"tofuse: {error}", file=sys.stderr)  # there are results, so this is no 2
-    return _tell(chosen, folder, as_json=arguments.json)
+            print(f"tofuse: {error}", file=sys.stderr)  # there are results: status 3, not 2
+    return _print_summary(chosen, folder, as_json=arguments.json)
 
 
 def _chosen(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
@@ -63,7 +64,7 @@ def _chosen(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
         if name not in names:
             near = get_close_matches(name, names, 1)
             raise InputError(
-                f"there is no job {name} in {arguments.list}",
+                f"{arguments.list} has no job {name}",
                 where="--only",
                 remedy=f"did you mean {near[0]}?" if near else "see --print-jobs",
             )
@@ -71,16 +72,16 @@ def _chosen(jobs: Sequence[Job], arguments: argparse.Namespace) -> list[Job]:
 
 
 def _command_line(arguments: argparse.Namespace, job: Job) -> str:
-    """A command that does one job alone, from any folder."""
-    words = ["tofuse", "batch", str(arguments.list.absolute())]
-    words += ["--out", str(arguments.out.absolute()), "--only", job.name]
+    """A command that does a single job, from any folder."""
+    command = ["tofuse", "batch", str(arguments.list.absolute())]
+    command += ["--out", str(arguments.out.absolute()), "--only", job.name]
     for option in ("threads", "retries"):
         value = getattr(arguments, option)
-        words += [] if value is None else [f"--{option}", str(value)]
-    return shlex.join([*words, *(["--overwrite"] if arguments.overwrite else [])])
+        command += [] if value is None else [f"--{option}", str(value)]
+    return shlex.join([*command, *(["--overwrite"] if arguments.overwrite else [])])
 
 
-def _work(
+def _run(
     arguments: argparse.Namespace, jobs: Sequence[Job], left: Sequence[Job], folder: BatchFolder
 ) -> None:
     workers, threads = _workers(arguments, len(left))
@@ -109,19 +110,19 @@ def _work(
 
 
 def _workers(arguments: argparse.Namespace, jobs: int) -> tuple[Workers, int]:
-    """Who works, and with how many threads each job."""
+    """The workers, and the number of threads of each job."""
     if arguments.scheduler is not None:
         from tofuse.batch.cluster import DaskWorkers
 
-        # A worker has as many threads as it may use cores, and each of them does a job.
+        # A worker has a thread per core that it may use, and each thread does one job.
         return DaskWorkers(arguments.scheduler), arguments.threads or 1
     count = min(arguments.workers or 1, jobs)
     return LocalWorkers(count), arguments.threads or max(1, usable_cores() // count)
 
 
-def _tell(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
-    """Say in a few lines what came out, and return the exit status."""
-    from tofuse.cli.commands import COLORS
+def _print_summary(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
+    """Print a summary, and return the exit status."""
+    from tofuse.cli.commands import VERDICT_COLORS, make_console
 
     records = {job.name: folder.record(job) for job in chosen}
     verdicts = Counter(r.verdict for r in records.values() if r is not None and r.state == "done")
@@ -144,15 +145,17 @@ def _tell(chosen: Sequence[Job], folder: BatchFolder, *, as_json: bool) -> int:
             }
         )
         return status
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     counts = [
-        f"[{COLORS[v]}]{verdicts[v]} {v}[/]" for v in ("good", "degraded", "failed") if verdicts[v]
+        f"[{VERDICT_COLORS[v]}]{verdicts[v]} {v}[/]"
+        for v in ("good", "degraded", "failed")
+        if verdicts[v]
     ]
-    said = f": {', '.join(counts)}" if counts else ""
-    console.print(f"{done} of {len(chosen)} recordings have a result{said}")
-    for name, reason in list(failed.items())[:_TOLD]:
+    verdict_counts = f": {', '.join(counts)}" if counts else ""
+    console.print(f"{done} of {len(chosen)} recordings have a result{verdict_counts}")
+    for name, reason in list(failed.items())[:_MAX_LISTED]:
         console.print(f"  {name}: {reason}", markup=False)
-    if len(failed) > _TOLD:
-        console.print(f"  and {len(failed) - _TOLD} others have none")
+    if len(failed) > _MAX_LISTED:
+        console.print(f"  and {len(failed) - _MAX_LISTED} more")
     console.print(f"see {folder.html}", markup=False)
     return status

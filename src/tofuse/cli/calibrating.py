@@ -1,4 +1,4 @@
-"""``tofuse calibrate``: what each subject does, and how it is told in a few lines."""
+"""``tofuse calibrate``: its subjects, and their summaries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.calibration.depth import calibrate_depth, composed
 from tofuse.calibration.lens import calibrate_lens
 from tofuse.calibration.lens_files import read_lens_file
 from tofuse.calibration.plane_views import board_planes, scene_planes
-from tofuse.cli.inputs import selected
+from tofuse.cli.open_input import open_selection
 from tofuse.errors import InputError
 from tofuse.files.atomic import make_folder, replacing
 from tofuse.geometry.cameras import Pinhole, RayTable
@@ -22,25 +22,25 @@ from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.depth_correction import DepthCorrection
 
-# What a subject gives: data for JSON, lines to print, and warnings.
-Told = tuple[dict[str, Any], list[str], list[str]]
-_NAMED = 8
-_MOST_PLANES = 20
+# Data for JSON, lines to print, and warnings.
+Summary = tuple[dict[str, Any], list[str], list[str]]
+_MAX_LISTED = 8
+_MAX_PLANES = 20
 
 
-def lens(arguments: argparse.Namespace) -> Told:
+def lens(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate lens``."""
     board = _board(arguments)
-    recording = selected(arguments)
+    recording = open_selection(arguments)
     fit = calibrate_lens(recording, board, arguments.model, arguments.image)
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
-        f"{len(fit.views)} views, corners missed by {fit.rms_px:.3f} px rms (by the lens that the "
-        f"recording came with: {fit.before_px:.3f})"
+        f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px rms (with the recording's "
+        f"own intrinsics: {fit.before_px:.3f})"
     )
-    lines += [f"left out: frame {frame} {why}" for frame, why in fit.left_out[:_NAMED]]
-    if len(fit.left_out) > _NAMED:
-        lines.append(f"left out: {len(fit.left_out) - _NAMED} more frames (--json names all)")
+    lines += [f"left out: frame {frame} {why}" for frame, why in fit.left_out[:_MAX_LISTED]]
+    if len(fit.left_out) > _MAX_LISTED:
+        lines.append(f"left out: {len(fit.left_out) - _MAX_LISTED} more frames (--json lists all)")
     if arguments.out is not None:
         about = recording_fields(recording)
         write_camera_json(arguments.out, fit.camera, about, overwrite=arguments.overwrite)
@@ -48,29 +48,29 @@ def lens(arguments: argparse.Namespace) -> Told:
     return fit.to_dict(), lines, list(fit.warnings)
 
 
-def depth(arguments: argparse.Namespace) -> Told:
+def depth(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate depth``."""
-    recording = selected(arguments)
+    recording = open_selection(arguments)
     earlier = _earlier_correction(arguments, recording)
     if arguments.board is not None:
         board = Board.parse(arguments.board)
         views, camera = board_planes(recording, board, arguments.image, wall=arguments.wall)
     else:
         if arguments.wall:
-            raise InputError("needs a board on it", where="--wall", remedy="give --board too")
-        if arguments.planes > _MOST_PLANES:
+            raise InputError("requires --board", where="--wall", remedy="pass --board as well")
+        if arguments.planes > _MAX_PLANES:
             raise InputError(
-                f"is {arguments.planes}", where="--planes", remedy=f"give {_MOST_PLANES} at most"
+                f"is {arguments.planes}", where="--planes", remedy=f"use at most {_MAX_PLANES}"
             )
         views, camera = scene_planes(recording, arguments.planes, arguments.seed or 0)
     fit = calibrate_depth(views, camera, recording.path)
     low, high = fit.range_m
     lines = [
         f"{fit.planes} planes in {fit.frames} frames, {low:.2f} to {high:.2f} m",
-        f"distance of pixels from the planes {1000 * fit.before_m:.1f} mm, "
-        f"corrected {1000 * fit.after_m:.1f} mm (noise included)",
-        f"of patches of pixels {1000 * fit.bias_before_m:.1f} mm, "
-        f"corrected {1000 * fit.bias_after_m:.1f} mm",
+        f"rms distance of pixels from the planes: {1000 * fit.before_m:.1f} mm, corrected "
+        f"{1000 * fit.after_m:.1f} mm (including noise)",
+        f"systematic part (means of patches): {1000 * fit.bias_before_m:.1f} mm, corrected "
+        f"{1000 * fit.bias_after_m:.1f} mm",
         f"constant offset known to {1000 * fit.constant_sigma_m:.1f} mm, scale to "
         f"{100 * fit.scale_sigma:.2f} %",
     ]
@@ -81,7 +81,7 @@ def depth(arguments: argparse.Namespace) -> Told:
             whole.save(part)
         lines.append(f"written to {arguments.out}")
         if earlier is not None:
-            lines.append("it holds the correction that the recording had before, too")
+            lines.append("it includes the correction that the recording already had")
     return fit.to_dict(), lines, list(fit.warnings)
 
 
@@ -94,23 +94,23 @@ def _earlier_correction(
     own = Path(recording.path) / "correction.npz"
     if len(arguments.inputs) != 1 or not own.is_file():
         raise InputError(
-            "is corrected already, each part by its own",
+            "is already corrected, each input by its own correction",
             where=recording.path,
-            remedy="give one folder, or move its correction.npz away",
+            remedy="pass one folder, or move its correction.npz away",
         )
     return read_correction(own)
 
 
-def import_lens(arguments: argparse.Namespace) -> Told:
+def import_lens(arguments: argparse.Namespace) -> Summary:
     """``tofuse calibrate import``."""
     if len(arguments.inputs) != 1:
-        raise InputError("takes one file", where="calibrate import", remedy="give one INPUT")
+        raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
     found = read_lens_file(arguments.inputs[0], arguments.index)
     about: dict[str, Any] = {}
     warnings = list(found.warnings)
     if arguments.recording is None:
         warnings.append(
-            "depth is taken for z in mm; give --recording to keep what a recording says"
+            "depth is assumed to be z in mm; pass --recording to take it from a recording"
         )
     else:
         recording = open_recording(arguments.recording)
@@ -134,7 +134,7 @@ def _board(arguments: argparse.Namespace) -> Board:
         raise InputError(
             "is missing",
             where="--board",
-            remedy="give inner corners and metres of a square, such as 8x6:0.1",
+            remedy="pass inner corners and square size in metres, e.g. 8x6:0.1",
         )
     return Board.parse(arguments.board)
 
@@ -142,6 +142,6 @@ def _board(arguments: argparse.Namespace) -> Board:
 def _number(camera: Pinhole, name: str, sigma: float | None) -> str:
     value = getattr(camera, name)
     if sigma is None:
-        return f"{name} {value:.6g} (held)"
+        return f"{name} {value:.6g} (fixed)"
     digits = 2 if name in ("fx", "fy", "cx", "cy") else 5
     return f"{name} {value:.{digits}f} +- {sigma:.{digits}f}"

@@ -1,4 +1,4 @@
-"""What each command does. Heavy imports happen here, when a command runs."""
+"""The commands. Heavy imports happen in the functions, when a command runs."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.table import Table
@@ -24,13 +25,37 @@ from tofuse.cli.progress import (
 from tofuse.results.types import Reason, Reconstruction
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from viser import ViserServer
 
     from tofuse.pipeline.run import Options
 
-_SEVERITIES = {"severe": "red", "warning": "yellow", "note": "cyan"}
-_BELIEFS = {True: "green", False: "red", None: "yellow"}
-COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
+_Options = TypeVar("_Options", bound="DataclassInstance")
+
+_SEVERITY_COLORS = {"severe": "red", "warning": "yellow", "note": "cyan"}
+_BELIEF_COLORS = {True: "green", False: "red", None: "yellow"}
+VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
+
+
+def from_arguments(kind: type[_Options], arguments: argparse.Namespace, **others: Any) -> _Options:
+    """Make a dataclass of options from the arguments with the names of its fields.
+
+    Fields without an argument keep their defaults; `others` override both.
+    """
+    names = [f.name for f in fields(kind) if hasattr(arguments, f.name)]
+    return kind(**{name: getattr(arguments, name) for name in names} | others)
+
+
+def make_console() -> Console:
+    """Return a console for results on standard output, without wrapping or highlighting."""
+    return Console(highlight=False, soft_wrap=True)
+
+
+def _progress_unless_json(
+    arguments: argparse.Namespace,
+) -> AbstractContextManager[TerminalProgress | JsonProgress | QuietProgress | None]:
+    """The progress of a command whose --json prints a single object."""
+    return nullcontext() if arguments.json else progress_for(as_json=False)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -54,51 +79,25 @@ def run(arguments: argparse.Namespace) -> int:
         return _run_in_view(arguments, options)
     for given, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
         if given:
-            raise InputError("is only for --view", where=name, remedy="give --view as well")
-    with _working(arguments) as progress:
+            raise InputError("requires --view", where=name, remedy="pass --view as well")
+    with _run_progress(arguments) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
-    tell(result, arguments.out, as_json=arguments.json)
+    print_result(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
 
 
 def run_options(arguments: argparse.Namespace) -> Options:
-    """What the words of ``tofuse run`` ask for."""
+    """Return the options of ``tofuse run``."""
     from tofuse.pipeline.run import Options
 
-    return Options(
-        out=arguments.out,
-        method=arguments.method,
-        config=arguments.config,
-        camera=arguments.camera,
-        topic=arguments.topic,
-        format=arguments.format,
-        seed=arguments.seed,
-        threads=arguments.threads,
-        start=arguments.start,
-        end=arguments.end,
-        every=arguments.every,
-        average_still=arguments.average_still,
-        min_depth=arguments.min_depth,
-        max_depth=arguments.max_depth,
-        guess=arguments.guess,
-        prior=arguments.prior,
-        loops=arguments.loops,
-        object=arguments.object,
-        unwrap=arguments.unwrap,
-        tolerance=arguments.tolerance,
-        texture=arguments.texture,
-        faces=arguments.faces,
-        voxel=arguments.voxel,
-        memory=arguments.memory,
-        overwrite=arguments.overwrite,
-    )
+    return from_arguments(Options, arguments)
 
 
 @contextmanager
-def _working(
+def _run_progress(
     arguments: argparse.Namespace,
 ) -> Iterator[TerminalProgress | JsonProgress | QuietProgress]:
-    """Progress of a run, whose pieces of work go to a cluster if one is named."""
+    """Show the progress of a run; with --scheduler, distribute its work to the cluster."""
     with progress_for(as_json=arguments.json) as progress:
         if arguments.scheduler is None:
             yield progress
@@ -114,7 +113,7 @@ def _working(
 
 
 def _run_into(arguments: argparse.Namespace, options: Options) -> int:
-    """Run, then merge the result into an earlier one, which stays as it was if that fails."""
+    """Run, then merge the result into an earlier one, which stays unchanged if that fails."""
     from tofuse.errors import InputError
     from tofuse.pipeline.merging import MergeOptions, check_result, merge_files
     from tofuse.pipeline.run import exit_status
@@ -122,13 +121,15 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
 
     into = arguments.into
     if arguments.view:
-        raise InputError("does not go with --into", where="--view", remedy="view the result later")
+        raise InputError(
+            "can't be combined with --into", where="--view", remedy="view the result afterwards"
+        )
     if into.resolve() == options.out.resolve():
-        raise InputError("is --out as well", where="--into", remedy="give two folders")
+        raise InputError("is the same folder as --out", where="--into", remedy="use two folders")
     check_result(into)  # before hours of work
-    with _working(arguments) as progress:
+    with _run_progress(arguments) as progress:
         result = run_pipeline(arguments.inputs, options, progress)
-    tell(result, options.out, as_json=arguments.json)
+    print_result(result, options.out, as_json=arguments.json)
     map_options = MergeOptions(
         into,
         overwrite=True,
@@ -140,9 +141,9 @@ def _run_into(arguments: argparse.Namespace, options: Options) -> int:
         texture=options.texture,
         only_joined=True,
     )
-    with _working(arguments) as progress:
+    with _run_progress(arguments) as progress:
         merged = merge_files([into, options.out], map_options, progress)
-    tell(merged, into, as_json=arguments.json)
+    print_result(merged, into, as_json=arguments.json)
     return exit_status(merged)
 
 
@@ -155,15 +156,15 @@ def _run_rig(arguments: argparse.Namespace, options: Options) -> int:
     for name in ("view", "into", "loops", "guess", "object", "average_still", "camera", "topic"):
         if getattr(arguments, name):
             option = f"--{name.replace('_', '-')}"
-            raise InputError("means nothing for a rig", where=option, remedy="leave it out")
-    with _working(arguments) as progress:
+            raise InputError("can't be used with a rig", where=option, remedy="leave it out")
+    with _run_progress(arguments) as progress:
         found = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
-    tell(found.result, arguments.out, as_json=arguments.json)
+    print_result(found.result, arguments.out, as_json=arguments.json)
     return exit_status(found.result)
 
 
 def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
-    """Run, with the model growing in the browser; then show the result until Ctrl-C."""
+    """Run and show the reconstruction live; then show the result until Ctrl-C."""
     from tofuse.pipeline.progress import Both
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
@@ -171,9 +172,9 @@ def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
 
     with _page(arguments) as server:
         live = LiveView(server)
-        with _working(arguments) as progress:
+        with _run_progress(arguments) as progress:
             result = run_pipeline(arguments.inputs, options, Both(progress, live))
-        tell(result, arguments.out, as_json=arguments.json)
+        print_result(result, arguments.out, as_json=arguments.json)
         live.finish(arguments.out)
         _wait()
     return exit_status(result)
@@ -193,7 +194,7 @@ def view(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _page(arguments: argparse.Namespace) -> Iterator[ViserServer]:
-    """Serve a page, say where, and open it in the browser."""
+    """Serve a page, print its address, and open it in the browser."""
     import webbrowser
 
     from tofuse.viewer.server import address, serve, stop
@@ -210,9 +211,9 @@ def _page(arguments: argparse.Namespace) -> Iterator[ViserServer]:
 
 def _wait() -> None:
     """Wait for Ctrl-C."""
-    with _interrupted() as asked:
-        print("Ctrl-C ends the page", file=sys.stderr, flush=True)
-        while not asked.wait(0.5):
+    with _stop_on_signal() as stopped:
+        print("press Ctrl-C to stop", file=sys.stderr, flush=True)
+        while not stopped.wait(0.5):
             pass
 
 
@@ -231,29 +232,19 @@ def register(arguments: argparse.Namespace) -> int:
     from tofuse.results.pair import pair_json
 
     _check_overwrite(arguments)
-    options = PairOptions(
-        guess=arguments.guess,
-        out=arguments.out,
-        overwrite=arguments.overwrite,
-        format=arguments.format,
-        camera=arguments.camera,
-        topic=arguments.topic,
-        threads=arguments.threads,
-    )
-    # With --json only the one object is printed.
-    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+    options = from_arguments(PairOptions, arguments)
+    with _progress_unless_json(arguments) as progress:
         result = register_files(arguments.source, arguments.target, options, progress)
     if arguments.json:
         emit({**pair_json(result), "out": None if options.out is None else str(options.out)})
         return exit_status(result)
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     head, tail = belief(result)
-    color = _BELIEFS[result.found.believed]
+    color = _BELIEF_COLORS[result.found.believed]
     console.print(f"[bold {color}]{head.lower()}[/]" + (f": {_escape(tail)}" if tail else ""))
     for line in registering.text(result):
         console.print(line, markup=False)
-    for warning in pair_json(result)["warnings"]:
-        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    _print_warnings(console, pair_json(result)["warnings"])
     if options.out is not None:
         console.print(f"see {options.out / 'report.html'}", markup=False)
     return exit_status(result)
@@ -267,7 +258,7 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     from tofuse.rigs.calibrate import calibrate as calibrate_rig
 
     check_new(arguments.out, overwrite=arguments.overwrite)
-    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+    with _progress_unless_json(arguments) as progress:
         found = calibrate_rig(
             arguments.inputs,
             motion=arguments.motion,
@@ -279,11 +270,10 @@ def rig_calibrate(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit({**found.rig.to_dict(), "how": found.how, "notes": list(found.notes)})
         return rigging.exit_status(found)
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     for table in rigging.tables(found.rig):
         console.print(table)
-    for note in rigging.notes(found):
-        console.print(f"[yellow]warning:[/] {_escape(note)}")
+    _print_warnings(console, rigging.notes(found))
     console.print(f"from {found.how}; see {arguments.out}", markup=False)
     return rigging.exit_status(found)
 
@@ -295,7 +285,7 @@ def rig_check(arguments: argparse.Namespace) -> int:
     from tofuse.rigs.calibrate import check
 
     stated = read_rig(arguments.rig)
-    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+    with _progress_unless_json(arguments) as progress:
         found, cameras = check(
             stated,
             arguments.inputs,
@@ -307,11 +297,10 @@ def rig_check(arguments: argparse.Namespace) -> int:
     if arguments.json:
         emit(rigging.check_json(cameras))
         return rigging.check_status(cameras)
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     for line in rigging.check_lines(cameras):
         console.print(line, markup=False)
-    for note in found.notes:
-        console.print(f"[yellow]warning:[/] {_escape(note)}")
+    _print_warnings(console, found.notes)
     return rigging.check_status(cameras)
 
 
@@ -321,37 +310,25 @@ def judge(arguments: argparse.Namespace) -> int:
     from tofuse.results.output import plain
 
     _check_overwrite(arguments)
-    options = JudgeOptions(
-        out=arguments.out,
-        overwrite=arguments.overwrite,
-        tolerance=arguments.tolerance,
-        format=arguments.format,
-        camera=arguments.camera,
-        topic=arguments.topic,
-        start=arguments.start,
-        end=arguments.end,
-        every=arguments.every,
-        threads=arguments.threads,
-    )
-    # With --json only the one object is printed.
-    with progress_for(as_json=False) if not arguments.json else nullcontext() as progress:
+    options = from_arguments(JudgeOptions, arguments)
+    with _progress_unless_json(arguments) as progress:
         found = judge_files([arguments.recording], arguments.trajectory, options, progress)
     status = 3 if found.verdict == "failed" else 0
     if arguments.json:
         emit({**plain(found.to_dict()), "out": None if options.out is None else str(options.out)})
         return status
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"[bold {COLORS[found.verdict]}]{found.verdict}[/]")
+    console = make_console()
+    console.print(f"[bold {VERDICT_COLORS[found.verdict]}]{found.verdict}[/]")
     _print_reasons(console, found.reasons)
     console.print(sentence(found, arguments.trajectory.name), markup=False)
     pairs = (("given", found.consistency), ("refined", found.refined_consistency))
-    said = [
+    texts = [
         f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_share:.1%} inliers"
         for name, c in pairs
         if c is not None
     ]
-    if said:
-        console.print(f"map consistency: {'; '.join(said)}", markup=False)
+    if texts:
+        console.print(f"map consistency: {'; '.join(texts)}", markup=False)
     if options.out is not None:
         console.print(f"see {options.out / 'report.html'}", markup=False)
     return status
@@ -362,28 +339,19 @@ def merge(arguments: argparse.Namespace) -> int:
     from tofuse.pipeline.merging import MergeOptions, merge_files
     from tofuse.pipeline.run import exit_status
 
-    options = MergeOptions(
-        out=arguments.out,
-        overwrite=arguments.overwrite,
-        tolerance=arguments.tolerance,
-        voxel=arguments.voxel,
-        faces=arguments.faces,
-        seed=arguments.seed or 0,
-        threads=arguments.threads,
-        texture=arguments.texture,
-    )
+    options = from_arguments(MergeOptions, arguments, seed=arguments.seed or 0)
     with progress_for(as_json=arguments.json) as progress:
         result = merge_files(arguments.results, options, progress)
-    tell(result, arguments.out, as_json=arguments.json)
+    print_result(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
 
 
 def _check_overwrite(arguments: argparse.Namespace) -> None:
-    """Refuse --overwrite where --out is optional and not given."""
+    """Refuse --overwrite without --out, where that is optional."""
     from tofuse.errors import InputError
 
     if arguments.overwrite and arguments.out is None:
-        raise InputError("is only for --out", where="--overwrite", remedy="pass --out as well")
+        raise InputError("requires --out", where="--overwrite", remedy="pass --out as well")
 
 
 def demo(arguments: argparse.Namespace) -> int:
@@ -403,12 +371,12 @@ def demo(arguments: argparse.Namespace) -> int:
             overwrite=arguments.overwrite,
             progress=progress,
         )
-    tell(result, arguments.out, as_json=arguments.json)
+    print_result(result, arguments.out, as_json=arguments.json)
     return exit_status(result)
 
 
-def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
-    """Say in a few lines what came out."""
+def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
+    """Print a summary of a result, or with `as_json` one JSON line."""
     from tofuse.results.card import SEPARATOR, card
     from tofuse.results.folder import component_name
     from tofuse.results.output import accuracy_json, plain, reasons_json
@@ -435,8 +403,8 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
             }
         )
         return
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"[bold {COLORS[d.verdict]}]{d.verdict}[/]")
+    console = make_console()
+    console.print(f"[bold {VERDICT_COLORS[d.verdict]}]{d.verdict}[/]")
     _print_reasons(console, d.reasons)
     for line in sessions:
         console.print(line, markup=False)
@@ -455,12 +423,17 @@ def tell(result: Reconstruction, out: Path, *, as_json: bool) -> None:
             console.print(f"and {path}, for {in_words(component.frames)}", markup=False)
 
 
+def _print_warnings(console: Console, warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+
+
 def _print_reasons(console: Console, reasons: Sequence[Reason]) -> None:
     from tofuse.results.verdict import ADVICE, REASONS, ranked
 
     for reason in ranked(reasons):
         level = REASONS[reason.code][0]
-        console.print(f"  [{COLORS[level]}]{level}:[/] {_escape(reason.text)}")
+        console.print(f"  [{VERDICT_COLORS[level]}]{level}:[/] {_escape(reason.text)}")
         if reason.code in ADVICE:
             console.print(f"    {ADVICE[reason.code]}", markup=False, style="dim")
 
@@ -499,28 +472,27 @@ def simulate(arguments: argparse.Namespace) -> int:
 
 def inspect(arguments: argparse.Namespace) -> int:
     """``tofuse inspect``."""
-    from tofuse.cli.inputs import opened
+    from tofuse.cli.open_input import open_input
     from tofuse.inspection.inspect import inspect_recording
 
-    recording = opened(arguments)
+    recording = open_input(arguments)
     found = inspect_recording(recording, turning=arguments.object, quick=arguments.quick)
     if arguments.sheet is not None:
         found.save_sheet(arguments.sheet)
     if arguments.json:
         emit(found.to_dict())
         return 0
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     width = max(map(len, found.facts))
     for name, value in found.facts.items():
         console.print(f"[bold]{name:<{width}}[/]  {_escape(value)}")
-    for note in found.notes:
-        console.print(f"[yellow]warning:[/] {_escape(note)}")
+    _print_warnings(console, found.notes)
     for finding in found.findings:
-        color = _SEVERITIES[finding.severity]
+        color = _SEVERITY_COLORS[finding.severity]
         console.print(f"[{color}]{finding.severity}:[/] {finding.code}: {_escape(finding.text)}")
         console.print(f"  {_escape(finding.remedy)}")
     if not found.findings:
-        console.print("[green]no check found anything wrong[/]")
+        console.print("[green]No problems found.[/]")
     if arguments.sheet is not None:
         console.print(f"see {_escape(str(arguments.sheet))}")
     return 0
@@ -528,19 +500,18 @@ def inspect(arguments: argparse.Namespace) -> int:
 
 def convert(arguments: argparse.Namespace) -> int:
     """``tofuse convert``."""
-    from tofuse.cli.inputs import selected
+    from tofuse.cli.open_input import open_selection
     from tofuse.recordings.convert import convert as convert_recording
     from tofuse.recordings.layouts import convert_to
 
-    recording = selected(arguments)
+    recording = open_selection(arguments)
     if arguments.to == "native":
         done = convert_recording(recording, arguments.out)
     else:
         done = convert_to(recording, arguments.out, arguments.to)
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
-    for warning in (*recording.warnings, *done.warnings):
-        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    _print_warnings(console, (*recording.warnings, *done.warnings))
     return 0
 
 
@@ -550,7 +521,7 @@ def record(arguments: argparse.Namespace) -> int:
     from tofuse.live.device import device, devices, is_installed
     from tofuse.live.recorder import record as record_stream
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     if arguments.device is None:
         table = Table("camera", "needs", "")
         for name, kind in devices().items():
@@ -559,20 +530,20 @@ def record(arguments: argparse.Namespace) -> int:
         console.print(table)
         return 0
     if arguments.out is None:
-        raise InputError("is missing", where="--out", remedy="give a new folder")
+        raise InputError("is missing", where="--out", remedy="pass a new folder")
     options = dict(part.partition("=")[::2] for part in arguments.set)
     with (
         device(arguments.device, options).open() as stream,
-        _interrupted() as asked,
+        _stop_on_signal() as stopped,
         progress_for(as_json=False) as progress,
     ):
-        progress.stage("recording, Ctrl-C ends", arguments.frames)
+        progress.stage("recording (Ctrl-C stops)", arguments.frames)
         done = record_stream(
             stream,
             arguments.out,
             seconds=arguments.seconds,
             frames=arguments.frames,
-            stopped=asked.is_set,
+            stopped=stopped.is_set,
             progress=lambda _: progress.advance(),
         )
     console.print(f"{done.frames} frames in {_escape(str(done.folder))}")
@@ -584,11 +555,8 @@ def record(arguments: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _interrupted() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C sets: what was recorded is kept. A second one ends at once.
-
-    So does SIGTERM, which is how a system that shuts down asks.
-    """
+def _stop_on_signal() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C or SIGTERM sets, for an orderly end; a second one ends at once."""
     event = threading.Event()
 
     def ask(number: int, frame: object) -> None:
@@ -611,7 +579,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     subjects = {
         "lens": calibrating.lens,
         "depth": calibrating.depth,
@@ -623,22 +591,21 @@ def calibrate(arguments: argparse.Namespace) -> int:
         return 0
     for line in lines:
         console.print(_escape(line))
-    for warning in warnings:
-        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    _print_warnings(console, warnings)
     return 0
 
 
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
     from tofuse.calibration.noise import estimate_noise
-    from tofuse.cli.inputs import opened
+    from tofuse.cli.open_input import open_input
     from tofuse.errors import OutputError
 
     if arguments.out is not None and arguments.out.exists() and not arguments.overwrite:
         raise OutputError(
-            "is there already", where=arguments.out, remedy="give --overwrite to replace it"
+            "already exists", where=arguments.out, remedy="pass --overwrite to replace it"
         )
-    recording = opened(arguments)
+    recording = open_input(arguments)
     fit = estimate_noise(recording, arguments.name)
     if arguments.out is not None:
         fit.model.save(arguments.out)
@@ -652,16 +619,14 @@ def noise(arguments: argparse.Namespace) -> int:
         label = f"{(item.low + item.high) / 2:.0f}" if fit.law == "confidence" else low_high
         measured, predicted = 1000 * item.measured_m, 1000 * item.predicted_m
         table.add_row(label, str(item.pixels), f"{measured:.2f}", f"{predicted:.2f}")
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console()
     console.print(table)
     console.print(
-        f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} still "
-        f"stretch{'' if fit.stretches == 1 else 'es'}: the law over {fit.law} errs by "
-        f"{100 * fit.rms_log_error:.0f} % (rms over the rows; without a fit by "
-        f"{100 * fit.before:.0f} %)"
+        f"{_escape(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
+        f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
+        f"{100 * fit.rms_log_error:.0f} % rms (built-in model: {100 * fit.before:.0f} %)"
     )
-    for warning in fit.warnings:
-        console.print(f"[yellow]warning:[/] {_escape(warning)}")
+    _print_warnings(console, fit.warnings)
     return 0
 
 
@@ -680,11 +645,11 @@ def evaluate(arguments: argparse.Namespace) -> int:
         emit(data)
         return 0
     table = Table.grid(padding=(0, 2))
-    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of those known)")
+    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of the reference)")
     table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
     if interval is not None:
         table.add_row("true ATE within", f"{interval[0]:.4f} to {interval[1]:.4f} m")
-    table.add_row("ATE largest", f"{error.ate_max_m:.4f} m")
+    table.add_row("ATE maximum", f"{error.ate_max_m:.4f} m")
     for r in error.relative:
         value = "too few poses"
         if r.pairs:
@@ -697,7 +662,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         if m["rms_m"] is not None:
             value = f"{m['rms_m']:.5f} m rms, {m['inlier_share']:.4f} inliers, {m['pairs']} pairs"
         table.add_row("map consistency", value)
-    Console(highlight=False, soft_wrap=True).print(table)
+    make_console().print(table)
     return 0
 
 
@@ -709,7 +674,7 @@ def optimize(arguments: argparse.Namespace) -> int:
 
     if arguments.out.exists() and not arguments.overwrite:
         raise OutputError(
-            "is there already", where=arguments.out, remedy="give --overwrite to replace it"
+            "already exists", where=arguments.out, remedy="pass --overwrite to replace it"
         )
     config = from_method("default", "range")
     if arguments.optimiser is not None:
@@ -728,8 +693,8 @@ def optimize(arguments: argparse.Namespace) -> int:
         count = int(left_out.sum())
         before, after = graph.chi2(~left_out), done.graph.chi2(~left_out)
         print(
-            f"{count} edge{' does' if count == 1 else 's do'} not fit the others and counted "
-            f"little or nothing; squared error of the others {before:.6g} to {after:.6g}"
+            f"{count} edge{'' if count == 1 else 's'} inconsistent with the others and "
+            f"down-weighted; squared error of the others {before:.6g} to {after:.6g}"
         )
     for piece in done.parts if len(done.parts) > 1 else ():
         print(
@@ -737,7 +702,7 @@ def optimize(arguments: argparse.Namespace) -> int:
             f"objective {piece.before:.6g} to {piece.after:.6g}"
         )
     if not done.improved:
-        print("nothing better was found: the poses are those of the input")
+        print("no improvement: the poses are those of the input")
     return 0
 
 

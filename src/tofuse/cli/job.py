@@ -1,10 +1,10 @@
-"""One job of a batch: `tofuse run` with a small picture of its model, for a parent process.
+"""One job of a batch: `tofuse run` and a thumbnail of its model, as a child process.
 
     python -m tofuse.cli.job PICTURE INPUT --out DIR ...
 
-It ends at once when its standard input does: when its parent is gone, somebody else may be doing
-the same job. What it has so far stays for them. The last lines on standard output are JSON: what
-`tofuse run --json` tells of its result, and what only a batch asks for.
+It is killed when its standard input closes: without its parent, another worker may be doing the
+same job, and can resume from its checkpoint. The last lines on standard output are JSON: the result
+as `tofuse run --json` prints it, and facts for the batch.
 """
 
 from __future__ import annotations
@@ -18,14 +18,20 @@ from collections.abc import Sequence
 _PICTURE = (336, 210)  # pixels
 
 
-def main(words: Sequence[str]) -> int:
-    """Run the job and return the exit status of its run."""
-    from tofuse.cli import ended_by_signals, faults_told, prepare_process, told
+def main(arguments: Sequence[str]) -> int:
+    """Run the job and return the exit status of `tofuse run`.
+
+    Parameters
+    ----------
+    arguments
+        Path of the thumbnail, then the arguments of `tofuse run`.
+    """
+    from tofuse.cli import ended_by_signals, prepare_process, report_bugs, run_command
 
     prepare_process()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with ended_by_signals():
-        return faults_told(lambda: told(lambda: _job(words[0], words[1:])))
+        return report_bugs(lambda: run_command(lambda: _job(arguments[0], arguments[1:])))
 
 
 def _end_with_parent() -> None:
@@ -37,8 +43,8 @@ def _end_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _job(picture: str, words: Sequence[str]) -> int:
-    from tofuse.cli.commands import run_options, tell
+def _job(picture: str, run_arguments: Sequence[str]) -> int:
+    from tofuse.cli.commands import print_result, run_options
     from tofuse.cli.parser import make_parser
     from tofuse.cli.progress import QuietProgress, emit
     from tofuse.files.atomic import write_bytes
@@ -46,18 +52,18 @@ def _job(picture: str, words: Sequence[str]) -> int:
     from tofuse.report.images import encoded
     from tofuse.report.scene import make_scene, small
 
-    arguments = make_parser().parse_args(["run", *words])
+    arguments = make_parser().parse_args(["run", *run_arguments])
     with QuietProgress() as progress:
         result = run(arguments.inputs, run_options(arguments), progress)
     rows = {record.index: k for k, record in enumerate(result.diagnostics.frames)}
     write_bytes(picture, encoded(small(make_scene(result, rows), _PICTURE), jpeg=True))
-    tell(result, arguments.out, as_json=True)
+    print_result(result, arguments.out, as_json=True)
     emit({"posed": int(result.has_pose.sum()), "peak_bytes": _peak_bytes()})
     return exit_status(result)
 
 
 def _peak_bytes() -> int | None:
-    """Most memory that this process held; None where the system does not tell."""
+    """Peak memory of this process; None where the system does not report it."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,4 +1,4 @@
-"""Whether this process may have what the program can't do without."""
+"""Whether this process is allowed enough memory to start."""
 
 from __future__ import annotations
 
@@ -6,20 +6,25 @@ import sys
 
 from tofuse.errors import InputError
 
-# What the smallest run was seen to need of addresses: 1.2 GB with two threads, most of it for
-# libraries. Where the compiler in them gets no memory it ends the process, which can't be caught.
-_LEAST_BYTES = 1792 << 20
-_EACH_THREAD_BYTES = 72 << 20  # its stack, and what the C library sets aside for it
+# The smallest run needs 1.2 GB of address space with two threads, most of it for libraries. A
+# compiler that gets no memory aborts the process, which can't be caught.
+_MIN_BYTES = 1792 << 20
+_EACH_THREAD_BYTES = 72 << 20  # its stack and the C library's arena
 _COUNTED_THREADS = 2
 
 
 def check_machine(threads: int | None = None) -> None:
-    """Refuse to begin with less than is needed in any case.
+    """Refuse to start with less memory than any run needs.
+
+    Parameters
+    ----------
+    threads
+        Number of threads; by default that of usable cores.
 
     Raises
     ------
     InputError
-        If addresses are limited to less (`ulimit -v`).
+        If the address space is limited to less (`ulimit -v`).
     """
     limit = address_limit()
     if limit is None:
@@ -28,18 +33,18 @@ def check_machine(threads: int | None = None) -> None:
         from tofuse.kernels.cores import usable_cores
 
         threads = usable_cores()
-    needed = _LEAST_BYTES + _EACH_THREAD_BYTES * max(0, threads - _COUNTED_THREADS)
+    needed = _MIN_BYTES + _EACH_THREAD_BYTES * max(0, threads - _COUNTED_THREADS)
     if limit < needed:
         raise InputError(
-            f"not enough memory: this process may have {limit / 1e9:.1f} GB of addresses, and "
-            f"needs {needed / 1e9:.1f} GB with {threads} threads",
+            f"not enough memory: the address space is limited to {limit / 1e9:.1f} GB, and "
+            f"{needed / 1e9:.1f} GB are needed with {threads} threads",
             where="memory",
             remedy="raise the limit (ulimit -v), or use --threads 1",
         )
 
 
 def address_limit() -> int | None:
-    """Bytes of addresses that this process may have; None where that is not limited."""
+    """Return the limit of the address space in bytes; None without one."""
     if sys.platform == "win32":
         return None
     import resource

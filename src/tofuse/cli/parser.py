@@ -1,4 +1,4 @@
-"""Which commands and options there are. Imports nothing heavy: ``--help`` is instant."""
+"""The commands and their options. Imports nothing heavy, so that ``--help`` is instant."""
 
 from __future__ import annotations
 
@@ -19,63 +19,66 @@ EXPORTS = (
     *("kitti", "log", "nerfstudio", "colmap"),
 )
 
-_EXIT = """\
-exit status:
-  0  a result was written and every readable frame has a pose
-  3  a result was written, but some readable frame has no pose
-  2  nothing was written: one line on stderr says why
-"""
+_NOTHING = "nothing was written: one line on stderr says why"
 
-_EXIT_BATCH = """\
+
+def _exit_status(zero: str, three: str, two: str = _NOTHING) -> str:
+    return f"exit status:\n  0  {zero}\n  3  {three}\n  2  {two}\n"
+
+
+_EXIT = _exit_status(
+    "a result was written and every readable frame has a pose",
+    "a result was written, but some readable frame has no pose",
+)
+_BATCH = """\
 LIST is a text file with one path or glob per line, or a table (.csv, .toml) with a column
 `recording` and further columns for options of `tofuse run`; see docs/batch.md. Run the same
 command again to resume.
 
-exit status:
-  0  every recording has a result, and every readable frame has a pose
-  3  some recording has no result, or some readable frame has no pose
-  2  there is no result: one line on stderr says why
-"""
-_VIEWS = """\
+""" + _exit_status(
+    "every recording has a result, and every readable frame has a pose",
+    "some recording has no result, or some readable frame has no pose",
+    "there is no result: one line on stderr says why",
+)
+_REGISTER = """\
 A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), or REC#12: frame 12 of
 a recording, counting from 0.
 
-"""
-_EXIT_CALIBRATE = """\
-exit status:
-  0  the pose of every camera was found
-  3  the file was written, but the pose of some camera could not be found
-  2  nothing was written: one line on stderr says why
-"""
-_EXIT_CHECK = """\
-exit status:
-  0  no camera has moved
-  3  some camera has moved, or cannot be checked
-  2  nothing could be checked: one line on stderr says why
-"""
-_EXIT_REGISTER = """\
-exit status:
-  0  the pose is believed
-  3  the pose is not believed, or cannot be verified; it is still printed and written
-  2  nothing was written: one line on stderr says why
-"""
-
-
-_SESSIONS = """\
+""" + _exit_status(
+    "the pose is believed",
+    "the pose is not believed, or cannot be verified; it is still printed and written",
+)
+_JUDGE = _exit_status(
+    "the poses were assessed",
+    "the depth images contradict the poses",
+    "nothing was assessed: one line on stderr says why",
+)
+_MERGE = """\
 A RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it
 was. The first result defines the world frame. What cannot be joined stays a separate component.
 
-"""
-_EXIT_MERGE = """\
-exit status:
-  0  a result was written and every readable frame is in one map
-  3  a result was written, but a session or a frame could not be joined
-  2  nothing was written: one line on stderr says why
-"""
+""" + _exit_status(
+    "a result was written and every readable frame is in one map",
+    "a result was written, but a session or a frame could not be joined",
+)
+_CALIBRATE_RIG = """\
+Pass one recording per camera, taken at the same time: a single image each, images of a
+scene in which something moves, or a walk with the rig. The first camera defines the rig
+frame.
+
+""" + _exit_status(
+    "the pose of every camera was found",
+    "the file was written, but the pose of some camera could not be found",
+)
+_CHECK_RIG = _exit_status(
+    "no camera has moved",
+    "some camera has moved, or cannot be checked",
+    "nothing could be checked: one line on stderr says why",
+)
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that says what is wrong in one line."""
+    """An argument parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit with 2."""
@@ -96,7 +99,7 @@ class Parser(argparse.ArgumentParser):
         return found
 
     def refuse(self, unknown: Sequence[str]) -> NoReturn:
-        """Report an unknown option, and the one that was probably meant."""
+        """Report an unknown option, with the most similar known one."""
         word = unknown[0].partition("=")[0]
         self.error(f"unknown option {word}" + _meant(word, self._option_string_actions))
 
@@ -115,16 +118,22 @@ def _meant(word: str, known: Iterable[str]) -> str:
 
 
 class _Help(argparse.HelpFormatter):
-    """Puts each command and what it does on one line."""
+    """Prints each command and its summary on one line."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog)
-        # What argparse itself counts leaves out that commands are indented once more.
+        # argparse does not count the extra indentation of commands.
         self._action_max_length = 15
 
 
 def make_parser(kind: type[Parser] = Parser) -> Parser:
-    """Return the parser of the whole command line, of a kind that may deal with errors its way."""
+    """Return the parser of the command line.
+
+    Parameters
+    ----------
+    kind
+        Its class, which handles errors.
+    """
     parser = kind(
         prog="tofuse",
         description="Reconstruct a 3D model and the camera trajectory from recordings of "
@@ -176,13 +185,13 @@ def _command(
     def call(arguments: argparse.Namespace) -> int:
         import tofuse.cli.commands as functions
 
-        made: Callable[[argparse.Namespace], int] = getattr(functions, function or name)
+        run: Callable[[argparse.Namespace], int] = getattr(functions, function or name)
         if not reconstructs:
-            return made(arguments)
+            return run(arguments)
         from tofuse.kernels.ahead import compiled_beside
 
         with compiled_beside():
-            return made(arguments)
+            return run(arguments)
 
     parser.set_defaults(command=call, parser=parser)
     return parser
@@ -190,10 +199,10 @@ def _command(
 
 def _run(commands: Any) -> None:
     p = _command(commands, "run", "reconstruct a recording", epilog=_EXIT, reconstructs=True)
-    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    _inputs(p)
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the result")
-    p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
-    p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
+    _overwrite(p)
+    _json(p, "progress and result as JSON lines")
     p.add_argument(
         "--into",
         type=Path,
@@ -203,20 +212,13 @@ def _run(commands: Any) -> None:
     p.add_argument(
         "--texture", action="store_true", help="texture the surface, in mesh.glb and mesh.obj"
     )
-    p.add_argument(
-        "--faces", type=_count, metavar="N", help="maximum number of triangles (default: all)"
-    )
-    p.add_argument(
-        "--voxel",
-        type=_length,
-        metavar="LENGTH",
-        help="resolution of the model, e.g. 5mm (default: from the camera's resolution)",
-    )
+    _faces(p, "default: all")
+    _voxel(p, "from the camera's resolution")
     p.add_argument(
         "--memory",
         type=_bytes,
         metavar="SIZE",
-        help="what to hold in memory at most, about, as 4GB; the rest goes to disk (2GB)",
+        help="approximate memory limit, e.g. 4GB; the rest goes to disk (2GB)",
     )
     p.add_argument(
         "--rig",
@@ -256,7 +258,7 @@ def _source(p: Any) -> None:
         "--camera",
         type=Path,
         metavar="FILE",
-        help="use this camera.json instead of the recording's",
+        help="use this camera.json instead of the recording's own",
     )
     p.add_argument("--topic", metavar="T", help="topic of a ROS bag, if the default is wrong")
 
@@ -269,7 +271,7 @@ def _selection(p: Any) -> None:
 
 def _processing(p: argparse.ArgumentParser) -> None:
     g = p.add_argument_group("reconstruction")
-    g.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
+    _method(g)
     g.add_argument(
         "--config",
         type=Path,
@@ -285,8 +287,8 @@ def _processing(p: argparse.ArgumentParser) -> None:
         "--prior",
         choices=("auto", "none", "device"),
         default="auto",
-        help="priors beside the images, as far as they agree with them: gravity and a phone's "
-        "own poses (auto, the default), none, or odometry as well (device)",
+        help="priors in addition to the images, as far as they agree: gravity and a phone's own "
+        "poses (auto, the default), none, or odometry as well (device)",
     )
     g.add_argument(
         "--loops", type=Path, metavar="FILE", help="known loop closures, one `i j` per line"
@@ -301,32 +303,61 @@ def _processing(p: argparse.ArgumentParser) -> None:
         action="store_true",
         help="unwrap phase beyond the camera's ambiguity range",
     )
-    g.add_argument(
-        "--tolerance",
-        type=_length,
-        metavar="LENGTH",
-        help='accuracy required of a "good" result, e.g. 30mm (0.5 %% of the model, at least 10mm)',
-    )
+    _tolerance(g, 'a "good" result')
     _seed(g)
-    g.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _threads(g)
+
+
+# Options that several commands have.
+
+
+def _inputs(p: Any) -> None:
+    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+
+
+def _json(p: Any, what: str = "print the result as JSON") -> None:
+    p.add_argument("--json", action="store_true", help=what)
+
+
+def _overwrite(p: Any, what: str = "an existing result in --out") -> None:
+    p.add_argument("--overwrite", action="store_true", help=f"replace {what}")
+
+
+def _threads(p: Any) -> None:
+    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
 
 
 def _seed(p: Any) -> None:
-    p.add_argument("--seed", type=_seed_number, metavar="N", help="random seed (0)")
+    p.add_argument("--seed", type=_non_negative, metavar="N", help="random seed (0)")
+
+
+def _method(p: Any) -> None:
+    p.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
+
+
+def _tolerance(p: Any, what: str, default: str = "0.5 %% of the model, at least 10mm") -> None:
+    text = f"accuracy required of {what}, e.g. 30mm ({default})"
+    p.add_argument("--tolerance", type=_length, metavar="LENGTH", help=text)
+
+
+def _faces(p: Any, default: str) -> None:
+    text = f"maximum number of triangles ({default})"
+    p.add_argument("--faces", type=_count, metavar="N", help=text)
+
+
+def _voxel(p: Any, default: str) -> None:
+    text = f"resolution of the model, e.g. 5mm (default: {default})"
+    p.add_argument("--voxel", type=_length, metavar="LENGTH", help=text)
 
 
 def _batch(commands: Any) -> None:
     p = _command(
-        commands, "batch", "reconstruct many recordings, each as a separate job", epilog=_EXIT_BATCH
+        commands, "batch", "reconstruct many recordings, each as a separate job", epilog=_BATCH
     )
     p.add_argument("list", type=Path, metavar="LIST", help="the recordings, with their options")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the results")
-    p.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="replace results made with other options; up-to-date results are kept",
-    )
-    p.add_argument("--json", action="store_true", help="jobs and outcome as JSON lines")
+    _overwrite(p, "results made with other options; up-to-date results are kept")
+    _json(p, "jobs and outcome as JSON lines")
     p.add_argument(
         "--only", action="append", metavar="NAME", help="run only this job; may be repeated"
     )
@@ -352,25 +383,23 @@ def _batch(commands: Any) -> None:
     )
     g.add_argument(
         "--retries",
-        type=_seed_number,
+        type=_non_negative,
         metavar="N",
         help="how often a job whose process was killed is restarted (3)",
     )
 
 
 def _register(commands: Any) -> None:
-    p = _command(
-        commands, "register", "register two files or frames", epilog=_VIEWS + _EXIT_REGISTER
-    )
+    p = _command(commands, "register", "register two files or frames", epilog=_REGISTER)
     p.add_argument("source", metavar="SOURCE", help="the view to be transformed")
     p.add_argument("target", metavar="TARGET", help="the view that stays fixed")
     p.add_argument(
         "--guess", type=Path, metavar="FILE", help="initial guess of T_target_source (none)"
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the result (none)")
-    p.add_argument("--overwrite", action="store_true", help="replace an existing one in --out")
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _overwrite(p, "an existing one in --out")
+    _json(p)
+    _threads(p)
     g = p.add_argument_group("input")
     _source(g)
 
@@ -380,7 +409,7 @@ def _judge(commands: Any) -> None:
         commands,
         "judge",
         "assess poses from any source, without a reference",
-        epilog="exit status: 0, judged; 3, the depth images contradict the poses; 2, bad input",
+        epilog=_JUDGE,
         reconstructs=True,
     )
     p.add_argument("recording", metavar="RECORDING", help="range images")
@@ -391,15 +420,10 @@ def _judge(commands: Any) -> None:
         help="a trajectory in any supported format, or a result",
     )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the refined result (none)")
-    p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
-    p.add_argument(
-        "--tolerance",
-        type=_length,
-        metavar="LENGTH",
-        help="accuracy required of good poses, e.g. 30mm (0.5 %% of the model, at least 10mm)",
-    )
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _overwrite(p)
+    _json(p)
+    _tolerance(p, "good poses")
+    _threads(p)
     g = p.add_argument_group("input")
     _source(g)
     _selection(g)
@@ -410,7 +434,7 @@ def _merge(commands: Any) -> None:
         commands,
         "merge",
         "merge the results of several recordings into one map",
-        epilog=_SESSIONS + _EXIT_MERGE,
+        epilog=_MERGE,
         reconstructs=True,
     )
     p.add_argument(
@@ -421,31 +445,16 @@ def _merge(commands: Any) -> None:
         help="two or more results; the first one defines the world frame",
     )
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the map")
-    p.add_argument("--overwrite", action="store_true", help="replace an existing result in --out")
-    p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
-    p.add_argument(
-        "--tolerance",
-        type=_length,
-        metavar="LENGTH",
-        help='accuracy required of a "good" map, e.g. 30mm (default: as the first result)',
-    )
+    _overwrite(p)
+    _json(p, "progress and result as JSON lines")
+    _tolerance(p, 'a "good" map', "default: as the first result")
     p.add_argument(
         "--texture", action="store_true", help="texture the surface (default: as the first result)"
     )
-    p.add_argument(
-        "--faces",
-        type=_count,
-        metavar="N",
-        help="maximum number of triangles (default: as the first result)",
-    )
-    p.add_argument(
-        "--voxel",
-        type=_length,
-        metavar="LENGTH",
-        help="resolution of the model, e.g. 5mm (default: as the first result)",
-    )
+    _faces(p, "default: as the first result")
+    _voxel(p, "as the first result")
     _seed(p)
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _threads(p)
 
 
 def _rig(commands: Any) -> None:
@@ -461,20 +470,18 @@ def _rig(commands: Any) -> None:
         commands,
         "calibrate",
         "estimate the extrinsics of a rig",
-        epilog="Pass one recording per camera, taken at the same time: a single image each, images "
-        "of a\nscene in which something moves, or a walk with the rig. The first camera defines "
-        "the rig frame.\n\n" + _EXIT_CALIBRATE,
+        epilog=_CALIBRATE_RIG,
         function="rig_calibrate",
     )
     p.add_argument("inputs", nargs="+", metavar="RECORDING", help="one per camera")
     p.add_argument("--out", required=True, type=Path, metavar="FILE", help="the rig.json to write")
-    p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
+    _overwrite(p, "an existing FILE")
     _rig_options(p)
     p = _command(
         commands,
         "check",
         "check whether a camera has moved since the rig was calibrated",
-        epilog=_EXIT_CHECK,
+        epilog=_CHECK_RIG,
         function="rig_check",
     )
     p.add_argument("rig", type=Path, metavar="RIG", help="a rig.json")
@@ -494,8 +501,8 @@ def _rig_options(p: argparse.ArgumentParser) -> None:
         default="auto",
         help="whether the cameras are static (default: detected from the images)",
     )
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _json(p)
+    _threads(p)
     p.add_argument("--format", metavar="F", help="input format, if not recognised")
 
 
@@ -514,8 +521,8 @@ def _demo(commands: Any) -> None:
     what.add_argument(
         "--failure",
         action="store_true",
-        help="a recording that can't be reconstructed, 1.5 m along a bare corridor: see in "
-        "report.html how the failure is detected and explained",
+        help="simulate a recording that can't be reconstructed, 1.5 m along a bare corridor: "
+        "report.html shows how the failure is detected and explained",
     )
     p.add_argument(
         "--out",
@@ -524,11 +531,11 @@ def _demo(commands: Any) -> None:
         metavar="DIR",
         help="output folder (tofuse-demo)",
     )
-    p.add_argument("--overwrite", action="store_true", help="replace an existing demo in DIR")
-    p.add_argument("--json", action="store_true", help="progress and result as JSON lines")
-    p.add_argument("--method", metavar="NAME", help="default, thesis (default: default)")
+    _overwrite(p, "an existing demo in DIR")
+    _json(p, "progress and result as JSON lines")
+    _method(p)
     _seed(p)
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _threads(p)
 
 
 def _simulate(commands: Any) -> None:
@@ -538,7 +545,7 @@ def _simulate(commands: Any) -> None:
     p.add_argument("--camera", default="sr4000", metavar="NAME", help="camera model (sr4000)")
     p.add_argument("--every", type=_count, metavar="N", help="stride (default: the thesis's)")
     p.add_argument("--frames", type=_count, metavar="N", help="stop after this many frames")
-    p.add_argument("--first", type=_seed_number, metavar="K", help="first raw frame (0)")
+    p.add_argument("--first", type=_non_negative, metavar="K", help="first raw frame (0)")
     p.add_argument("--uniform", action="store_true", help="uniform albedo, no texture")
     passing = p.add_mutually_exclusive_group()
     for kind, does in (("person", "walks"), ("box", "slides")):
@@ -558,26 +565,26 @@ def _simulate(commands: Any) -> None:
     p.add_argument("--imu", action="store_true", help="simulate an accelerometer as well")
     p.add_argument("--sigma", type=_metres, metavar="M", help="noise of the `peaks` scene (0.05)")
     _seed(p)
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _threads(p)
 
 
 def _inspect(commands: Any) -> None:
     p = _command(commands, "inspect", "show a recording's properties and check it for faults")
-    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    _inputs(p)
     _source(p)
     p.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet of the frames")
     p.add_argument(
         "--object", action="store_true", help="an object turns in front of a static camera"
     )
     p.add_argument(
-        "--quick", action="store_true", help="only the checks that `tofuse run` makes at its start"
+        "--quick", action="store_true", help="only the checks that `tofuse run` makes first"
     )
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
+    _json(p)
 
 
 def _convert(commands: Any) -> None:
     p = _command(commands, "convert", "write any recording as a native, TUM or Open3D folder")
-    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    _inputs(p)
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="a new folder")
     p.add_argument(
         "--to",
@@ -618,8 +625,8 @@ def _calibrate(commands: Any) -> None:
     p.add_argument("subject", choices=("lens", "depth", "import"), help="what to calibrate")
     p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings; import: one file")
     p.add_argument("--out", type=Path, metavar="FILE", help="write the result")
-    p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
+    _overwrite(p, "an existing FILE")
+    _json(p)
     g = p.add_argument_group("lens and depth")
     g.add_argument(
         "--board", metavar="CxR:M", help="inner corners and square size in metres, e.g. 8x6:0.1"
@@ -660,14 +667,14 @@ def _calibrate(commands: Any) -> None:
 
 def _noise(commands: Any) -> None:
     p = _command(commands, "noise", "estimate a camera's noise from a static recording")
-    p.add_argument("inputs", nargs="+", metavar="INPUT", help="recordings, joined in this order")
+    _inputs(p)
     p.add_argument(
         "--out", type=Path, metavar="FILE", help="write the noise model, e.g. noise.json"
     )
-    p.add_argument("--overwrite", action="store_true", help="replace an existing FILE")
+    _overwrite(p, "an existing FILE")
     p.add_argument("--name", metavar="NAME", help="name of the camera")
     _source(p)
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
+    _json(p)
 
 
 def _evaluate(commands: Any) -> None:
@@ -691,7 +698,7 @@ def _evaluate(commands: Any) -> None:
         metavar="LENGTH",
         help="rms error of the reference itself, e.g. 20mm; prints an interval for the ATE",
     )
-    p.add_argument("--json", action="store_true", help="print the result as JSON")
+    _json(p)
 
 
 def _optimize(commands: Any) -> None:
@@ -701,7 +708,7 @@ def _optimize(commands: Any) -> None:
     p.add_argument(
         "--optimiser", metavar="NAME", help="method (default: levenberg-marquardt; castellani, ...)"
     )
-    p.add_argument("--overwrite", action="store_true", help="replace an existing OUT.g2o")
+    _overwrite(p, "an existing OUT.g2o")
 
 
 def _export(commands: Any) -> None:
@@ -711,28 +718,26 @@ def _export(commands: Any) -> None:
     p.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the files (default: that of the result)"
     )
-    p.add_argument(
-        "--faces", type=_count, metavar="N", help="at most so many triangles (60000; STL: all)"
-    )
+    _faces(p, "60000; STL: all")
     p.add_argument(
         "--every", type=_count, default=1, metavar="N", help="every N-th image (nerfstudio, colmap)"
     )
     p.add_argument(
         "--pinhole", action="store_true", help="images without distortion (nerfstudio, colmap)"
     )
-    p.add_argument("--overwrite", action="store_true", help="replace existing files")
+    _overwrite(p, "existing files")
 
 
 def _experiments(commands: Any) -> None:
     p = _command(commands, "experiments", "reproduce the experiments of the 2010 thesis")
     p.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder for the report")
-    p.add_argument("--overwrite", action="store_true", help="replace existing experiments in DIR")
+    _overwrite(p, "existing experiments in DIR")
     p.add_argument(
         "--cases", default="", metavar="NAMES", help="run only these, separated by commas"
     )
     p.add_argument("--seeds", type=_count, default=20, metavar="N", help="noise seeds (20)")
     _seed(p)
-    p.add_argument("--threads", type=_count, metavar="N", help="threads (default: all cores)")
+    _threads(p)
 
 
 def _view(commands: Any) -> None:
@@ -772,34 +777,36 @@ def _whole(text: str) -> int:
 def _count(text: str) -> int:
     value = _whole(text)
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
+        raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return value
 
 
-def _seed_number(text: str) -> int:
+def _non_negative(text: str) -> int:
     value = _whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
 
 
-def _ratio(text: str) -> float:
+def _number(text: str) -> float:
+    """NaN if it is none."""
     try:
-        value = float(text)
+        return float(text)
     except ValueError:
-        value = math.nan
+        return math.nan
+
+
+def _ratio(text: str) -> float:
+    value = _number(text)
     if not 0 < value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not between 0 and 1")
     return value
 
 
 def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive time in seconds")
     return value
 
 
@@ -807,22 +814,16 @@ _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 def _length(text: str) -> float:
-    """A length above 0 in m, given as 30mm, 3cm, 0.03m or 0.03."""
+    """A positive length in m, given as 30mm, 3cm, 0.03m or 0.03."""
     match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*(mm|cm|m)?\s*", text)
-    try:
-        value = float(match[1]) * _UNITS_M[match[2] or "m"] if match else math.nan
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or value <= 0:
+    value = _number(match[1]) * _UNITS_M[match[2] or "m"] if match else math.nan
+    if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
     return value
 
 
 def _metres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or value < 0:
+    value = _number(text)
+    if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a distance in metres")
     return value

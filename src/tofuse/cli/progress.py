@@ -1,4 +1,4 @@
-"""What a person or a program sees while a job runs."""
+"""Progress of a job on a terminal, as JSON lines, or as notes in a log."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ from rich.table import Column
 from tofuse.pipeline.progress import Silent
 from tofuse.results.types import FrameRecord
 
-# The last steps, whose pace tells how long the others will take.
-_WINDOW = 30
-_GOOD_SHARE = 0.8  # of the points that fit
-_WIDE = 92  # columns, with which there is room for a bar
+_WINDOW = 30  # steps from whose rate the remaining time is estimated
+_GOOD_FRACTION = 0.8  # inliers
+_WIDE = 92  # columns of a terminal with space for a bar
 
 
 class Pace:
-    """How fast a stage goes, by its last steps: the first ones compile and load."""
+    """The rate of a stage over its last steps; the first ones include compilation and loading."""
 
     def __init__(self, total: int | None = None, clock: Callable[[], float] = perf_counter) -> None:
         self.done, self.total = 0, total or None
@@ -34,24 +33,24 @@ class Pace:
         self._times = deque([self._start], maxlen=_WINDOW)
 
     def step(self) -> None:
-        """Finish a step."""
+        """Count a step as done."""
         self.done += 1
         self._times.append(self._clock())
 
     @property
     def seconds(self) -> float:
-        """Since the stage began."""
+        """Time since the stage began."""
         return self._clock() - self._start
 
     @property
     def per_second(self) -> float | None:
-        """Steps in a second; None before there are any."""
+        """Steps per second; None before the first."""
         passed = self._times[-1] - self._times[0]
         return (len(self._times) - 1) / max(passed, 1e-3) if self.done else None
 
     @property
     def seconds_left(self) -> float | None:
-        """Until the stage is done; None where that can't be told."""
+        """Estimated time until the stage is done; None where unknown."""
         rate = self.per_second
         if rate is None or self.total is None:
             return None
@@ -59,42 +58,42 @@ class Pace:
 
 
 class Health:
-    """How tracking goes, in a few words."""
+    """The state of tracking in a few words."""
 
     def __init__(self) -> None:
         self._without = 0  # frames without a pose
-        self._in_a_row = 0
+        self._consecutive = 0  # of these, the last ones
         self._words, self._color = "", "green"
 
-    def see(self, record: FrameRecord) -> None:
-        """Take in what became of the next frame."""
-        gone = record.status in ("lost", "skipped")
-        self._without += gone
-        self._in_a_row = self._in_a_row + 1 if gone else 0
+    def update(self, record: FrameRecord) -> None:
+        """Take the outcome of the next frame."""
+        missing = record.status in ("lost", "skipped")
+        self._without += missing
+        self._consecutive = self._consecutive + 1 if missing else 0
         if record.status == "lost":
-            self._words, self._color = f"lost for {_frames(self._in_a_row)}", "red"
+            self._words, self._color = f"lost for {_frames(self._consecutive)}", "red"
         elif record.status == "skipped":
             self._words, self._color = "unreadable", "yellow"
         elif record.status == "predicted":
-            self._words, self._color = "guessing", "yellow"
+            self._words, self._color = "predicting", "yellow"
         else:
-            share = record.inlier_share
-            self._words = "tracking" if share is None else f"{share:.0%} fits"
-            self._color = "green" if share is None or share >= _GOOD_SHARE else "yellow"
+            inliers = record.inlier_share
+            self._words = "tracking" if inliers is None else f"{inliers:.0%} inliers"
+            self._color = "green" if inliers is None or inliers >= _GOOD_FRACTION else "yellow"
 
     @property
     def markup(self) -> str:
-        """For a terminal."""
+        """The words, with rich's markup."""
         if not self._words:
             return ""
-        more = f", {self._without} without a pose" if self._without > self._in_a_row else ""
+        more = f", {self._without} without a pose" if self._without > self._consecutive else ""
         return f"[{self._color}]{self._words}[/]{more}"
 
 
 class TerminalProgress(Silent):
-    """The stages on a terminal: those done with their times, and one bar that goes on.
+    """The stages on a terminal: finished ones with their times, and a bar for the current one.
 
-    When the job is done all of it goes away, and what came out is said in its place.
+    It disappears when the job is done, to make space for the summary.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
@@ -151,7 +150,7 @@ class TerminalProgress(Silent):
         if pace.seconds_left is not None:
             words += f", {_duration(pace.seconds_left)} left"
         if record is not None:
-            self._health.see(record)
+            self._health.update(record)
         count = f"{pace.done}/{pace.total}" if pace.total else f"{pace.done}"
         self._bar.update(self._task, advance=1, count=count, pace=words, health=self._health.markup)
 
@@ -169,18 +168,18 @@ class JsonProgress(Silent):
     def __exit__(
         self, kind: type[BaseException] | None, value: object, trace: TracebackType | None
     ) -> None:
-        """Nothing to put away."""
+        """Nothing to clean up."""
 
     def __init__(self) -> None:
         self._pace = Pace()
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Tell the stage."""
+        """Print the stage."""
         self._pace = Pace(total)
         emit({"event": "stage", "stage": name, "total": total})
 
     def advance(self, record: FrameRecord | None = None) -> None:
-        """Tell what became of a frame, and how far the stage is."""
+        """Print the outcome of a frame, and the progress of the stage."""
         self._pace.step()
         if record is None:
             return
@@ -199,14 +198,14 @@ class JsonProgress(Silent):
         )
 
     def note(self, text: str) -> None:
-        """Tell a warning."""
+        """Print a note."""
         emit({"event": "note", "text": text})
 
 
 class QuietProgress(Silent):
-    """Notes on standard error and nothing else, for logs and pipes.
+    """Only notes on standard error, for logs and pipes.
 
-    They come at the end of a job that succeeded: one that fails says its one line alone.
+    They are printed after a job that succeeded: one that fails prints only its error.
     """
 
     def __init__(self) -> None:
@@ -223,10 +222,10 @@ class QuietProgress(Silent):
                 print(f"note: {text}", file=sys.stderr)
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Say nothing."""
+        """Print nothing."""
 
     def advance(self, record: FrameRecord | None = None) -> None:
-        """Say nothing."""
+        """Print nothing."""
 
     def note(self, text: str) -> None:
         """Keep the note for the end."""
@@ -234,19 +233,19 @@ class QuietProgress(Silent):
 
 
 def progress_for(*, as_json: bool) -> TerminalProgress | JsonProgress | QuietProgress:
-    """Choose by who is looking: a program, a terminal, or a log."""
+    """Return the progress for JSON, a terminal, or a log."""
     if as_json:
         return JsonProgress()
     return TerminalProgress() if sys.stderr.isatty() else QuietProgress()
 
 
 def emit(data: dict[str, Any]) -> None:
-    """Print one JSON line at once."""
+    """Print one JSON line, and flush it."""
     print(json.dumps(data, allow_nan=False), flush=True)
 
 
 def _column(text: str, width: int, justify: Literal["left", "right"] = "left") -> TextColumn:
-    """A column of one line that is not narrower than that, as long as others can be."""
+    """A column of one line with a minimum width, as long as others can be narrower."""
     column = Column(min_width=width, no_wrap=True, overflow="ellipsis")
     return TextColumn(text, justify=justify, table_column=column)
 
@@ -260,7 +259,7 @@ def _frames(count: int) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """A time in few characters: 0.4 s, 12 s, 3:07, 1:02:45."""
+    """A duration in few characters: 0.4 s, 12 s, 3:07, 1:02:45."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)

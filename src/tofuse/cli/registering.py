@@ -1,4 +1,4 @@
-"""``tofuse register``: the result of one pair in a few lines."""
+"""``tofuse register``: the summary of one pair."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Lines = list[tuple[str, str]]
 
 
 def lines(result: PairResult) -> Lines:
-    """Return name and value of each line that is printed below the belief; values may be empty."""
+    """Return name and value of each line that is printed below the verdict; names may be empty."""
     found: Lines = [("translation", words.translation(result))]
     if moved := words.moved_center(result):
         found.append(("", moved))

@@ -1,4 +1,4 @@
-"""``tofuse rig``: rigs in a few lines and tables."""
+"""``tofuse rig``: summaries of rigs as lines and tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tofuse.rigs.check import Moved
 
 
 def tables(rig: Rig) -> list[Table]:
-    """Where the cameras are, and how far surfaces of each two of them are apart."""
+    """Return tables of the cameras' poses, and of the distances between overlapping surfaces."""
     where = Table(box=None)
     for title in ("camera", "x y z (m)"):
         where.add_column(title, no_wrap=True)
@@ -38,43 +38,43 @@ def tables(rig: Rig) -> list[Table]:
             " ".join(f"{x:+.3f}" for x in T[:3, 3]),
             *(("-",) * len(values) if first else values),
         )
-    pairs = Table("surfaces of", "and", "are apart (mm)", "pixels", box=None)
+    pairs = Table("camera", "camera", "surface distance (mm)", "pixels", box=None)
     for found in rig.disagreement:
         pairs.add_row(found.a, found.b, f"{1000 * found.median_m:.1f}", f"{found.pixels:,}")
     return [where, pairs] if rig.disagreement else [where]
 
 
 def notes(found: Calibration) -> list[str]:
-    """What a person should know, cameras without a place first."""
-    unplaced = [f"{name} is not placed: {why}" for name, why in found.rig.unplaced.items()]
+    """Return warnings, those about cameras without a pose first."""
+    unplaced = [f"{name} has no pose: {why}" for name, why in found.rig.unplaced.items()]
     return [*unplaced, *found.notes]
 
 
 def exit_status(found: Calibration) -> int:
-    """3 where some camera is not placed."""
+    """Return 3 if the pose of some camera is unknown, else 0."""
     return 3 if found.rig.unplaced else 0
 
 
 def check_lines(cameras: Sequence[Moved]) -> list[str]:
-    """What became of each camera, one line each."""
+    """Return one line for each camera."""
     width = max(len(camera.name) for camera in cameras)
-    return [f"{camera.name:<{width}}  {_said(camera)}" for camera in cameras]
+    return [f"{camera.name:<{width}}  {_outcome(camera)}" for camera in cameras]
 
 
-def _said(camera: Moved) -> str:
+def _outcome(camera: Moved) -> str:
     if camera.reason:
         return f"not checked: {camera.reason}"
-    by = f"{1000 * camera.distance_m:.1f} mm and {np.degrees(camera.angle_rad):.2f} deg"
-    sure = f"known to {1000 * camera.sigma_m:.1f} mm and {np.degrees(camera.sigma_rad):.2f} deg"
+    by = f"{1000 * camera.distance_m:.1f} mm, {np.degrees(camera.angle_rad):.2f} deg"
+    sigma = f"1 sigma: {1000 * camera.sigma_m:.1f} mm, {np.degrees(camera.sigma_rad):.2f} deg"
     if camera.moved:
-        return f"moved by {by} ({sure}; by chance in {camera.chance:.1g} of the cases)"
+        return f"moved by {by} ({sigma}; p = {camera.chance:.1g})"
     if camera.sigma_m == 0:
-        return "as it was: the others are compared with it"
-    return f"as it was, within {by} ({sure})"
+        return "unchanged: reference for the others"
+    return f"unchanged, within {by} ({sigma})"
 
 
 def check_json(cameras: Sequence[Moved]) -> dict[str, Any]:
-    """The same as plain data."""
+    """Return the check as plain data."""
     rows = [
         {
             "name": c.name,
@@ -94,5 +94,5 @@ def check_json(cameras: Sequence[Moved]) -> dict[str, Any]:
 
 
 def check_status(cameras: Sequence[Moved]) -> int:
-    """3 where some camera was moved, or is not checked."""
+    """Return 3 if some camera has moved or could not be checked, else 0."""
     return 3 if any(camera.moved or camera.reason for camera in cameras) else 0

@@ -1,7 +1,7 @@
-"""Standard output and error of a command, whatever they lead to: closed, full, gone, or not UTF-8.
+"""Standard output and error that may be closed, full, or not UTF-8.
 
-What is printed is not the result. A command goes on when nobody reads it any more, and says in the
-end that something could not be told.
+What is printed is not the result: a command continues when its output can't be written, and
+reports that at the end.
 """
 
 from __future__ import annotations
@@ -14,19 +14,24 @@ from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
 
-class Outlet:
-    """A text stream that never fails: what can't be written is dropped, and `error` says why."""
+class SafeStream:
+    """A text stream that never raises: output that can't be written is dropped.
+
+    Attributes
+    ----------
+    error
+        Why output was dropped; None as long as nothing was.
+    """
 
     def __init__(self, stream: TextIO | None) -> None:
         self.error: Exception | None = OSError("it is closed") if stream is None else None
-        kept: Any = stream if stream is not None else io.StringIO()
-        self._stream = kept
+        self._stream: Any = stream if stream is not None else io.StringIO()
         with suppress(AttributeError, ValueError, OSError):
-            # Names of files need not be in the terminal's encoding, nor in any.
+            # File names may not be representable in the terminal's encoding.
             self._stream.reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:
-        """Write, or drop it."""
+        """Write text, or drop it."""
         if self.error is None:
             try:
                 self._stream.write(text)
@@ -35,12 +40,12 @@ class Outlet:
         return len(text)
 
     def writelines(self, lines: Any) -> None:
-        """Write them one after the other."""
+        """Write lines."""
         for line in lines:
             self.write(line)
 
     def flush(self) -> None:
-        """Hand on what was written."""
+        """Flush the stream."""
         if self.error is None:
             try:
                 self._stream.flush()
@@ -48,7 +53,7 @@ class Outlet:
                 self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """Write nothing more. What still waits must not fail again when the process ends."""
+        """Drop everything from now on, including what is buffered when the process ends."""
         self.error = error
         with suppress(AttributeError, OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
@@ -62,10 +67,10 @@ class Outlet:
 
 
 @contextmanager
-def outlets() -> Iterator[tuple[Outlet, Outlet]]:
-    """Let all that the block prints go through outlets, and give them."""
+def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
+    """Replace standard output and error in the block, and yield both replacements."""
     before = sys.stdout, sys.stderr
-    out, err = Outlet(sys.stdout), Outlet(sys.stderr)
+    out, err = SafeStream(sys.stdout), SafeStream(sys.stderr)
     sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
     try:
         yield out, err

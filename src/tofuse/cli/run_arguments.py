@@ -1,4 +1,4 @@
-"""Options of `tofuse run` in the columns of a table, checked as its parser does."""
+"""Options of `tofuse run` in the columns of a table, checked by its parser."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import NoReturn
 from tofuse.cli.parser import Parser, make_parser
 from tofuse.errors import InputError
 
-# What a batch decides itself, and what is for somebody who watches.
-_NOT_HERE = {
+# Options that the batch sets itself, and interactive ones.
+_EXCLUDED = {
     "out",
     "overwrite",
     "into",
@@ -31,7 +31,7 @@ _YES, _NO = {"true", "yes", "1", "x"}, {"false", "no", "0"}
 
 
 class _Strict(Parser):
-    """Raises where it would exit."""
+    """Raises an error instead of exiting."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
@@ -42,51 +42,56 @@ def _options() -> dict[str, argparse.Action]:
     """Options of `tofuse run` that a table may have, by name."""
     found = make_parser().parse_args(["run", ".", "--out", "."]).parser._option_string_actions
     names = {word.removeprefix("--"): action for word, action in found.items()}
-    return {n: a for n, a in names.items() if not n.startswith("-") and n not in _NOT_HERE}
+    return {n: a for n, a in names.items() if not n.startswith("-") and n not in _EXCLUDED}
 
 
-def run_words(cells: Mapping[str, str], base: Path, where: str) -> tuple[str, ...]:
-    """Turn options of a table into words of `tofuse run`, with paths from `base` made absolute.
+def run_arguments(cells: Mapping[str, str], base: Path, where: str) -> tuple[str, ...]:
+    """Convert the options of a row into command-line arguments of `tofuse run`.
+
+    Parameters
+    ----------
+    cells
+        Values of options, by their names.
+    base
+        Folder that relative paths refer to.
+    where
+        The row, for error messages.
 
     Raises
     ------
     InputError
-        If `tofuse run` would not understand them.
+        If `tofuse run` would not accept them.
     """
-    words = []
+    arguments = []
     for column, value in cells.items():
         name = column.replace("_", "-")
         action = _options().get(name)
         if action is None:
             near = get_close_matches(name, _options(), 1)
             raise InputError(
-                f"{column} is no option of `tofuse run` for a table",
+                f"{column} is not an option of `tofuse run` for a table",
                 where=where,
                 remedy=f"did you mean {near[0]}?" if near else "see docs/batch.md",
             )
         if action.nargs == 0:
             if value.lower() not in _YES | _NO:
-                raise InputError(f"{column} is {value!r}", where=where, remedy="give yes or no")
-            words += [f"--{name}"] * (value.lower() in _YES)
+                raise InputError(f"{column} is {value!r}", where=where, remedy="use yes or no")
+            arguments += [f"--{name}"] * (value.lower() in _YES)
         else:
             path = action.type is Path
-            words.append(
+            arguments.append(
                 f"--{name}={os.path.join(base, os.path.expanduser(value)) if path else value}"
             )
-    _check(tuple(words), where)
-    return tuple(words)
-
-
-def _check(words: tuple[str, ...], where: str) -> None:
-    problem = _problem(words)
-    if problem:
+    if problem := _problem(tuple(arguments)):
         raise InputError(problem, where=where)
+    return tuple(arguments)
 
 
 @cache
-def _problem(words: tuple[str, ...]) -> str:
+def _problem(arguments: tuple[str, ...]) -> str:
+    """What is wrong with arguments of `tofuse run`; empty if nothing."""
     try:
-        make_parser(_Strict).parse_args(["run", ".", "--out", ".", *words])
+        make_parser(_Strict).parse_args(["run", ".", "--out", ".", *arguments])
     except InputError as error:
         return str(error)
     return ""
