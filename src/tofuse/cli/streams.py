@@ -25,7 +25,8 @@ class SafeStream:
 
     def __init__(self, stream: TextIO | None) -> None:
         self.error: Exception | None = OSError("it is closed") if stream is None else None
-        self._stream: Any = stream if stream is not None else io.StringIO()
+        target: Any = io.StringIO() if stream is None else stream
+        self._stream = target
         with suppress(AttributeError, ValueError, OSError):
             # File names may not be representable in the terminal's encoding.
             self._stream.reconfigure(errors="backslashreplace")
