@@ -39,7 +39,7 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float64
 from tofuse.corrections.multipath import Multipath
-from tofuse.evaluation.surface import Shape, compare_surfaces, distances
+from tofuse.evaluation.surface import Surface, compare_surfaces, distances
 from tofuse.files.spill import Spill
 from tofuse.filters.base import apply_filters
 from tofuse.fusion.kept import KeptViews
@@ -118,12 +118,12 @@ def views_of(
     return views, masks, corrected
 
 
-def shape_of(mesh: Mesh) -> Shape:
+def shape_of(mesh: Mesh) -> Surface:
     """The mesh as what is compared."""
-    return Shape(mesh.vertices, mesh.faces)
+    return Surface(mesh.vertices, mesh.faces)
 
 
-def row(label: str, shape: Shape, truth: Shape, seen: Float64, kept: Float64) -> str:
+def row(label: str, shape: Surface, truth: Surface, seen: Float64, kept: Float64) -> str:
     """One line of the table."""
     found = compare_surfaces(shape, truth, seen=kept)
     recall = (distances(seen, shape) <= found.threshold_m).mean()
@@ -259,7 +259,7 @@ def main(arguments: list[str] | None = None) -> int:
     made, frames = simulated(options.every, options.all)
     vertices, faces = made.scene.truth_mesh()
     T_world_truth = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
-    truth = Shape(se3.transform(T_world_truth, vertices), faces)
+    truth = Surface(se3.transform(T_world_truth, vertices), faces)
     config = method(options.all)
     views, masks, corrected = views_of(frames, config)
     seen = seen_by(made, [frame.valid for frame in frames], frames)
@@ -275,7 +275,7 @@ def main(arguments: list[str] | None = None) -> int:
 
         clean = [frame.keep(mask) for frame, mask in zip(corrected, masks, strict=True)]
         for least in (1.0, 3.0):
-            peer = Shape(*o3d.fused(clean, made.poses, fitting_voxel(views), least))
+            peer = Surface(*o3d.fused(clean, made.poses, fitting_voxel(views), least))
             print(row(f"Open3D, weight {least:.0f}", peer, truth, seen, kept), flush=True)
     if options.estimated:
         mapper = Mapper(config)

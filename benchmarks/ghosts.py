@@ -27,7 +27,7 @@ import numpy as np
 
 import sequences
 from tofuse.arrays import Bool, Float64
-from tofuse.evaluation.surface import Shape, distances
+from tofuse.evaluation.surface import Surface, distances
 from tofuse.evaluation.trajectory import align
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.tsdf import fuse_surface
@@ -115,11 +115,11 @@ class Walk:
         return open_recording(folder)
 
     @cached_property
-    def surface(self) -> Shape:
+    def surface(self) -> Surface:
         """The true surface, in the world of the true poses."""
         vertices, faces = self.plan.scene.truth_mesh()
         start = self.plan.raw[0] / self.plan.sequence.frame_rate_hz
-        return Shape(se3.transform(self.plan.sequence.T_world_truth(start), vertices), faces)
+        return Surface(se3.transform(self.plan.sequence.T_world_truth(start), vertices), faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ def row(label: str, mesh: Mesh, T_true_world: Float64, walk: Walk, seen: Places,
     """One line of the table."""
     vertices = se3.transform(T_true_world, mesh.vertices.astype(float))
     off = distances(vertices, walk.surface, SAMPLES)
-    found = distances(seen.points, Shape(vertices, mesh.faces), SAMPLES) <= NEAR_M
+    found = distances(seen.points, Surface(vertices, mesh.faces), SAMPLES) <= NEAR_M
     ghosts = " | ".join(f"{100 * (off > limit).mean():.3f}" for limit in (0.05, 0.10, 0.20))
     complete = " | ".join(f"{100 * found[m].mean():.1f}" for m in (..., seen.floor, seen.dark))
     return f"| {walk}, {label} | {1e3 * ate:.0f} | {len(mesh):,} | {ghosts} | {complete} |"

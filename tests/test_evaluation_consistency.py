@@ -268,7 +268,7 @@ def test_frames_without_pose_and_unreadable_ones_are_left_out() -> None:
 def test_what_can_not_be_compared_is_said() -> None:
     clouds = [CloudFrame.of(np.ones((4, 3)), index=k) for k in range(2)]
     recording = Recording.of(ArraySource(clouds), "clouds", "test")
-    with pytest.raises(InputError, match="clouds: holds clouds"):
+    with pytest.raises(InputError, match="clouds: contains clouds"):
         map_consistency(recording, path(2))
     with pytest.raises(InputError, match="for 2 frames"):
         map_consistency(recording, path(3))

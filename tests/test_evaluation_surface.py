@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from tofuse.errors import InputError
-from tofuse.evaluation.surface import Shape, compare_surfaces, distances
+from tofuse.evaluation.surface import Surface, compare_surfaces, distances
 
-SQUARE = Shape(
+SQUARE = Surface(
     np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float), np.array([[0, 1, 2], [0, 2, 3]])
 )
 
 
 def shifted(shape, by):
-    return Shape(shape.points + by, shape.faces)
+    return Surface(shape.points + by, shape.faces)
 
 
 def slow_distance(p, a, b, c):
@@ -28,12 +28,12 @@ def slow_distance(p, a, b, c):
 
 def test_distances_to_triangles_are_those_of_a_slow_search() -> None:
     rng = np.random.default_rng(0)
-    mesh = Shape(rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3))
+    mesh = Surface(rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3))
     points = rng.normal(size=(40, 3))
     found = distances(points, mesh, 50_000)
     expected = [min(slow_distance(p, *mesh.points[face]) for face in mesh.faces) for p in points]
     np.testing.assert_allclose(found, expected, atol=0.02)
-    np.testing.assert_allclose(distances(points, Shape(points[:7]))[:7], 0, atol=1e-12)
+    np.testing.assert_allclose(distances(points, Surface(points[:7]))[:7], 0, atol=1e-12)
 
 
 def test_a_shifted_square_is_as_far_off_as_it_was_shifted() -> None:
@@ -46,7 +46,7 @@ def test_a_shifted_square_is_as_far_off_as_it_was_shifted() -> None:
 
 
 def test_a_missing_half_is_incomplete_but_accurate() -> None:
-    half = Shape(SQUARE.points * [0.5, 1, 1], SQUARE.faces)
+    half = Surface(SQUARE.points * [0.5, 1, 1], SQUARE.faces)
     found = compare_surfaces(half, SQUARE, samples=20_000)
     assert found.accuracy_m == pytest.approx(0, abs=1e-5)
     assert found.precision == 1
@@ -71,7 +71,7 @@ def test_samples_lie_evenly_on_the_faces() -> None:
 
 
 def test_clouds_are_compared_by_their_points() -> None:
-    cloud = Shape(SQUARE.samples(5000)[0])
+    cloud = Surface(SQUARE.samples(5000)[0])
     found = compare_surfaces(cloud, SQUARE, samples=20_000)
     assert found.accuracy_m == pytest.approx(0, abs=1e-5)
     assert 0.002 < found.completeness_m < 0.02  # the spacing of 5000 points
@@ -79,6 +79,6 @@ def test_clouds_are_compared_by_their_points() -> None:
 
 def test_what_can_t_be_compared_is_refused() -> None:
     with pytest.raises(InputError, match="model"):
-        compare_surfaces(Shape(np.zeros((0, 3))), SQUARE)
+        compare_surfaces(Surface(np.zeros((0, 3))), SQUARE)
     with pytest.raises(InputError, match="finite"):
-        Shape(np.full((2, 3), np.nan))
+        Surface(np.full((2, 3), np.nan))

@@ -36,9 +36,9 @@ def test_points_land_where_the_camera_says(camera: Camera) -> None:
     assert seen.sum() > 50
     assert found[seen] == pytest.approx(expected[seen], abs=1e-9)
     assert np.isnan(found[points[:, 2] <= 0]).all()
-    # What a lens can't see must not come back through its polynomials.
+    # What a lens_parameters can't see must not come back through its polynomials.
     inside = (found >= -0.5).all(1) & (found < [63.5, 47.5]).all(1)
-    wide = np.hypot(points[:, 0], points[:, 1]) > 1.1 * math.sqrt(image.reach) * points[:, 2]
+    wide = np.hypot(points[:, 0], points[:, 1]) > 1.1 * math.sqrt(image.max_radius2) * points[:, 2]
     assert not (inside & wide).any()
 
 

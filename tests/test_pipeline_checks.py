@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tofuse.evaluation.sightings import Sighting, Sightings
+from tofuse.evaluation.cross_view import CrossViewConsistency, PairConsistency
 from tofuse.geometry import se3
 from tofuse.pipeline.checks import Evidence, judge, stretches
 from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of
@@ -30,14 +30,14 @@ def registration(share=0.5, converged=True, unheld=False) -> Registration:
     return Registration(STEP, converged, 10, found, 1000, 0.3, 0.01, np.eye(6) * 1e4, free)
 
 
-def pair(i, j, share=0.95, rms=0.004, said=10_000) -> Sighting:
-    return Sighting(i, j, share * said, (1 - share) * said, share * said * rms**2)
+def pair(i, j, share=0.95, rms=0.004, said=10_000) -> PairConsistency:
+    return PairConsistency(i, j, share * said, (1 - share) * said, share * said * rms**2)
 
 
-def seen(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> Sightings:
+def seen(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> CrossViewConsistency:
     near = [pair(k, k + 1, near_share, near_rms) for k in range(8)]
     far = [pair(i, j, far_share, far_rms) for i in range(9) for j in range(i + 2, 9)]
-    return Sightings(tuple(range(9)), tuple(near + far))
+    return CrossViewConsistency(tuple(range(9)), tuple(near + far))
 
 
 def evidence(
@@ -131,7 +131,7 @@ def in_components(*others, frames=9, lost=()) -> Evidence:
     e = evidence(
         ("tracked",) * frames,
         gaps=((0, main[-1], [0.0] * 6),) if main[-1] else (),
-        images=Sightings((), ()),
+        images=CrossViewConsistency((), ()),
         components=(first, *others),
     )
     records = tuple(
@@ -317,15 +317,15 @@ def test_a_loop_that_was_found_and_rejected_is_no_news() -> None:
 
 
 def test_images_without_inliers_disagree() -> None:
-    verdict, reasons = judge(evidence(images=Sightings((0, 1), (pair(0, 1, 0.0),))))
+    verdict, reasons = judge(evidence(images=CrossViewConsistency((0, 1), (pair(0, 1, 0.0),))))
     assert verdict == "failed"
     text = "Only 0 % of overlapping measurements are consistent with the poses."
     assert reasons[0].text == text
 
 
 def test_images_that_do_not_overlap_say_nothing() -> None:
-    assert codes(evidence(images=Sightings(tuple(range(5)), ()))) == []
-    assert codes(replace(evidence(), sightings=None)) == []
+    assert codes(evidence(images=CrossViewConsistency(tuple(range(5)), ()))) == []
+    assert codes(replace(evidence(), cross_view=None)) == []
 
 
 def test_noise_that_neighbours_share_is_no_difference() -> None:
@@ -338,14 +338,14 @@ def test_views_that_are_further_apart_count_in_the_accuracy() -> None:
     assert codes(evidence(images=images)) == []
     assert images.excess_m() == pytest.approx(np.sqrt(0.02**2 - 0.004**2))
     assert seen(far_rms=0.001).excess_m() == 0
-    assert Sightings(tuple(range(9)), ()).excess_m() == 0
+    assert CrossViewConsistency(tuple(range(9)), ()).excess_m() == 0
 
 
 def test_views_that_the_others_contradict_are_named() -> None:
     said = tuple(
         pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i in range(9) for j in range(i + 1, 9)
     )
-    (reason,) = judge(evidence(images=Sightings(tuple(range(0, 18, 2)), said)))[1]
+    (reason,) = judge(evidence(images=CrossViewConsistency(tuple(range(0, 18, 2)), said)))[1]
     assert (reason.code, reason.ranges) == ("images_differ", ((12, 12),))
     assert reason.text.startswith("Frame 12 is inconsistent with most overlapping frames.")
 

@@ -1,14 +1,15 @@
-"""What changed between two sessions in one map: surfaces that appeared, and that vanished.
+"""Change detection between two sessions in one map: surfaces that appeared or vanished.
 
-A surface of one session has appeared if the other session saw through it: from views that looked
-at what lies behind. A surface of the earlier one that the later one saw through has vanished. What
-the other session did not look at, or what hid there, says nothing.
+A surface of the later session has appeared if the earlier one measured free space there; one of the
+earlier session has vanished if the later one did. Places that the other session did not see, or
+that were occluded, are not compared.
 
-Each point is compared with all views of the other session that it lands in. The standard deviation
-of a comparison is that of both measurements, scaled by how views of the same session disagree
-(which noise models do not know), and by how far the two sessions are off from each other. A view
-that saw through a point is a likelihood ratio for the change, one that saw a surface there is one
-against it; these add up over views, and voxels that have changed beyond doubt are clustered.
+Each point is compared with all views of the other session that it projects into. The standard
+deviation of a comparison is that of both measurements, scaled by the disagreement of views of the
+same session (which noise models do not include), plus the misalignment of the two sessions. A view
+with free space at a point is a likelihood ratio for a change, one with a surface there is one
+against it; log-ratios are summed over views, and voxels that have changed with high probability are
+clustered.
 """
 
 from __future__ import annotations
@@ -31,38 +32,38 @@ from tofuse.registration.view_points import ViewPoints, landing_pixels
 
 Kind = Literal["appeared", "vanished"]
 
-# Points of each view, and pairs of views of one session from which is learnt how they disagree.
-_POINTS, _LEARN = 2000, 60
-# Residuals of surfaces that are the same are below this share of the depth; the quantile of their
-# absolute values that the scale is taken from, and what it is of a normal distribution.
-_SAME, _QUANTILE, _NORMAL = 0.05, 0.5, 0.6745
-# A surface is seen again within so many standard deviations, and seen through beyond so many.
-_SEEN, _THROUGH = 3.0, 5.0
-# Probability that a view is wrong about a point for other reasons than noise, and that a point has
-# changed, before it is compared: so a view counts log(19), and two must say so more than not.
+# Points of each view, and pairs of views from which the disagreement within a session is estimated.
+_POINTS, _MAX_PAIRS = 2000, 60
+# Residuals of the same surface are below this fraction of the depth; the quantile of their absolute
+# values that the scale is estimated from, and its value for a normal distribution.
+_MAX_RESIDUAL, _QUANTILE, _NORMAL = 0.05, 0.5, 0.6745
+# A surface is the same within this many standard deviations, and free space beyond this many.
+_SAME_SIGMAS, _THROUGH_SIGMAS = 3.0, 5.0
+# Probability that a view is wrong about a point for other reasons than noise, prior probability of
+# a change, and the posterior that is required: a view counts log(19), and two more must support a
+# change than contradict it.
 _OUTLIERS, _PRIOR, _DETECT = 0.05, 0.05, 0.95
-# Views of its own session that must have seen a voxel: flying pixels move with the camera.
+# Views of its own session that must see a voxel: flying pixels move with the camera.
 _OWN_VIEWS = 2
-# Views whose axes are farther apart hardly see the same surface from the same side.
-_LEAST_COSINE = 0.25
-# Edge of a voxel in pixels at the typical depth; voxels that are nearer than so many edges are of
-# one cluster.
+# Views with larger angles between their axes hardly see a surface from the same side.
+_MIN_COSINE = 0.25
+# Edge of a voxel in pixels at the typical depth; voxels closer than this many edges form a cluster.
 _VOXEL_PIXELS, _GAP = 2.5, 3.0
-# Least surface of a change, as a share of what a view sees at the typical depth.
-_LEAST_SHARE = 0.004
+# Minimum area of a change, as a fraction of the area that a view covers at the typical depth.
+_MIN_AREA_RATIO = 0.004
 _CHUNKS = 32
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A cluster of surfaces that are there in one of two sessions only.
+    """A cluster of surfaces that exist in only one of two sessions.
 
     Attributes
     ----------
     kind
         "appeared": in the later session only; "vanished": in the earlier one only.
     points
-        (N, 3) middles of its surface, one for each voxel, m.
+        (N, 3) centroids of its surface in each voxel, world frame, m.
     voxel_m
         Edge of a voxel, m.
     """
@@ -73,23 +74,23 @@ class Change:
 
     @property
     def centre(self) -> Float64:
-        """(3,) of the box around it, m."""
+        """(3,) centre of its bounding box, world frame, m."""
         return np.asarray(0.5 * (self.points.min(0) + self.points.max(0)), np.float64)
 
     @property
     def size(self) -> Float64:
-        """(3,) edges of the box around it, along the axes of the world, m."""
+        """(3,) size of its bounding box along the axes of the world frame, m."""
         return np.asarray(np.ptp(self.points, axis=0) + self.voxel_m, np.float64)
 
     @property
     def volume_m3(self) -> float:
-        """Of the voxels that its surface fills, m^3; not of what may be inside."""
+        """Volume of the voxels that its surface fills, m^3, without any interior."""
         return len(self.points) * self.voxel_m**3
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """A view, prepared to be compared with points."""
+class _SessionView:
+    """A view, prepared for comparison with points."""
 
     view: PreparedView
     points: ViewPoints
@@ -103,7 +104,7 @@ def changes(
     after: Sequence[PreparedView],
     poses_after: Float64,
 ) -> list[Change]:
-    """Find what changed between two sessions, the largest first.
+    """Return what changed between two sessions, the largest change first.
 
     Parameters
     ----------
@@ -116,39 +117,42 @@ def changes(
         return []
     first = _prepared(before, poses_before)
     second = _prepared(after, poses_after)
-    scale = max(_scale(first), _scale(second))
-    shift = _shift(first, second, scale)
+    scale = max(_noise_scale(first), _noise_scale(second))
+    shift = _misalignment(first, second, scale)
     depth = float(np.median([v.depth for v in (*before, *after)]))
     pitch = float(np.median([v.projection.pitch for v in (*before, *after)]))
     voxel = _VOXEL_PIXELS * pitch * depth
     sight = float(np.median([v.pixels * v.projection.pitch**2 for v in (*before, *after)]))
-    least = _LEAST_SHARE * sight * depth**2 / voxel**2
+    min_voxels = _MIN_AREA_RATIO * sight * depth**2 / voxel**2
     found = []
-    ways: tuple[tuple[Kind, Sequence[_Seen], Sequence[_Seen]], ...] = (
+    ways: tuple[tuple[Kind, Sequence[_SessionView], Sequence[_SessionView]], ...] = (
         ("appeared", second, first),
         ("vanished", first, second),
     )
     for kind, own, other in ways:
-        middles = _changed(own, other, scale, shift, voxel)
-        found += [Change(kind, p, voxel) for p in _clusters(middles, voxel) if len(p) >= least]
+        points = _changed_voxels(own, other, scale, shift, voxel)
+        found += [Change(kind, p, voxel) for p in _clusters(points, voxel) if len(p) >= min_voxels]
     return sorted(found, key=lambda c: -len(c.points))
 
 
-def _prepared(views: Sequence[PreparedView], poses: Float64) -> list[_Seen]:
+def _prepared(views: Sequence[PreparedView], poses: Float64) -> list[_SessionView]:
     return [
-        _Seen(view, ViewPoints.of(view, _POINTS), nearest_depth(view), T)
+        _SessionView(view, ViewPoints.of(view, _POINTS), nearest_depth(view), T)
         for view, T in zip(views, poses, strict=True)
     ]
 
 
-def _compare(source: _Seen, target: _Seen) -> tuple[Intp, Float64, Float64, Float64, Bool]:
-    """What a view says of the points of another one.
+def _compare(
+    source: _SessionView, target: _SessionView
+) -> tuple[Intp, Float64, Float64, Float64, Bool]:
+    """Compare the points of a view with another view.
 
     Returns
     -------
-    (K,) which points land on something; their distance behind the surface that the target saw, m,
-    NaN where it has no plane; how much nearer they are than all that it saw around there, m; the
-    standard deviation of both, m; and whether both surfaces face the same way.
+    (K,) rows of the points that project to a valid pixel; their distances behind the target's
+    surface, m, NaN where it has no plane; how much closer they are than everything that the target
+    measured around the pixel, m; the standard deviation of both measurements, m; and whether both
+    surfaces face the same way.
     """
     T = se3.inverse(target.T_world_camera) @ source.T_world_camera
     points = se3.transform(T, source.points.points.astype(np.float64))
@@ -172,20 +176,20 @@ def _compare(source: _Seen, target: _Seen) -> tuple[Intp, Float64, Float64, Floa
     return at, np.where(known, behind, np.nan), nearer, sigma, facing
 
 
-def _facing(a: _Seen, b: _Seen) -> bool:
-    """Whether two views look in about the same direction."""
-    return float(a.T_world_camera[:3, 2] @ b.T_world_camera[:3, 2]) > _LEAST_COSINE
+def _look_alike(a: _SessionView, b: _SessionView) -> bool:
+    """Whether two views have similar viewing directions."""
+    return float(a.T_world_camera[:3, 2] @ b.T_world_camera[:3, 2]) > _MIN_COSINE
 
 
-def _residuals(pairs: Sequence[tuple[_Seen, _Seen]]) -> tuple[Float64, Float64]:
-    """Distances of points from the same surface in other views, m, and their sigma, m."""
+def _residuals(pairs: Sequence[tuple[_SessionView, _SessionView]]) -> tuple[Float64, Float64]:
+    """Distances of points from the same surface in other views, and their stated sigma, m."""
 
     def work(start: int, stop: int) -> list[tuple[Float64, Float64]]:
         found = []
         for source, target in pairs[start:stop]:
             at, behind, _, sigma, facing = _compare(source, target)
             z = source.points.points[at, 2]
-            same = facing & (np.abs(np.nan_to_num(behind, nan=np.inf)) < _SAME * z)
+            same = facing & (np.abs(np.nan_to_num(behind, nan=np.inf)) < _MAX_RESIDUAL * z)
             found.append((np.abs(behind[same]), sigma[same]))
         return found
 
@@ -196,22 +200,24 @@ def _residuals(pairs: Sequence[tuple[_Seen, _Seen]]) -> tuple[Float64, Float64]:
     return r, sigma
 
 
-def _scale(views: Sequence[_Seen]) -> float:
-    """How many times the stated sigma views of one session differ by."""
-    # Neighbours share errors: views that are apart by a quarter of the session as well.
+def _noise_scale(views: Sequence[_SessionView]) -> float:
+    """The disagreement of views of one session, as a multiple of the stated sigma; at least 1."""
+    # Neighbours share errors, so that views up to a quarter of the session apart are compared too.
     steps = sorted({1, max(1, len(views) // 8), max(1, len(views) // 4)})
     pairs = [(views[k], views[k + s]) for s in steps for k in range(len(views) - s)]
-    some = np.linspace(0, len(pairs) - 1, min(len(pairs), _LEARN)).round().astype(int)
+    some = np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).round().astype(int)
     r, sigma = _residuals([pairs[k] for k in np.unique(some)])
     if not len(r):
         return 1.0
     return max(float(np.quantile(r / sigma, _QUANTILE)) / _NORMAL, 1.0)
 
 
-def _shift(first: Sequence[_Seen], second: Sequence[_Seen], scale: float) -> float:
-    """How far surfaces of two sessions are off from each other beyond noise (one sigma), m."""
-    facing = [(a, b) for a in first for b in second if _facing(a, b)]
-    some = np.linspace(0, len(facing) - 1, min(len(facing), 4 * _LEARN)).round().astype(int)
+def _misalignment(
+    first: Sequence[_SessionView], second: Sequence[_SessionView], scale: float
+) -> float:
+    """The distance between surfaces of two sessions in excess of noise (one sigma), m."""
+    facing = [(a, b) for a in first for b in second if _look_alike(a, b)]
+    some = np.linspace(0, len(facing) - 1, min(len(facing), 4 * _MAX_PAIRS)).round().astype(int)
     r, sigma = _residuals([facing[k] for k in np.unique(some)])
     if not len(r):
         return 0.0
@@ -220,10 +226,14 @@ def _shift(first: Sequence[_Seen], second: Sequence[_Seen], scale: float) -> flo
     return float(np.sqrt(max(both**2 - noise**2, 0.0)))
 
 
-def _changed(
-    own: Sequence[_Seen], other: Sequence[_Seen], scale: float, shift: float, voxel: float
+def _changed_voxels(
+    own: Sequence[_SessionView],
+    other: Sequence[_SessionView],
+    scale: float,
+    shift: float,
+    voxel: float,
 ) -> Float64:
-    """(K, 3) middles of the voxels with surfaces of one session that the other saw through."""
+    """(K, 3) surface centroids of voxels where the other session measured free space."""
 
     def work(start: int, stop: int) -> list[tuple[Float64, Float64, Intp]]:
         found = []
@@ -232,13 +242,13 @@ def _changed(
             points = source.points.points.astype(np.float64)
             says = np.zeros(len(points))
             for target in other:
-                if not _facing(source, target):
+                if not _look_alike(source, target):
                     continue
                 at, behind, nearer, sigma, facing = _compare(source, target)
                 sigma = np.hypot(scale * sigma, shift)
-                # What a surface at a slant is off by along the ray says little across it.
-                through = (nearer > _THROUGH * sigma) & ~(behind > -_THROUGH * sigma)
-                again = facing & (np.abs(behind) < _SEEN * sigma)
+                # On slanted surfaces, errors along the ray exceed those along the normal.
+                through = (nearer > _THROUGH_SIGMAS * sigma) & ~(behind > -_THROUGH_SIGMAS * sigma)
+                again = facing & (np.abs(behind) < _SAME_SIGMAS * sigma)
                 says[at] += through.astype(float) - again
             found.append(
                 (se3.transform(source.T_world_camera, points), says, np.full(len(points), k))
@@ -261,7 +271,7 @@ def _changed(
 
 
 def _clusters(points: Float64, voxel: float) -> list[Float64]:
-    """Points that are near each other."""
+    """Clusters (K, 3) of points that are close to each other."""
     if not len(points):
         return []
     pairs = cKDTree(points).query_pairs(_GAP * voxel, output_type="ndarray")

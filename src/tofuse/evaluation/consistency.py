@@ -1,21 +1,21 @@
 """Map consistency: how well the range images of a recording agree under given poses.
 
-It needs no truth, so it also tells good poses from bad where the reference is no better than the
-estimate. The definition:
+It needs no ground truth, so it distinguishes good poses from bad ones even where the reference is
+no more accurate than the estimate. The definition:
 
-1. Of the frames with a pose at most `frames` are taken, evenly spaced, the first and the last
-   among them.
-2. z images are brought to 320 columns or fewer by taking every second pixel until that holds;
-   pixels outside 0.1 to 12 m don't count.
+1. Of the frames with a pose at most `frames` are used, evenly spaced, including the first and the
+   last.
+2. z images are subsampled by 2 until they have at most 320 columns; pixels outside 0.1 to 12 m are
+   invalid.
 3. A normal is the cross product of central differences over +-2 pixels of the raw points, and is
    unknown where one of the four is invalid or differs from the centre by over 5 % of its depth.
-4. A pair counts if at least 35 % of the valid pixels of each land on a valid pixel of the other
+4. A pair counts if at least 35 % of the valid pixels of each project to a valid pixel of the other
    with a difference in z under 0.25 m.
 5. The later image's points are compared with the plane at the pixel of the earlier one that they
-   land on. Inliers are those with a normal there and at most 0.10 m from the point there.
+   project to. Inliers are those with a normal there and at most 0.10 m from the point there.
 
-The figures are the rms of the inliers' distances from the plane and the share of inliers among
-the points that land on a pixel with a normal, pooled over all pairs.
+The figures are the rms distance of the inliers from the plane, and the fraction of inliers among
+the points that project to a pixel with a normal, pooled over all pairs.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from tofuse.recordings.recording import Recording, evenly
 MAX_COLUMNS = 320
 MIN_DEPTH, MAX_DEPTH = 0.1, 12.0  # m
 NORMAL_REACH = 2  # pixels
-NORMAL_JUMP = 0.05  # share of the depth
-MIN_OVERLAP = 0.35  # share of the valid pixels, both ways
+NORMAL_JUMP = 0.05  # fraction of the depth
+MIN_OVERLAP = 0.35  # fraction of the valid pixels, both ways
 SAME_SURFACE = 0.25  # m
 INLIER_DISTANCE = 0.10  # m
-FRAMES = 100
+MAX_FRAMES = 100
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class PairAgreement:
     Attributes
     ----------
     i, j
-        Positions of the views in what was given; i < j.
+        Positions of the views in the input; i < j.
     overlap
-        The smaller of the two shares of step 4.
+        The smaller of the two fractions of step 4.
     compared
-        Points of j that land on a pixel of i with a normal.
+        Number of points of j that project to a pixel of i with a normal.
     inliers
-        Those of them within 0.10 m of the point there.
+        Number of these within 0.10 m of the point there.
     squares
         Sum of the inliers' squared distances from the plane, m^2.
     """
@@ -79,7 +79,7 @@ class PairAgreement:
 
     @property
     def inlier_share(self) -> float:
-        """Inliers as a share of the points compared; NaN if there are none."""
+        """Fraction of inliers among the points compared, 0 to 1; NaN if there are none."""
         return self.inliers / self.compared if self.compared else np.nan
 
 
@@ -92,11 +92,11 @@ class Consistency:
     rms_m
         Pooled rms of the inliers' distances from the plane, m; NaN if no pair counts.
     inlier_share
-        Pooled share of inliers, 0 to 1; NaN if no pair counts.
+        Pooled fraction of inliers, 0 to 1; NaN if no pair counts.
     pairs
-        How many pairs of views count.
+        Number of pairs of views that count.
     frames
-        How many views were looked at.
+        Number of views that were used.
     agreements
         The pairs that count, in order of (i, j).
     """
@@ -109,7 +109,7 @@ class Consistency:
 
     @classmethod
     def of(cls, agreements: Sequence[PairAgreement], frames: int) -> Consistency:
-        """Pool the pairs that count of so many views."""
+        """Pool the pairs that count, of a number of views."""
         compared = sum(p.compared for p in agreements)
         inliers = sum(p.inliers for p in agreements)
         squares = sum(p.squares for p in agreements)
@@ -122,7 +122,7 @@ class Consistency:
         )
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """Return the pooled figures as plain data; None where there is nothing to measure."""
+        """Return the pooled figures as plain data; None instead of NaN."""
         return {
             "rms_m": _known(self.rms_m),
             "inlier_share": _known(self.inlier_share),
@@ -140,7 +140,7 @@ class SurfaceImage:
     camera
         The camera, at full resolution.
     step
-        Every how many pixels of the camera one was taken.
+        Every n-th pixel of the camera is used.
     points
         (H, W, 3) in m, z = 0 where invalid.
     normals
@@ -158,10 +158,12 @@ class SurfaceImage:
 
         Parameters
         ----------
+        frame
+            The frame.
         depth_unit_m
-            What one count of the recording's depth images is, if known. Depths in single
-            precision are then put back on that grid, so that comparisons with a limit which counts
-            can meet exactly go as they do in double precision.
+            Unit of the recording's depth images in m, if known. Depths in single precision are
+            then rounded to it, so that comparisons with limits which counts can meet exactly have
+            the same outcome as in double precision.
         """
         depth = frame.depth.astype(np.float64)
         if depth_unit_m:
@@ -182,12 +184,12 @@ class SurfaceImage:
 
     @cached_property
     def valid(self) -> int:
-        """How many pixels are valid."""
+        """Number of valid pixels."""
         return int(np.count_nonzero(self.points[..., 2]))
 
     @cached_property
-    def lens(self) -> Float64 | None:
-        """Numbers of the lens for `project_by_lens` at this resolution; None for other cameras."""
+    def lens_parameters(self) -> Float64 | None:
+        """Lens parameters of `project_by_lens` at this resolution; None without a lens model."""
         camera = self.camera
         if not isinstance(camera, Pinhole):
             return None
@@ -195,22 +197,22 @@ class SurfaceImage:
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         size = [getattr(camera, name) / self.step for name in ("fx", "fy", "cx", "cy")]
         bend = [getattr(camera, name, 0.0) for name in names]
-        return np.array([*size, *bend, model, self.reach], float)
+        return np.array([*size, *bend, model, self.max_radius2], float)
 
     @cached_property
-    def reach(self) -> float:
-        """The largest x^2 + y^2 at z = 1 that a pixel sees, with a margin."""
+    def max_radius2(self) -> float:
+        """The largest x^2 + y^2 at z = 1 in the field of view, with a margin."""
         return 1.1 * float(np.nanmax((_rays(self.camera) ** 2).sum(-1)))
 
     def pixels(self, points: Float64) -> Float64:
-        """Pixels (N, 2) of this resolution that points (N, 3) in the camera frame land on."""
+        """Project points (N, 3) in the camera frame to pixels (N, 2) of this resolution."""
         out = np.full((len(points), 2), np.nan)
-        if self.lens is not None:
-            project_by_lens(points, self.lens, out)
+        if self.lens_parameters is not None:
+            project_by_lens(points, self.lens_parameters, out)
             return out
-        # Other cameras project slowly: only what can be in view.
+        # Other cameras project slowly: only points that can be in view.
         x, y, z = points.T
-        seen = (z > 0.05) & (x * x + y * y <= self.reach * z * z)
+        seen = (z > 0.05) & (x * x + y * y <= self.max_radius2 * z * z)
         out[seen] = self.camera.project(points[seen]) / self.step
         return out
 
@@ -218,22 +220,36 @@ class SurfaceImage:
 def pair_agreement(
     a: SurfaceImage, b: SurfaceImage, T_a_b: Float64, i: int = 0, j: int = 1
 ) -> PairAgreement | None:
-    """Compare view b with the earlier view a; None if they overlap too little (step 4)."""
-    forth, compared, inliers, squares = _land(a, b, T_a_b)
+    """Compare view b with the earlier view a.
+
+    Parameters
+    ----------
+    a, b
+        The views.
+    T_a_b
+        (4, 4) relative pose.
+    i, j
+        Their positions, for the result.
+
+    Returns
+    -------
+    None if they overlap too little (step 4).
+    """
+    forth, compared, inliers, squares = _compare(a, b, T_a_b)
     overlap = forth / max(b.valid, 1)
     if overlap < MIN_OVERLAP:
         return None
-    back, *_ = _land(b, a, se3.inverse(T_a_b))
+    back, *_ = _compare(b, a, se3.inverse(T_a_b))
     overlap = min(overlap, back / max(a.valid, 1))
     if overlap < MIN_OVERLAP:
         return None
     return PairAgreement(i, j, overlap, compared, inliers, squares)
 
 
-def agreement(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
+def consistency_of_images(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
     """Map consistency of prepared views under poses (N, 4, 4) T_world_camera, over all pairs.
 
-    The same on any number of threads; must not be called from inside a chunk of `run_chunks`.
+    Independent of the number of threads; must not be called inside a chunk of `run_chunks`.
     """
     T = np.asarray(poses, float)
     pairs = [(i, j) for i in range(len(images)) for j in range(i + 1, len(images))]
@@ -253,37 +269,39 @@ def agreement(images: Sequence[SurfaceImage], poses: ArrayLike) -> Consistency:
 def map_consistency(
     recording: Recording,
     poses: ArrayLike,
-    frames: int = FRAMES,
+    frames: int = MAX_FRAMES,
     correctors: Sequence[Corrector] = (),
 ) -> Consistency:
     """Map consistency of a recording under poses of its frames.
 
+    Frames that can't be read are left out.
+
     Parameters
     ----------
+    recording
+        Range images.
     poses
         (M, 4, 4) T_world_camera of the M frames of the recording, NaN where there is none; see
         `poses_of_frames` for a trajectory with its own times.
     frames
-        How many frames to look at, at most.
+        Maximum number of frames to use.
     correctors
-        What puts frames right before.
-
-    Frames that can't be read are left out.
+        Corrections that are applied to the frames first.
 
     Raises
     ------
     InputError
-        If the recording holds clouds, or the poses are not one for each frame.
+        If the recording contains clouds, or the number of poses is not that of the frames.
     """
     T = np.asarray(poses, float)
     if T.shape != (len(recording), 4, 4):
         raise InputError(
             f"have shape {T.shape}, for {len(recording)} frames",
             where="poses",
-            remedy="give one each",
+            remedy="pass one pose per frame",
         )
     if frames < 1:
-        raise InputError(f"is {frames}", where="frames", remedy="give 1 or more")
+        raise InputError(f"is {frames}", where="frames", remedy="use 1 or more")
     unit = recording.metadata.get("depth_unit_m")
     chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), frames)
     images, used = [], []
@@ -294,16 +312,16 @@ def map_consistency(
             continue
         if not isinstance(frame, RangeFrame):
             raise InputError(
-                "holds clouds, and map consistency compares images",
+                "contains clouds, but map consistency compares range images",
                 where=recording.path,
-                remedy="leave --recording out",
+                remedy="leave out --recording",
             )
         for corrector in correctors:
             frame = corrector.apply(frame)
         assert isinstance(frame, RangeFrame)
         images.append(SurfaceImage.of(frame, unit))
         used.append(int(k))
-    return agreement(images, T[used])
+    return consistency_of_images(images, T[used])
 
 
 def consistency_of_frames(
@@ -311,18 +329,26 @@ def consistency_of_frames(
 ) -> Consistency:
     """Map consistency of frames in memory under their poses (N, 4, 4) T_world_camera.
 
-    Looks at no more than `limit` of them, evenly spaced. Frames without a pose (NaN) don't count.
+    Uses at most `limit` of them, evenly spaced. Frames without a pose (NaN) are left out.
     """
     T = np.asarray(poses, float)
     chosen = evenly(np.flatnonzero(np.isfinite(T).all((1, 2))), limit)
-    return agreement([SurfaceImage.of(frames[k]) for k in chosen], T[chosen])
+    return consistency_of_images([SurfaceImage.of(frames[k]) for k in chosen], T[chosen])
 
 
 def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -> Float64:
-    """Give each pose (P, 4, 4) to the frame nearest in time, if that is within 0.02 s.
+    """Assign each pose to the frame nearest in time, if that is within 0.02 s.
 
-    Returns (M, 4, 4), NaN for the frames at `times` (M,) without a pose. Of several poses for one
-    frame the last is taken.
+    Parameters
+    ----------
+    times
+        (M,) times of the frames, s.
+    pose_times, poses
+        (P,) s and (P, 4, 4).
+
+    Returns
+    -------
+    (M, 4, 4), NaN for frames without a pose. Of several poses for a frame the last one is used.
     """
     times, pose_times = np.asarray(times, float), np.asarray(pose_times, float)
     out = np.full((len(times), 4, 4), np.nan)
@@ -335,18 +361,18 @@ def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -
     return out
 
 
-def _land(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
-    """Compare b's points, in a's frame, with the pixels of a that they land on."""
+def _compare(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
+    """Compare b's points, in a's frame, with the pixels of a that they project to."""
     points = b.points.reshape(-1, 3)
-    moved = np.empty_like(points)
-    move_points(points, np.ascontiguousarray(T_a_b), moved)
+    transformed = np.empty_like(points)
+    move_points(points, np.ascontiguousarray(T_a_b), transformed)
     return agreement_sums(
-        moved, a.pixels(moved), a.points, a.normals, SAME_SURFACE, INLIER_DISTANCE
+        transformed, a.pixels(transformed), a.points, a.normals, SAME_SURFACE, INLIER_DISTANCE
     )
 
 
 def _rays(camera: Camera) -> Float64:
-    """(H, W, 2) rays in double precision: exact for a pinhole, whose table is rounded."""
+    """(H, W, 2) rays in double precision: computed exactly for a pinhole camera."""
     if type(camera) is Pinhole:
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
         return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)

@@ -1,4 +1,4 @@
-"""How near a model is to a reference: accuracy, completeness, F-score (Knapitsch et al. 2017)."""
+"""Errors of a model: accuracy, completeness, F-score (Knapitsch et al. 2017)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from tofuse.arrays import Float64, Int64
 from tofuse.errors import InputError
 from tofuse.kernels.kdtree import KdTree
 
-_SAMPLED = 400_000  # points of a mesh
-_TRIED = 4  # samples of a mesh near a point whose triangles are tried
+_SAMPLES = 400_000  # points on a mesh
+_CANDIDATES = 4  # nearest samples of a mesh whose triangles are tested
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
-    """A cloud, or with `faces` a mesh: what models are compared as.
+class Surface:
+    """A point cloud, or with `faces` a mesh.
 
     Attributes
     ----------
@@ -36,21 +36,21 @@ class Shape:
             raise InputError(
                 f"has shape {points.shape}, or numbers that are not finite",
                 where="points of a model",
-                remedy="give (N, 3) finite numbers in metres",
+                remedy="pass (N, 3) finite numbers in metres",
             )
         object.__setattr__(self, "points", points)
 
     @property
     def area(self) -> float:
-        """Of all faces, m^2; 0 of a cloud."""
+        """Area of all faces, m^2; 0 for a cloud."""
         if self.faces is None:
             return 0.0
         return float(_areas(self.points[self.faces]).sum())
 
     def samples(self, count: int, seed: int = 0) -> tuple[Float64, Int64]:
-        """Return points spread evenly over the faces, and the face of each; a cloud's own, and -1.
+        """Return points (K, 3) spread evenly over the faces, and their faces (K,).
 
-        Of a cloud with more than `count` points some are taken, at random.
+        For a cloud, at most `count` of its own points, chosen at random, and -1.
         """
         if self.faces is None or len(self.faces) == 0:
             points = self.points
@@ -59,13 +59,13 @@ class Shape:
                 points = points[np.sort(rng.permutation(len(points))[:count])]
             return points, np.full(len(points), -1)
         corners = self.points[self.faces]
-        share = np.cumsum(_areas(corners))
-        if not share[-1] > 0:
+        cumulative = np.cumsum(_areas(corners))
+        if not cumulative[-1] > 0:
             return self.points, np.full(len(self.points), -1)
         rng = np.random.default_rng([seed, len(corners)])
-        # One in each of as many equal parts of the area: even, not just random.
-        at = (np.arange(count) + rng.random(count)) / count * share[-1]
-        face = np.minimum(np.searchsorted(share, at, side="right"), len(corners) - 1)
+        # Stratified sampling: one point in each of `count` equal parts of the area.
+        at = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
+        face = np.minimum(np.searchsorted(cumulative, at, side="right"), len(corners) - 1)
         u, v = rng.random((2, count, 1))
         flip = u + v > 1
         u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
@@ -80,17 +80,17 @@ class SurfaceErrors:
     Attributes
     ----------
     accuracy_m, accuracy_median_m, accuracy_p95_m
-        Mean, median and 95th percentile of the distance from the model to the reference; from its
-        points, or evenly over its faces.
+        Mean, median and 95th percentile of the distance from the model to the reference, over its
+        points or evenly over its faces.
     completeness_m
         Mean distance from the reference to the model.
     precision, recall, fscore
-        Share of the model within `threshold_m` of the reference, of the reference within
-        `threshold_m` of the model (its completeness), and their harmonic mean.
+        Fraction of the model within `threshold_m` of the reference, of the reference within
+        `threshold_m` of the model, and their harmonic mean.
     outliers
-        Share of the model farther than `outlier_m` from the reference.
+        Fraction of the model farther than `outlier_m` from the reference.
     threshold_m, outlier_m
-        As given.
+        The limits, m.
     """
 
     accuracy_m: float
@@ -106,13 +106,13 @@ class SurfaceErrors:
 
 
 def compare_surfaces(
-    model: Shape,
-    reference: Shape,
+    model: Surface,
+    reference: Surface,
     *,
     threshold_m: float = 0.01,
     outlier_m: float = 0.05,
     seen: ArrayLike | None = None,
-    samples: int = _SAMPLED,
+    samples: int = _SAMPLES,
 ) -> SurfaceErrors:
     """Compare a model with a reference in the same frame.
 
@@ -121,12 +121,12 @@ def compare_surfaces(
     model, reference
         Meshes or clouds. Distances to a mesh are those to its triangles.
     threshold_m, outlier_m
-        What counts as near, and as far off.
+        Maximum distance of an inlier, and minimum distance of an outlier, m.
     seen
-        (K, 3) points of the reference that could be seen: only they have to be in the model. All
-        of the reference unless given.
+        (K, 3) visible points of the reference, the only ones that completeness counts; by default
+        the whole reference.
     samples
-        How many points stand for a mesh.
+        Number of points that represent a mesh.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def compare_surfaces(
     """
     for name, shape in (("model", model), ("reference", reference)):
         if len(shape.points) == 0:
-            raise InputError("is empty", where=name, remedy="give a model with points")
+            raise InputError("is empty", where=name, remedy="pass a model with points")
     points, _ = model.samples(samples, seed=1)
     off = distances(points, reference, samples)
     wanted = reference.samples(samples, seed=2)[0] if seen is None else np.asarray(seen, float)
@@ -157,11 +157,20 @@ def compare_surfaces(
     )
 
 
-def distances(points: ArrayLike, shape: Shape, samples: int = _SAMPLED) -> Float64:
-    """Distance (K,) in m from points (K, 3) to a cloud's points or a mesh's triangles.
+def distances(points: ArrayLike, shape: Surface, samples: int = _SAMPLES) -> Float64:
+    """Return distances (K,) in m from points (K, 3) to a cloud's points or a mesh's triangles.
 
-    A mesh is sampled; the distance is that to the nearest of the triangles of the 4 nearest
-    samples, which may be too large where samples are sparse, but is never too small.
+    For a mesh, the distance to the nearest of the triangles of the 4 nearest samples: never too
+    small, but possibly too large where samples are sparse.
+
+    Parameters
+    ----------
+    points
+        (K, 3), m.
+    shape
+        The cloud or mesh.
+    samples
+        Number of points that represent a mesh.
     """
     points = np.asarray(points, float)
     found, face = shape.samples(samples)
@@ -169,7 +178,7 @@ def distances(points: ArrayLike, shape: Shape, samples: int = _SAMPLED) -> Float
     if shape.faces is None or (len(face) and face[0] < 0):
         return np.sqrt(tree.nearest(points)[1])
     corners = shape.points[shape.faces]
-    near, _ = tree.neighbours(points, min(_TRIED, len(found)))
+    near, _ = tree.neighbours(points, min(_CANDIDATES, len(found)))
     best = np.full(len(points), np.inf)
     for column in near.T:
         best = np.minimum(best, _to_triangles(points, corners[face[column]]))

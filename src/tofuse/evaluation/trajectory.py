@@ -1,4 +1,4 @@
-"""How far a trajectory is from a reference: absolute and relative errors, and coverage."""
+"""Errors of a trajectory against a reference: absolute and relative errors, and coverage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tofuse.geometry import se3
 
 MAX_GAP_S = 0.02
 RPE_FRAMES = (1, 30)
-# Spread of positions, m^2, that orientations weigh as much as in the alignment: (10 um)^2.
+# Weight of orientations in the alignment, as a spread of positions in m^2: (10 um)^2.
 _ORIENTATION_WEIGHT = 1e-10
 
 
@@ -25,9 +25,9 @@ class RelativeError:
     Attributes
     ----------
     frames
-        Distance between the two poses of a pair, in associated poses.
+        Distance between the two poses of a pair, counted in associated poses.
     pairs
-        How many pairs there are.
+        Number of pairs.
     translation_rms_m, rotation_rms_rad
         Root mean square over the pairs; NaN if there are none.
     """
@@ -38,7 +38,7 @@ class RelativeError:
     rotation_rms_rad: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data, angles in degrees; None where nothing could be measured."""
+        """Return plain data, angles in degrees; None instead of NaN."""
         return {
             "frames": self.frames,
             "pairs": self.pairs,
@@ -49,28 +49,28 @@ class RelativeError:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryError:
-    """How far an estimated trajectory is from a reference.
+    """Errors of an estimated trajectory against a reference.
 
     Attributes
     ----------
     associated
-        How many poses of the two were matched in time.
+        Number of poses that were associated by time.
     coverage
-        Share of the frames with a reference pose that have an estimated one, 0 to 1.
+        Fraction of the frames with a reference pose that have an estimated one, 0 to 1.
     ate_rms_m
         Root mean square distance of the positions after alignment, m.
     ate_max_m
         The largest of these distances, m.
     rotation_rms_rad
-        Root mean square angle between the orientations, rad, after the one rotation that brings
-        the orientations together best. It is found from them alone, because positions say little
-        about it where a camera turns on the spot.
+        Root mean square angle between the orientations, rad, after alignment by one rotation that
+        is estimated from the orientations alone: positions hardly constrain it where a camera
+        rotates in place.
     relative
         Relative pose errors over 1 and 30 frames.
     T_reference_estimate
         (4, 4) the alignment: maps the estimate's world into the reference's.
     pairs
-        (A, 2) positions of the matched poses in the estimate and in the reference.
+        (A, 2) rows of the associated poses in the estimate and in the reference.
     position_errors
         (A, 3) aligned estimate minus reference, m, in the reference's world.
     """
@@ -86,8 +86,9 @@ class TrajectoryError:
     position_errors: Float64
 
     def ate_within(self, reference_m: float) -> tuple[float, float]:
-        """Bounds in m of the true ATE, if the reference is off by up to `reference_m`, rms after
-        alignment: the rms distance after alignment obeys the triangle inequality.
+        """Return bounds of the true ATE in m, for a reference with an rms error of `reference_m`.
+
+        The rms distance after alignment obeys the triangle inequality.
         """
         return max(self.ate_rms_m - reference_m, 0.0), self.ate_rms_m + reference_m
 
@@ -118,7 +119,7 @@ def evaluate_trajectory(
     estimate_times, estimate
         (N,) s and (N, 4, 4) T_world_camera, NaN where there is none.
     reference_times, reference
-        (M,) s and (M, 4, 4), in a world of its own, NaN where there is none.
+        (M,) s and (M, 4, 4), in its own world frame, NaN where there is none.
     frame_times
         (F,) s of the recording's frames, if known. Coverage is then counted over the frames with
         a reference pose; else over the reference poses.
@@ -137,12 +138,12 @@ def evaluate_trajectory(
         raise InputError(
             f"no pose is within {MAX_GAP_S} s of a reference pose",
             where="timestamps",
-            remedy="give trajectories of the same recording, in seconds",
+            remedy="use trajectories of the same recording, with times in seconds",
         )
     T_estimate, T_reference = estimate[pairs[:, 0]], reference[pairs[:, 1]]
     T_align = align(T_estimate, T_reference)
-    moved = T_align @ T_estimate
-    errors = moved[:, :3, 3] - T_reference[:, :3, 3]
+    aligned = T_align @ T_estimate
+    errors = aligned[:, :3, 3] - T_reference[:, :3, 3]
     distances = np.linalg.norm(errors, axis=1)
     angles = angles_between(T_estimate, T_reference)
     return TrajectoryError(
@@ -159,9 +160,18 @@ def evaluate_trajectory(
 
 
 def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S) -> Intp:
-    """Match times (N,) with times (M,) one to one, less than `max_gap` s apart, closest first.
+    """Associate times one to one, less than `max_gap` s apart, closest first.
 
-    NaN matches nothing. Returns (A, 2) positions in a and b, in order of a's time.
+    Parameters
+    ----------
+    times_a, times_b
+        (N,) and (M,) s; NaN is never associated.
+    max_gap
+        Maximum difference, s.
+
+    Returns
+    -------
+    (A, 2) rows in a and b, in order of a's time.
     """
     a, b = np.asarray(times_a, float), np.asarray(times_b, float)
     order_b = np.argsort(b, kind="stable")
@@ -188,13 +198,13 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, max_gap: float = MAX_GAP_S
 
 
 def align(estimate: ArrayLike, reference: ArrayLike) -> Float64:
-    """Find the rigid motion (4, 4), without scale, that brings one trajectory onto another.
+    """Return the rigid motion (4, 4) T_reference_estimate that aligns a trajectory with another.
 
-    It minimises the squared distances of the positions of poses (N, 4, 4), matched in order
-    (Horn 1987; Arun et al. 1987; Umeyama 1991 with scale 1). Positions leave the rotation open in
-    part where they lie on a line, and altogether where they lie at one place: a rail, a camera
-    turning on the spot, one or two poses. The orientations decide what is left open. They always
-    take part, but with the weight of 10 um of spread, so they never change what positions say.
+    It minimises the squared distances of the positions of associated poses (N, 4, 4), without scale
+    (Horn 1987; Arun et al. 1987; Umeyama 1991 with scale 1). Collinear positions leave one rotation
+    unconstrained, coincident ones all: a rail, a camera rotating in place, one or two poses. There
+    the orientations determine it. They always contribute, but with the weight of 10 um of spread,
+    which is negligible wherever the positions constrain the rotation.
     """
     T_e, T_r = np.asarray(estimate, float), np.asarray(reference, float)
     centre_e, centre_r = T_e[:, :3, 3].mean(0), T_r[:, :3, 3].mean(0)
@@ -207,25 +217,25 @@ def align(estimate: ArrayLike, reference: ArrayLike) -> Float64:
 
 
 def distances_between(estimate: Float64, reference: Float64) -> Float64:
-    """(N,) distances of the positions of poses (N, 4, 4), matched in order, after `align`, m."""
-    moved = align(estimate, reference) @ estimate
-    return np.asarray(np.linalg.norm(moved[:, :3, 3] - reference[:, :3, 3], axis=1), np.float64)
+    """(N,) distances in m between positions of associated poses (N, 4, 4), after `align`."""
+    aligned = align(estimate, reference) @ estimate
+    return np.asarray(np.linalg.norm(aligned[:, :3, 3] - reference[:, :3, 3], axis=1), np.float64)
 
 
 def angles_between(estimate: Float64, reference: Float64) -> Float64:
-    """(N,) angles of poses (N, 4, 4), after the rotation that brings them together best, rad."""
+    """(N,) angles in rad between orientations of associated poses (N, 4, 4), after alignment."""
     R_estimate, R_reference = estimate[:, :3, :3], reference[:, :3, :3]
     turn = mean_rotation(R_reference @ np.swapaxes(R_estimate, 1, 2))
     return np.asarray(se3.angle(np.swapaxes(R_reference, 1, 2) @ (turn @ R_estimate)), np.float64)
 
 
 def displacement(before: Float64, after: Float64) -> tuple[float, float]:
-    """Rms by which poses (N, 4, 4) differ: positions, m, and rotations, rad, each aligned."""
+    """Rms differences of associated poses (N, 4, 4): positions (m), rotations (rad), aligned."""
     return _rms(distances_between(after, before)), _rms(angles_between(after, before))
 
 
 def relative_error(estimate: Float64, reference: Float64, frames: int) -> RelativeError:
-    """Compare the motions over `frames` poses of two trajectories (N, 4, 4), matched in order."""
+    """Compare the motions over `frames` poses of two associated trajectories (N, 4, 4)."""
     if len(estimate) <= frames:
         return RelativeError(frames, 0, np.nan, np.nan)
     motion_e = se3.inverse(estimate[:-frames]) @ estimate[frames:]
@@ -266,7 +276,7 @@ def _coverage(
 def _poses(poses: ArrayLike, name: str) -> Float64:
     T = np.asarray(poses, float)
     if T.ndim != 3 or T.shape[1:] != (4, 4):
-        raise InputError(f"has shape {T.shape}", where=name, remedy="give (N, 4, 4) poses")
+        raise InputError(f"has shape {T.shape}", where=name, remedy="pass (N, 4, 4) poses")
     return T
 
 
@@ -275,7 +285,7 @@ def _times(times: ArrayLike, poses: Float64, name: str) -> Float64:
     t = np.asarray(times, float)
     if t.shape != (len(poses),):
         raise InputError(
-            f"has {t.size} times for {len(poses)} poses", where=name, remedy="give one for each"
+            f"has {t.size} times for {len(poses)} poses", where=name, remedy="pass one per pose"
         )
     return np.where(np.isfinite(poses).all((1, 2)), t, np.nan)
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from tofuse.arrays import Float64, Intp
-from tofuse.evaluation.sightings import Sightings, sightings
+from tofuse.evaluation.cross_view import CrossViewConsistency, cross_view_consistency
 from tofuse.evaluation.trajectory import displacement
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.model import Model, ModelBuilder
@@ -249,8 +249,8 @@ class BackEnd:
         self._progress.stage("checking")
         loops = tuple(c.record for c in closed.loops)
         with self._watch.timing("checking"):
-            sightings = self._sightings(graph)
-            accuracy, covariances = self._accuracy(closed, refined, model, sightings)
+            cross_view = self._cross_view(graph)
+            accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
             if kept.knows_errors:
                 model = self._with_pose_errors(model, graph, covariances)
             records = self._records(covariances)
@@ -260,7 +260,7 @@ class BackEnd:
                 loops,
                 closed.judged.sequential if self._tracks else graph.poses,
                 closed.judged.optimisation,
-                sightings,
+                cross_view,
                 accuracy,
                 model.cloud.diagonal_m,
                 self._config.tolerance_m,
@@ -365,7 +365,11 @@ class BackEnd:
         return build_graph(ids, poses, [*sequence, *needed, *again], closing)
 
     def _accuracy(
-        self, closed: Closed, refined: Refined, model: Model, sightings: Sightings | None
+        self,
+        closed: Closed,
+        refined: Refined,
+        model: Model,
+        cross_view: CrossViewConsistency | None,
     ) -> tuple[Accuracy, Float64]:
         """How far off the final poses may be, and their covariances (P, 6, 6).
 
@@ -383,7 +387,7 @@ class BackEnd:
         moved = 0.0, 0.0
         if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
-        excess = 0.0 if sightings is None else sightings.excess_m()
+        excess = 0.0 if cross_view is None else cross_view.excess_m()
         suspicion, gap = refinement.suspicion, (0.0, 0.0)
         if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
             gap = suspicion.gap.before
@@ -436,10 +440,10 @@ class BackEnd:
                 hanging |= sides[1] if first in sides[0] else sides[0]
         return tuple(index for index, c in component_of.items() if c in hanging)
 
-    def _sightings(self, graph: PoseGraph) -> Sightings | None:
+    def _cross_view(self, graph: PoseGraph) -> CrossViewConsistency | None:
         """What overlapping images say of the final poses."""
         frames, at = self._checked(graph)
-        return sightings(frames, graph.poses[at]) if len(frames) > 1 else None
+        return cross_view_consistency(frames, graph.poses[at]) if len(frames) > 1 else None
 
     def _checked(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """The images that are compared in the end, and where their poses are in the graph."""

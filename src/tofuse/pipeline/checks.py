@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.evaluation.sightings import Sightings
+from tofuse.evaluation.cross_view import CrossViewConsistency
 from tofuse.geometry import se3
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.posegraph.accuracy import Accuracy
@@ -66,7 +66,7 @@ class Evidence:
         (N, 4, 4) poses before optimisation, of the frames in the main model.
     optimisation
         The graph after it.
-    sightings
+    cross_view
         What overlapping images say of the final poses; None where there are too few.
     accuracy
         Of the final poses.
@@ -105,7 +105,7 @@ class Evidence:
     loops: tuple[LoopRecord, ...]
     sequential: Float64
     optimisation: Optimisation
-    sightings: Sightings | None
+    cross_view: CrossViewConsistency | None
     accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
     diagonal_m: float = 0.0
     tolerance_m: float | None = None
@@ -522,30 +522,30 @@ def _gap(e: Evidence) -> Iterator[Reason]:
 
 
 def _images(e: Evidence) -> Iterator[Reason]:
-    if e.sightings is not None:
-        yield from images(e.sightings, e.posed)
+    if e.cross_view is not None:
+        yield from images(e.cross_view, e.posed)
 
 
-def images(s: Sightings, everything: tuple[Range, ...]) -> Iterator[Reason]:
+def images(s: CrossViewConsistency, everything: tuple[Range, ...]) -> Iterator[Reason]:
     """Give reasons where overlapping images contradict the poses of a stretch of frames."""
-    if not np.isfinite(s.share()):
+    if not np.isfinite(s.support()):
         return
-    found = f"{_percent(s.share())} of overlapping measurements are consistent with the poses"
+    found = f"{_percent(s.support())} of overlapping measurements are consistent with the poses"
     if np.isfinite(s.rms_m()):
         found += f" ({s.rms_m() * 1e3:.1f} mm rms)"
-    if s.share() < CONTRADICTED_SHARE:
+    if s.support() < CONTRADICTED_SHARE:
         yield Reason("images_disagree", everything, f"Only {found}.")
         return
     texts = []
-    alone = runs(s.frames, [share < CONTRADICTED_SHARE for share in s.share_of_views()])
+    alone = runs(s.frames, [share < CONTRADICTED_SHARE for share in s.support_of_views()])
     if alone:
         verb = "is" if is_one(alone) else "are"
         texts.append(f"{_sentence(alone)} {verb} inconsistent with most overlapping frames.")
     # Images next to each other see the same errors of the sensor, but hardly any drift. By how much
     # they are apart is in the bounds; how many are not there at all is not.
     near = [p for p in s.pairs if p.j == p.i + 1]
-    share = s.share(near)
-    if s.share() < AGREEMENT_RATIO * share:
+    share = s.support(near)
+    if s.support() < AGREEMENT_RATIO * share:
         nearby = f"{_percent(share)} ({s.rms_m(near) * 1e3:.1f} mm rms)"
         texts.append(f"{found}, but {nearby} in consecutive images.")
     if texts:

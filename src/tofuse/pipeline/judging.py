@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.arrays import Float64
 from tofuse.errors import InputError, UnreadableFrameError
 from tofuse.evaluation.consistency import Consistency, map_consistency
-from tofuse.evaluation.sightings import Sightings, compared, prepared
+from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views, prepare_for_comparison
 from tofuse.evaluation.trajectory import displacement, distances_between
 from tofuse.files.trajectory_formats import read_poses
 from tofuse.geometry import se3
@@ -178,18 +178,18 @@ def judge(
 class Seen:
     """What overlapping images say of poses."""
 
-    sightings: Sightings
+    cross_view: CrossViewConsistency
 
     @property
     def overlapping(self) -> float:
         """Share of the views that overlap with another one."""
-        shares = self.sightings.share_of_views()
+        shares = self.cross_view.support_of_views()
         return float(np.isfinite(shares).mean()) if len(shares) else 0.0
 
     @property
     def support(self) -> float:
         """Share of the overlapping measurements that support the poses, times `overlapping`."""
-        return float(np.nan_to_num(self.sightings.share())) * self.overlapping
+        return float(np.nan_to_num(self.cross_view.support())) * self.overlapping
 
     @property
     def is_supported(self) -> bool:
@@ -209,7 +209,7 @@ class _Images:
         rows = evenly(np.flatnonzero(np.isfinite(poses).all((1, 2))), _CHECKED).tolist()
         found = [(k, view) for k in rows if (view := self._view(k)) is not None]
         chosen = [k for k, _ in found]
-        return Seen(compared([view for _, view in found], poses[chosen]))
+        return Seen(compare_views([view for _, view in found], poses[chosen]))
 
     def _view(self, k: int) -> PreparedView | None:
         """The k-th frame, prepared; None if it can't be read."""
@@ -218,7 +218,9 @@ class _Images:
                 frame = self._recording[k]
             except UnreadableFrameError:
                 frame = None
-            self._views[k] = prepared(frame) if isinstance(frame, RangeFrame) else None
+            self._views[k] = (
+                prepare_for_comparison(frame) if isinstance(frame, RangeFrame) else None
+            )
         return self._views[k]
 
 
@@ -410,7 +412,7 @@ def _reasons(
             f"under the refined ones {after.overlapping:.0%} do."
         )
         yield Reason("images_disagree", everything, text)
-    yield from images(seen.sightings, everything)
+    yield from images(seen.cross_view, everything)
     yield from bounds(accuracy, tolerance_of(tolerance_m, refined.cloud.diagonal_m), indices)
     # The camera itself may have moved abruptly; then the refined poses jump as well.
     moments = [Moment(f.index, f.timestamp) for f in frames]

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from tofuse.evaluation.sightings import whole
+from tofuse.evaluation.cross_view import restore_thinned
 from tofuse.files.spill import Scratch
 from tofuse.fusion.cloud import as_cloud
 from tofuse.fusion.model import ModelBuilder
@@ -78,7 +78,7 @@ class Observations:
         if isinstance(frame, RangeFrame):
             self._depths[frame.index] = _typical_range(frame)
             if isinstance(clean, RangeFrame):
-                self._checks.add(lambda: whole(frame, clean))
+                self._checks.add(lambda: restore_thinned(frame, clean))
         self._model.add(clean, step.surface, _KEPT_POINTS)
 
     def sample(self, ready: Ready, *, lost: bool) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.evaluation.changes import changes
-from tofuse.evaluation.sightings import Sightings, compared
+from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views
 from tofuse.posegraph.views import PosedView
 from tofuse.recordings.recording import evenly
 from tofuse.registration.prepared_view import PreparedView
@@ -69,11 +69,11 @@ class Model:
         ]
         return min(max(said), MAX_STATED_PROBABILITY) if said else None
 
-    def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> Sightings:
+    def seen(self, ours: Sequence[View], theirs: Sequence[View]) -> CrossViewConsistency:
         """What views of two sessions say of each other."""
         both = [*ours, *theirs]
         poses = np.array([self.poses[v.index] for v in both]).reshape(-1, 4, 4)
-        return compared([v.view for v in both], poses, [0] * len(ours) + [1] * len(theirs))
+        return compare_views([v.view for v in both], poses, [0] * len(ours) + [1] * len(theirs))
 
 
 def session_pairs(
@@ -120,8 +120,8 @@ def _pair(
 ) -> SessionPair:
     """What connects two sessions in one model."""
     seen = model.seen(ours, theirs)
-    overlap = np.isfinite(seen.share_of_views())
-    share = seen.share()
+    overlap = np.isfinite(seen.support_of_views())
+    share = seen.support()
     return SessionPair(
         a,
         b,

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.evaluation.sightings import Sighting, Sightings, sightings, whole
+from tofuse.evaluation.cross_view import (
+    CrossViewConsistency,
+    PairConsistency,
+    cross_view_consistency,
+    restore_thinned,
+)
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
@@ -43,9 +48,9 @@ def turned():
 
 def test_the_far_side_of_a_turned_object_is_no_contradiction(turned) -> None:
     frames, poses = turned
-    found = sightings(frames, poses)
+    found = cross_view_consistency(frames, poses)
     assert found.frames == tuple(range(12))
-    assert found.share() > 0.99
+    assert found.support() > 0.99
     assert found.rms_m() < 0.004
     # Views that look against each other see no surface of the same side.
     assert all(min(p.j - p.i, 12 - p.j + p.i) <= 3 for p in found.pairs)
@@ -56,7 +61,7 @@ def test_a_wrong_pose_is_seen_through(turned) -> None:
     frames, poses = turned
     wrong = poses.copy()
     wrong[6] = poses[6] @ se3.exp(np.array([0.25, 0, 0, 0, 0, 0]))
-    shares = sightings(frames, wrong).share_of_views()
+    shares = cross_view_consistency(frames, wrong).support_of_views()
     assert np.argmin(shares) == 6
     assert shares[6] < 0.75
     assert (np.delete(shares, [4, 5, 6, 7, 8]) > 0.95).all()
@@ -64,26 +69,26 @@ def test_a_wrong_pose_is_seen_through(turned) -> None:
     drift = np.stack(
         [T @ se3.exp(np.array([0, 0, 0.06 * k, 0, 0, 0])) for k, T in enumerate(poses)]
     )
-    assert sightings(frames, drift).share() < 0.8
+    assert cross_view_consistency(frames, drift).support() < 0.8
 
 
 def test_the_same_for_any_number_of_threads_and_any_world(turned) -> None:
     frames, poses = turned
     with threads(1):
-        one = sightings(frames, poses)
+        one = cross_view_consistency(frames, poses)
     with threads(3):
-        assert sightings(frames, poses) == one
-    moved = sightings(frames, se3.exp(np.array([1, 2, 3, 0.4, 0.5, 0.6])) @ poses)
-    assert moved.share() == pytest.approx(one.share(), abs=1e-3)
+        assert cross_view_consistency(frames, poses) == one
+    moved = cross_view_consistency(frames, se3.exp(np.array([1, 2, 3, 0.4, 0.5, 0.6])) @ poses)
+    assert moved.support() == pytest.approx(one.support(), abs=1e-3)
 
 
 def test_frames_without_a_pose_do_not_count(turned) -> None:
     frames, poses = turned
     some = poses.copy()
     some[3] = np.nan
-    assert sightings(frames, some).frames == (0, 1, 2, *range(4, 12))
-    assert np.isnan(sightings(frames[:1], poses[:1]).share())
-    assert np.isnan(Sightings((0, 1), (Sighting(0, 1, 0.0, 10.0, 0.0),)).rms_m())
+    assert cross_view_consistency(frames, some).frames == (0, 1, 2, *range(4, 12))
+    assert np.isnan(cross_view_consistency(frames[:1], poses[:1]).support())
+    assert np.isnan(CrossViewConsistency((0, 1), (PairConsistency(0, 1, 0.0, 10.0, 0.0),)).rms_m())
 
 
 def test_filters_that_thin_leave_the_image_whole_but_cuts_stand(turned) -> None:
@@ -92,7 +97,7 @@ def test_filters_that_thin_leave_the_image_whole_but_cuts_stand(turned) -> None:
     left = np.zeros(frame.depth.shape, bool)
     left[:, :40] = True
     thin = frame.keep(left & (rng.random(left.shape) < 0.5))
-    again = whole(frame, thin)
+    again = restore_thinned(frame, thin)
     assert again.valid[:, :39].sum() > 0.99 * frame.valid[:, :39].sum()
     assert not again.valid[:, 41:].any()
     np.testing.assert_array_equal(again.depth[again.valid], frame.depth[again.valid])
