@@ -302,10 +302,10 @@ def test_a_guess_decides_where_it_starts(clouds, tmp_path, capfd, monkeypatch) -
 
 BAD_GUESSES = {
     "missing": (None, ("doesn't exist",)),
-    "empty": ("", ("holds 0 numbers", "16 numbers")),
+    "empty": ("", ("contains 0 numbers", "16 numbers")),
     "words": ("1 0 0 x", ("line 1", "'x'")),
     "nan": ("nan " * 16, ("nan",)),
-    "nine numbers": ("1 2 3\n" * 3, ("holds 9 numbers",)),
+    "nine numbers": ("1 2 3\n" * 3, ("contains 9 numbers",)),
     "scaled": ("2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1", ("no rotation", "rigid")),
     "mirrored": ("-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", ("no rotation",)),
     "projective": ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1", ("last row",)),

@@ -771,7 +771,7 @@ def test_evaluate_against_what_a_recording_comes_with(plain_run, room_recording,
     shutil.copytree(room_recording, bare)
     (bare / "groundtruth.txt").unlink()
     assert main([*words, str(bare)]) == 2
-    assert "comes with no reference poses" in capsys.readouterr().err
+    assert "has no reference poses" in capsys.readouterr().err
     assert main([*words, str(tmp_path / "none.txt")]) == 2
     assert "none.txt: doesn't exist" in capsys.readouterr().err
 

@@ -165,12 +165,12 @@ def test_color_packed_as_float(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (b"DATA binary\n", b"", "no PCD"),
+        (b"DATA binary\n", b"", "not a PCD"),
         (b"DATA binary\n", b"DATA telegraph\n", "kind 'telegraph'"),
         (b"POINTS 12", b"POINTS 13", "13 points in 4 x 3"),
         (b"WIDTH 4\nHEIGHT 3", b"WIDTH 12000000\nHEIGHT 1", "points in"),
         (b"WIDTH 4\nHEIGHT 3\nV", b"WIDTH 4000\nHEIGHT 30000\nPOINTS 120000000\nV", "points"),
-        (b"SIZE 4 4 4", b"SIZE 4 4 3", "can't be understood"),
+        (b"SIZE 4 4 4", b"SIZE 4 4 3", "invalid PCD header"),
         (b"SIZE 4 4 4 4", b"SIZE 4 4 4", "different lengths"),
         (b"FIELDS x y z", b"FIELDS x y w", "store x y z"),
         (b"COUNT 1 1 1 1 1 1 3", b"COUNT 1 1 1 1 1 1 -3", "declares"),

@@ -17,7 +17,7 @@ from tofuse.batch.jobs import Job
 from tofuse.batch.table import write_table
 from tofuse.errors import OutputError
 from tofuse.files.atomic import new_folder, write_text
-from tofuse.files.moving import is_stopped
+from tofuse.files.moving import is_interrupted
 from tofuse.pipeline.checkpoint import Checkpoints
 from tofuse.recordings.rig import Rig, RigCamera, write_rig
 from tofuse.results.folder import STAGING, OutputFolder, finish_interrupted, is_result
@@ -80,7 +80,7 @@ def test_a_result_is_the_old_or_the_new_one(memory, power, old, reader_first) ->
     seen = set()
 
     def check(folder: Path, calls: int) -> None:
-        stopped = is_stopped(folder / STAGING)
+        stopped = is_interrupted(folder / STAGING)
         if not stopped:
             assert shown(folder) in (before, after), calls
         else:  # nobody takes it for whole
@@ -123,7 +123,7 @@ def test_what_goes_on_may_be_cut_off_again(memory, power, monkeypatch, way) -> N
             patch.setattr(os, "replace", fails)
             with pytest.raises(OutputError):
                 write_result(torn(seed=2), OutputFolder(folder, overwrite=True))
-        assert is_stopped(folder / STAGING)
+        assert is_interrupted(folder / STAGING)
         assert not is_result(folder)
         return folder
 

@@ -51,7 +51,7 @@ def test_everything_comes_back_whatever_the_budget(tmp_path: Path, budget: int) 
         got = spill.get(int(k))
         assert same(got, made(int(k)))
         assert got.image.flags.writeable  # kernels are compiled for arrays that are
-        assert spill.held_bytes <= max(budget, 2000)  # the newest stays
+        assert spill.resident_bytes <= max(budget, 2000)  # the newest stays
     assert (spill.spilled_bytes > 0) == (budget < 10**9)
     assert spill.nbytes > 30 * 800
     assert len(spill) == 30

@@ -64,8 +64,8 @@ def test_comments_blank_lines_and_scaled_quaternions(tmp_path: Path) -> None:
         ("1 0 0 zero 0 0 0 1", "zero"),
         ("nan 0 0 0 0 0 0 1", "not finite"),
         ("1 0 0 inf 0 0 0 1", "not finite"),
-        ("1 0 0 0 0 0 0 0", "no unit quaternion"),
-        ("1 0 0 0 3 0 0 1", "no unit quaternion"),
+        ("1 0 0 0 0 0 0 0", "not of unit length"),
+        ("1 0 0 0 3 0 0 1", "not of unit length"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, line: str, words: str) -> None:

@@ -110,9 +110,9 @@ def test_lost_frames_are_left_out(tmp_path: Path) -> None:
 
 
 BAD = {
-    "empty.txt": (b"", "holds no poses"),
-    "comments.txt": (b"# nothing\n", "holds no poses"),
-    "two.txt": (b"1 2\n3 4\n", "lines of 2 columns"),
+    "empty.txt": (b"", "contains no poses"),
+    "comments.txt": (b"# nothing\n", "contains no poses"),
+    "two.txt": (b"1 2\n3 4\n", "has 2 columns"),
     "binary.txt": (bytes(range(256)), "binary.txt"),
     "words.txt": (b"a b c d e f g h\n", "could not convert|is no number|a"),
     "kitti-short.txt": (b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "line 2"),
@@ -123,16 +123,16 @@ BAD = {
         b'{"frames": [{"transform_matrix": [[1' + b"0" * 400 + b"]]}]}",
         "transform_matrix",
     ),
-    "images.txt": (b"1 1 0 0 0 0 0 0 1 camera.png\n", "no number"),
+    "images.txt": (b"1 1 0 0 0 0 0 0 1 camera.png\n", "without a number"),
     "twice.txt": (b"1 1 0 0 0 0 0 0 1 a1.png\n2 1 0 0 0 0 0 0 1 b1.png\n", "same number"),
-    "quaternion.txt": (b"1 3 0 0 0 0 0 0 1 a1.png\n", "unit quaternion"),
-    "a.json": (b"{", "no JSON"),
+    "quaternion.txt": (b"1 3 0 0 0 0 0 0 1 a1.png\n", "unit length"),
+    "a.json": (b"{", "not valid JSON"),
     "list.json": (b"[1]", "no list 'frames'"),
     "none.json": (b'{"frames": []}', "no list 'frames'"),
     "matrix.json": (b'{"frames": [{"transform_matrix": "x"}]}', "transform_matrix|4x4"),
-    "deep.json": (b"[" * 100_000, "no JSON"),
-    "a.npy": (b"\x93NUMPY", "no array"),
-    "object.npy": (b"", "no array"),
+    "deep.json": (b"[" * 100_000, "not valid JSON"),
+    "a.npy": (b"\x93NUMPY", "not an array"),
+    "object.npy": (b"", "not an array"),
 }
 
 
@@ -155,7 +155,7 @@ def test_an_array_of_another_shape_is_refused(shape, tmp_path: Path) -> None:
 
 def test_objects_in_an_array_are_not_unpickled(tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="no array"):
+    with pytest.raises(InputError, match="not an array"):
         read_poses(tmp_path / "p.npy")
 
 

@@ -448,7 +448,7 @@ def test_a_builder_keeps_all_views_in_so_much_memory() -> None:
         )
         assert len(advanced) == 60
         assert (spill.spilled_bytes > 0) == (options.memory_mb == 1)
-        assert spill.held_bytes <= options.memory_mb * 500_000
+        assert spill.resident_bytes <= options.memory_mb * 500_000
         assert len(spill) == 60  # what was corrected is forgotten
         assert len(builder.sketch(posed)) > 500
     for large, small in zip(*models, strict=True):

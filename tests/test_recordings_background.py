@@ -69,7 +69,7 @@ def test_the_far_surface_is_the_farthest_depth_that_some_frames_agree_on() -> No
     z[:4, :5] = 1.0  # mostly nothing
     far = far_surface([frame(image, k) for k, image in enumerate(z)])
     assert np.isinf(far.z[:5]).all()
-    assert np.allclose(far.share[:5], 8 / 12)
+    assert np.allclose(far.static_fraction[:5], 8 / 12)
     behind = np.abs(z[:, 5:] - 2) < 0.1
     for s in range(8):
         columns = (stripe == s) & (U[0] % 10 > 1) & (U[0] % 10 < 8)
@@ -78,7 +78,7 @@ def test_the_far_surface_is_the_farthest_depth_that_some_frames_agree_on() -> No
             assert not (np.abs(far.z[5:, columns] - 2) < 0.1).any()
             continue
         assert np.abs(far.z[5:, columns] - 2).max() < 0.02
-        assert far.share[5:, columns].mean() == pytest.approx(times / count, abs=0.01)
+        assert far.static_fraction[5:, columns].mean() == pytest.approx(times / count, abs=0.01)
         assert np.median(far.sigma[5:, columns]) == pytest.approx(0.005, rel=0.6)
     assert 2 <= sum(behind[:, 0, stripe == s][:, 0].sum() >= 3 for s in range(8)) <= 8
 
@@ -140,11 +140,11 @@ def turning(k: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("scene", "why"),
     [
-        (sideways, "sides of the image change"),
-        (turning, "sides of the image change"),
-        (lambda _k: np.full((ROWS, COLUMNS), 2.0), "nothing moves before"),
+        (sideways, "image borders change"),
+        (turning, "image borders change"),
+        (lambda _k: np.full((ROWS, COLUMNS), 2.0), "nothing moves in front"),
         # A pillar that turns in a wall: of its faces only what comes out of the wall is seen.
-        (lambda k: np.minimum(turning_box(0.37 * k)[0], 1.02), "can't be told"),
+        (lambda k: np.minimum(turning_box(0.37 * k)[0], 1.02), "can't be separated"),
     ],
 )
 def test_what_is_no_moving_object_is_refused(scene: Callable[[int], np.ndarray], why: str) -> None:
@@ -161,5 +161,5 @@ def test_few_frames_and_several_sizes_are_refused() -> None:
         moving_object(frames)
     small = Pinhole(width=10, height=10, fx=9.0, fy=9.0, cx=4.5, cy=4.5)
     other = RangeFrame(9, 9.0, small, np.ones((10, 10), np.float32))
-    with pytest.raises(InputError, match="one size"):
+    with pytest.raises(InputError, match="same size"):
         moving_object([*frames, other])

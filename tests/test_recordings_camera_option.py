@@ -184,5 +184,5 @@ def test_a_table_of_rays_counts_and_another_size_does_not(tmp_path: Path, case: 
 def test_where_it_means_nothing_it_is_refused(tmp_path: Path, name: str) -> None:
     file, _ = camera_file(tmp_path / "given", (16, 12), 0.001, "z")
     (tmp_path / "b").mkdir()
-    with pytest.raises(InputError, match=r"--camera: means nothing for the format .*leave it out"):
+    with pytest.raises(InputError, match=r"--camera: does not apply to the format .*leave it out"):
         open_recording(REFUSES[name](tmp_path / "b"), format=name, camera=file)

@@ -127,5 +127,5 @@ def test_a_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
         write_ply(tmp_path / f"{k:02d}.ply", GeometryRecord(points))
     recording = open_recording(tmp_path)
     assert isinstance(recording[5], RangeFrame)
-    with pytest.raises(UnreadableFrameError, match="off the rays of those before it"):
+    with pytest.raises(UnreadableFrameError, match="off the rays of the previous clouds"):
         recording[4]

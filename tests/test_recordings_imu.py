@@ -84,7 +84,7 @@ def test_a_native_recording_and_selections_of_it_know_what_is_down(tmp_path: Pat
     joined = open_recording(tmp_path / "a", folder(tmp_path / "b", {"strange": np.zeros(3)}))
     assert joined.gravity is not None
     assert np.isfinite(joined.gravity).all(1).tolist() == [True] * 4 + [False] * 4
-    assert any("what is down" in warning for warning in joined.warnings)
+    assert any("gravity is unknown" in warning for warning in joined.warnings)
 
 
 def test_the_simulated_accelerometer_tells_the_tilt_of_the_camera(tmp_path: Path):

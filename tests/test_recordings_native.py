@@ -301,14 +301,14 @@ def test_counts_that_disagree(tmp_path: Path, name: str) -> None:
     [
         ("timestamps.txt", "0\n1\n2\n", "has 3 lines, depth/ has 4 files"),
         ("timestamps.txt", "0\n1\nnan\n3\n", "line 3 is nan"),
-        ("timestamps.txt", "0 1\n1 1\n2 1\n3 1\n", "2 numbers in a line"),
-        ("timestamps.txt", "0\n1\ntwo\n3\n", "no table of numbers"),
+        ("timestamps.txt", "0 1\n1 1\n2 1\n3 1\n", "2 numbers per line"),
+        ("timestamps.txt", "0\n1\ntwo\n3\n", "not a table of numbers"),
         ("frames.csv", "a\n1\n", "has 1 rows, depth/ has 4 files"),
         ("imu.csv", "", "is empty"),
         ("groundtruth.txt", "0 0 0\n", "line 1"),
         ("odometry.txt", "0 0 0 0 0 0 0 0\n", "line 1"),
         ("correction.npz", "no zip", "correction.npz"),
-        ("rays.npy", "no table", "rays.npy"),
+        ("rays.npy", "not a table", "rays.npy"),
     ],
 )
 def test_bad_files_beside_the_images(tmp_path: Path, name: str, text: str, words: str) -> None:
@@ -323,9 +323,9 @@ def test_unsorted_and_repeated_timestamps_warn(tmp_path: Path) -> None:
     (folder / "timestamps.txt").write_text("0\n2\n1\n3\n")
     source = NativeSource(folder)
     assert source.timestamps.tolist() == [0, 2, 1, 3]
-    assert "goes back at frame 2" in source.warnings[0]
+    assert "decreases at frame 2" in source.warnings[0]
     (folder / "timestamps.txt").write_text("0\n1\n1\n3\n")
-    assert "frames 1 and 2 have the same time" in NativeSource(folder).warnings[0]
+    assert "frames 1 and 2 have the same timestamp" in NativeSource(folder).warnings[0]
 
 
 def test_rays_of_a_wrong_shape(tmp_path: Path) -> None:

@@ -126,12 +126,12 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         ("missing", "doesn't exist"),
         ("empty", "empty folder"),
         ("loop", "leads back to itself"),
-        ("inside", "no recording that is known"),
+        ("inside", "not a recording of a known format"),
         ("file.mkv", "suffix '.mkv'"),
         ("file", r"1 \.docx"),
         ("images", r"1 \.PNG; put .* into a folder depth/ .* camera\.json"),
-        ("file.mkv/x", "no folder"),
-        ("a\0b", "no path"),
+        ("file.mkv/x", "not a folder"),
+        ("a\0b", "not a path"),
         ("n" * 300, "too long"),
     ):
         with pytest.raises(InputError, match=words):

@@ -295,9 +295,9 @@ def test_absurd_numbers_in_an_organised_pcd(tmp_path: Path, value: float, axis: 
 
 def test_a_file_that_only_claims_to_be_pcd(tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_text("This is no point cloud.\n" * 100)
-    with pytest.raises(InputError, match="is no PCD file"):
+    with pytest.raises(InputError, match="is not a PCD file"):
         open_recording(tmp_path / "a.pcd")
-    with pytest.raises(InputError, match="is no PCD file"):
+    with pytest.raises(InputError, match="is not a PCD file"):
         open_recording(tmp_path)
 
 

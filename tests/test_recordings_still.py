@@ -19,7 +19,7 @@ from tofuse.recordings.native import RecordingWriter
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
-from tofuse.recordings.still import average_of, average_still, motion_between, still_stretches
+from tofuse.recordings.still import average_of, average_still, change_between, stationary_intervals
 from tofuse.sensor.noise import NoiseModel, RangeLaw
 
 CAMERA = Pinhole(120, 96, 100.0, 100.0, 59.5, 47.5)
@@ -51,17 +51,17 @@ def recording_of(frames: list) -> Recording:
 def test_noise_is_no_motion_however_strong() -> None:
     for sigma in (0.0005, 0.02, 0.3):
         a, b = shot(0, scene(), sigma), shot(1, scene(), sigma)
-        motion = motion_between(a, b, MODEL)
+        motion = change_between(a, b, MODEL)
         assert motion.still
         assert not motion.identical
 
 
 def test_motion_is_seen_far_below_the_noise_of_a_pixel() -> None:
-    assert not motion_between(shot(0, scene()), shot(1, scene(0.4 * SIGMA)), MODEL).still
+    assert not change_between(shot(0, scene()), shot(1, scene(0.4 * SIGMA)), MODEL).still
     # With a better camera, a smaller one.
     better = 0.1 * SIGMA
     a, b = shot(0, scene(), better), shot(1, scene(0.4 * better), better)
-    assert not motion_between(a, b, MODEL).still
+    assert not change_between(a, b, MODEL).still
 
 
 def test_noise_that_neighbours_share_is_still_noise() -> None:
@@ -70,12 +70,12 @@ def test_noise_that_neighbours_share_is_still_noise() -> None:
         mean = sum(padded[i : i + 96, j : j + 120] for i in range(3) for j in range(3)) / 9
         return replace(frame, depth=mean.astype(np.float32))
 
-    assert motion_between(smooth(shot(0, scene())), smooth(shot(1, scene())), MODEL).still
+    assert change_between(smooth(shot(0, scene())), smooth(shot(1, scene())), MODEL).still
 
 
 def test_a_thing_that_moves_before_a_still_wall_is_motion() -> None:
-    assert motion_between(shot(0, scene(box_at=20)), shot(1, scene(box_at=20)), MODEL).still
-    assert not motion_between(shot(0, scene(box_at=20)), shot(1, scene(box_at=50)), MODEL).still
+    assert change_between(shot(0, scene(box_at=20)), shot(1, scene(box_at=20)), MODEL).still
+    assert not change_between(shot(0, scene(box_at=20)), shot(1, scene(box_at=50)), MODEL).still
 
 
 def test_amplitude_shows_a_camera_sliding_along_a_flat_wall() -> None:
@@ -87,26 +87,26 @@ def test_amplitude_shows_a_camera_sliding_along_a_flat_wall() -> None:
         image = (exposure * 400 * albedo * (1 + noise)).astype(np.float32)
         return shot(k, wall, amplitude_image=image)
 
-    assert motion_between(seen(0, 0), seen(1, 0), MODEL).still
-    assert motion_between(seen(0, 0), seen(1, 0, exposure=1.7), MODEL).still
-    assert not motion_between(seen(0, 0), seen(1, 1), MODEL).still
+    assert change_between(seen(0, 0), seen(1, 0), MODEL).still
+    assert change_between(seen(0, 0), seen(1, 0, exposure=1.7), MODEL).still
+    assert not change_between(seen(0, 0), seen(1, 1), MODEL).still
 
 
 def test_copies_and_frames_that_show_nothing() -> None:
     a = shot(0, scene())
-    assert motion_between(a, a, MODEL).identical
+    assert change_between(a, a, MODEL).identical
     empty = replace(a, depth=np.zeros_like(a.depth))
-    assert not motion_between(a, empty, MODEL).still
+    assert not change_between(a, empty, MODEL).still
     other = RangeFrame(1, 0.0, Pinhole(20, 20, 9, 9, 9, 9), np.ones((20, 20), np.float32))
-    assert not motion_between(a, other, MODEL).still
+    assert not change_between(a, other, MODEL).still
 
 
 def test_stretches_have_no_gaps_and_slow_motion_cannot_add_up() -> None:
     shifts = [0, 0, 0, 0, 0.1, 0.2, 0.3, 0.3, 0.3]
     frames = [shot(k, scene(s)) for k, s in enumerate(shifts)]
-    assert still_stretches(recording_of(frames), MODEL) == [(0, 4), (4, 5), (5, 6), (6, 9)]
+    assert stationary_intervals(recording_of(frames), MODEL) == [(0, 4), (4, 5), (5, 6), (6, 9)]
     creeping = [shot(k, scene(0.001 * k)) for k in range(40)]
-    found = still_stretches(recording_of(creeping), MODEL)
+    found = stationary_intervals(recording_of(creeping), MODEL)
     assert max(b - a for a, b in found) < 12
     assert [a for a, _ in found[1:]] == [b for _, b in found[:-1]]
     assert found[-1][1] == 40
@@ -121,13 +121,13 @@ def test_clouds_and_unreadable_frames_stand_alone() -> None:
 
     frames = [shot(k, scene()) for k in range(5)]
     broken = Recording.of(Broken(frames), "made", "made")
-    assert still_stretches(broken, MODEL) == [(0, 2), (2, 3), (3, 5)]
+    assert stationary_intervals(broken, MODEL) == [(0, 2), (2, 3), (3, 5)]
     averaged = average_still(broken, MODEL)
     assert len(averaged) == 3
     with pytest.raises(UnreadableFrameError):
         averaged[1]
     clouds = recording_of([CloudFrame.of(np.eye(3))] * 3)
-    assert still_stretches(clouds) == [(0, 1), (1, 2), (2, 3)]
+    assert stationary_intervals(clouds) == [(0, 1), (1, 2), (2, 3)]
     assert len(average_still(clouds)[2]) == 3
 
 
@@ -154,7 +154,7 @@ def test_averaging_keeps_times_poses_and_moving_frames() -> None:
     assert [f.index for f in averaged] == [0, 1, 2]
     assert [f.timestamp for f in averaged] == [0.1, 0.3, 0.5]
     np.testing.assert_array_equal(averaged[1].depth, frames[3].depth)  # type: ignore[union-attr]
-    assert averaged.warnings == ["7 frames averaged to 3, where nothing moved"]
+    assert averaged.warnings == ["7 frames averaged to 3 in stationary intervals"]
     assert averaged.metadata["averaged"] == [3, 1, 3]
     selected = recording_of(frames).select(4)
     np.testing.assert_array_equal(average_still(selected, MODEL).timestamps, [0.5])
@@ -237,7 +237,7 @@ def test_long_stretches_cost_bounded_memory() -> None:
 
 def test_simulated_turn_is_not_still() -> None:
     frames = simulate_recording("wall", every=10, frames=2)
-    assert len(still_stretches(frames)) == 2
+    assert len(stationary_intervals(frames)) == 2
 
 
 def test_run_averages_when_asked(tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ def test_run_averages_when_asked(tmp_path: Path) -> None:
 
 def test_sr4000_corridor(shared_data: Path) -> None:
     recording = open_recording(shared_data / "sr4000_corridor")
-    assert still_stretches(recording) == [(0, 4), (4, 8)]
+    assert stationary_intervals(recording) == [(0, 4), (4, 8)]
     averaged = average_still(recording)
     assert len(averaged) == 2
     # Each frame has rays of its own; the mean has theirs.
@@ -286,4 +286,4 @@ def test_pico_zense_is_still_all_along(shared_data: Path) -> None:
         RangeFrame(k, k / 30, camera, read_image(f, dtype="uint16").astype(np.float32) / 1000)
         for k, f in enumerate(files)
     ]
-    assert still_stretches(recording_of(frames)) == [(0, 10)]
+    assert stationary_intervals(recording_of(frames)) == [(0, 10)]

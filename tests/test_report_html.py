@@ -735,7 +735,7 @@ POOR = {
         lonely(),
         ReportExtras("x", (("raw", unlit()), ("median", unlit())), None, None, draw((dark(),))),
     ),
-    "camera that stands still": (
+    "stationary camera": (
         lonely(
             trajectory=np.tile(np.eye(4), (3, 1, 1)),
             timestamps=np.arange(3.0),

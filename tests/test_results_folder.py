@@ -54,7 +54,7 @@ PLANS: dict[str, object] = {
     "no result replaced": {"new": {}, "old": {"cloud.ply": FILE}},
     "no result made": {"new": {"cloud.ply": FILE}, "old": {}},
     "a link as new": {"new": {"run.json": ["link", 6, 0.0]}, "old": {}},
-    "not what it was": {"new": {}, "old": {"run.json": FILE, "cloud.ply": FILE}},
+    "was changed": {"new": {}, "old": {"run.json": FILE, "cloud.ply": FILE}},
     "infinite": {"new": {}, "old": {"run.json": ["file", 6, float("nan")]}},
     "huge numbers": b'{"new": {}, "old": {"run.json": ["file", 1' + b"0" * 10_000 + b", 0]}}",
 }
@@ -85,7 +85,7 @@ def test_no_plan_of_somebody_else_is_followed(tmp_path, plan, theirs, name) -> N
         assert "\n" not in str(caught.value)
         assert len(str(caught.value)) < 500
         assert contents(tmp_path) == before
-    if plan not in ("not what it was", "no result made"):  # which a reader would not ask
+    if plan not in ("was changed", "no result made"):  # which a reader would not ask
         with pytest.raises(InputError):
             finish_interrupted(out)
     assert contents(tmp_path) == before
@@ -122,7 +122,7 @@ def test_what_lies_in_hidden_folders_of_ours_and_is_not_ours_stays(tmp_path) -> 
     staging = tmp_path / STAGING
     staging.mkdir()
     (staging / "precious.txt").write_text("mine")
-    with pytest.raises(OutputError, match="holds something other than"):
+    with pytest.raises(OutputError, match="is not a file of an earlier result"):
         OutputFolder(tmp_path)
     assert (staging / "precious.txt").read_text() == "mine"
 

@@ -300,7 +300,7 @@ def test_a_folder_with_something_of_somebody_else_stays(tmp_path, how, when) -> 
     before = contents(tmp_path)
     if when == "before":
         folder.discard()
-    with pytest.raises(OutputError, match=r"component-2: holds something other than"):
+    with pytest.raises(OutputError, match=r"component-2: is not a file of an earlier result"):
         write_result(
             torn(seed=1), OutputFolder(out, overwrite=True) if when == "before" else folder
         )

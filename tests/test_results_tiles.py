@@ -244,7 +244,7 @@ def test_damaged_tilesets_are_told_in_one_line(made, tmp_path) -> None:
     for _ in range(60):
         nested = Tile(np.zeros(3), np.ones(3), 0.0, None, 0, [nested])
     write_tileset(path, nested, generator="", extras={})
-    with pytest.raises(InputError, match="no tileset of ours"):
+    with pytest.raises(InputError, match="not a tileset written by tofuse"):
         read_tileset(path)
 
 
@@ -323,7 +323,7 @@ def test_a_large_result_has_tiles_an_overview_and_all_else(tmp_path, small_limit
     # But not where somebody has put something into them.
     write_result(result, OutputFolder(out, overwrite=True))
     (out / "tiles" / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match="other than the files of an earlier result"):
+    with pytest.raises(OutputError, match="is not a file of an earlier result"):
         OutputFolder(out, overwrite=True)
 
 

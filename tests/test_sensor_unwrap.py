@@ -282,7 +282,7 @@ def test_frequencies_that_make_no_sense_are_refused(two_frequencies: Path) -> No
     with pytest.raises(InputError, match="frequencies/80000000"):
         tofuse.open(two_frequencies)
     shutil.rmtree(folder / "80000000")
-    with pytest.raises(InputError, match="holds one frequency"):
+    with pytest.raises(InputError, match="has only one frequency"):
         tofuse.open(two_frequencies)
     (folder / "fast").mkdir()
     with pytest.raises(InputError, match="isn't a frequency"):

@@ -310,9 +310,9 @@ def _stopped(out: Path) -> None:
         power = Power(calls)
         with power.connected(), suppress(PowerCut):
             write_result(made_results.torn(seed=2), OutputFolder(out, overwrite=True))
-        if moving.is_stopped(out / ".tofuse-unfinished"):
+        if moving.is_interrupted(out / ".tofuse-unfinished"):
             break
-    assert moving.is_stopped(out / ".tofuse-unfinished")
+    assert moving.is_interrupted(out / ".tofuse-unfinished")
 
 
 def _settle(out: Path) -> None:

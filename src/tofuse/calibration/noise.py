@@ -17,7 +17,7 @@ from tofuse.geometry.cameras import ray_lengths
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
-from tofuse.recordings.still import still_stretches
+from tofuse.recordings.still import stationary_intervals
 from tofuse.sensor.noise import AmplitudeLaw, ConfidenceLaw, Law, NoiseModel, RangeLaw
 
 LEAST_FRAMES = 3
@@ -161,7 +161,7 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
             "holds clouds", where=recording.path, remedy="give a recording of depth images"
         )
     prior = noise_model_for(recording)
-    stretches = [(a, b) for a, b in still_stretches(recording, prior) if b - a >= LEAST_FRAMES]
+    stretches = [(a, b) for a, b in stationary_intervals(recording, prior) if b - a >= LEAST_FRAMES]
     if not stretches:
         raise _not_still(recording)
     samples = _joined([_pixels(recording, a, b, prior) for a, b in stretches])

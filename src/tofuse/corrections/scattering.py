@@ -137,4 +137,4 @@ def _moves_and_still(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
     moves = found.own | np.any([found.mask(image.z) for image in images], axis=0)
     square = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
     around = cv2.dilate(moves.astype(np.uint8), square) > 0
-    return moves, ~around & np.isfinite(found.far.z) & (found.far.share > _STILL)
+    return moves, ~around & np.isfinite(found.far.z) & (found.far.static_fraction > _STILL)

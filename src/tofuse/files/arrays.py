@@ -1,4 +1,4 @@
-"""Sets of arrays in an .npz file: without objects, and never more than the file has bytes."""
+"""Reading and writing .npz files, safe against pickles and decompression bombs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Arrays = dict[str, NDArray[Any]]
 
 _MAX_BYTES = 4 << 30
 _MAX_MEMBERS = 100_000
-_MOST_SMALLER = 1100  # times; deflate makes nothing smaller than that
+_MAX_COMPRESSION = 1100  # just above the largest ratio that deflate reaches
 _KINDS = "biufcSU"
 
 
@@ -30,7 +30,7 @@ def write_npz(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
     Raises
     ------
     ValueError
-        If one of them holds objects.
+        If an array contains Python objects.
     """
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for name, array in arrays.items():
@@ -50,21 +50,22 @@ def read_npz(
     Parameters
     ----------
     limit
-        Bytes that all of them may have together.
+        Largest total size in bytes.
     only
-        Names of those that are wanted; all unless given.
+        Names of the arrays to read; all unless given.
     without
-        What names of those begin with that are not wanted.
+        Prefix of the names of arrays to skip.
 
     Raises
     ------
     InputError
-        If it can't be read, is damaged (each array has a sum), holds objects, or too much.
+        If it can't be read, is damaged (each array has a checksum), contains objects, or is too
+        large.
     """
     try:
         if not is_file(Path(path)):
             path.stat() if isinstance(path, Path) else Path(path).stat()
-            raise InputError("is no ordinary file", where=path, remedy="give a file")
+            raise InputError("is not a regular file", where=path, remedy="give a file")
         with zipfile.ZipFile(path) as archive:
             return _read(archive, limit, only, without)
     except OSError as error:
@@ -83,11 +84,11 @@ def read_npz(
         zipfile.BadZipFile,
         zlib.error,
     ) as error:
-        said = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(
-            f"can't be read as an .npz file ({said})",
+            f"can't be read as an .npz file ({reason})",
             where=path,
-            remedy="check that it is the file you meant, and whole",
+            remedy="check that it is the file you meant, and complete",
         ) from error
 
 
@@ -96,7 +97,7 @@ def _read(
 ) -> Arrays:
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
-        raise ValueError(f"it holds {len(members)} arrays")
+        raise ValueError(f"it contains {len(members)} arrays")
     wanted = [
         m
         for m in members
@@ -105,30 +106,30 @@ def _read(
     ]
     if sum(m.file_size for m in wanted) > limit:
         raise ValueError(f"its arrays have more than {limit >> 20} MiB")
-    found: Arrays = {}
+    arrays: Arrays = {}
     for member in wanted:
         if not member.filename.endswith(".npy"):
-            raise ValueError(f"{member.filename!r} is no array")
-        if member.file_size > _MOST_SMALLER * member.compress_size + 1000:
-            raise ValueError(f"{member.filename!r} claims more than it can hold")
+            raise ValueError(f"{member.filename!r} is not an array")
+        if member.file_size > _MAX_COMPRESSION * member.compress_size + 1000:
+            raise ValueError(f"{member.filename!r} declares more than it can contain")
         with archive.open(member) as stream:
             _check_header(stream, member)
         with archive.open(member) as stream:
             array = npy.read_array(stream, allow_pickle=False)
-            if stream.read(1):  # which also has the sum looked at
-                raise ValueError(f"{member.filename!r} holds more than its array")
-        found[member.filename.removesuffix(".npy")] = array
-    return found
+            if stream.read(1):  # reading to the end also verifies the checksum
+                raise ValueError(f"{member.filename!r} contains more than its array")
+        arrays[member.filename.removesuffix(".npy")] = array
+    return arrays
 
 
 def _check_header(stream: IO[bytes], member: zipfile.ZipInfo) -> None:
-    """Refuse an array that is larger than its bytes, before there is any room made for it."""
+    """Raise ValueError, before allocation, if a header declares another size than the data has."""
     version = npy.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"{member.filename!r} is of a version {version}")
+        raise ValueError(f"{member.filename!r} has the version {version}")
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, _fortran, dtype = read(stream)
     if dtype.kind not in _KINDS:
-        raise ValueError(f"{member.filename!r} holds {dtype}")
+        raise ValueError(f"{member.filename!r} contains {dtype}")
     if math.prod(shape) * dtype.itemsize != member.file_size - stream.tell():
-        raise ValueError(f"{member.filename!r} is of another size than it says")
+        raise ValueError(f"{member.filename!r} has another size than it declares")

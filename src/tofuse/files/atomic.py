@@ -1,7 +1,7 @@
-"""Writing a file so that it is either whole or not there, also after a power cut.
+"""Atomic writes: a file is either complete or absent, even after a power cut.
 
-What is written into a folder that is itself moved into place later (its name begins with
-`UNFINISHED`) reaches the disk with that folder, by `sync_tree`; everything else by itself.
+Files in a folder that is itself moved into place later (its name begins with `UNFINISHED`) are
+synced to disk with that folder, by `sync_tree`; all others when they are written.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tofuse.errors import OutputError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer as Buffer
 
-UNFINISHED = ".tofuse-"  # how names begin that are no result: a run that was killed left them
+UNFINISHED = ".tofuse-"  # prefix of temporary names, which a killed run leaves behind
 
 _counter = itertools.count()
 
@@ -38,7 +38,7 @@ _REMEDIES = {
 
 
 def output_error(error: OSError, path: str | Path) -> OutputError:
-    """Say in one line why `path` can't be written, and what to do."""
+    """Return the error that `path` can't be written, with reason and remedy."""
     reason = (error.strerror or str(error)).lower()
     remedy = _REMEDIES.get(error.errno or 0, "choose another place for it")
     return OutputError(f"can't be written ({reason})", where=path, remedy=remedy)
@@ -46,16 +46,18 @@ def output_error(error: OSError, path: str | Path) -> OutputError:
 
 @contextmanager
 def replacing(path: str | Path, *, durable: bool | None = None) -> Iterator[Path]:
-    """Give a temporary path beside `path`, renamed to it if the block succeeds, else removed.
+    """Yield a temporary path, renamed to `path` if the block succeeds, else removed.
 
-    The temporary name keeps the suffix, as some libraries choose the format by it. The block
-    should only write: its OSErrors are taken for trouble with the output.
+    It is in the same folder and keeps the suffix, by which some libraries choose the format. The
+    block should only write: its OSErrors become OutputErrors about `path`.
 
     Parameters
     ----------
+    path
+        The file to create or replace.
     durable
-        Whether to wait until it is on the disk, before the name is; unless given, where it is not
-        in a folder that is moved into place later.
+        Whether to sync the file to disk before it is renamed; unless given, if it is not in a
+        folder that is moved into place later.
 
     Raises
     ------
@@ -63,51 +65,51 @@ def replacing(path: str | Path, *, durable: bool | None = None) -> Iterator[Path
         If the file can't be written or renamed.
     """
     path = Path(path)
-    beside = path.with_name(f".{path.stem}.{os.getpid()}-{next(_counter)}.part{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{next(_counter)}.part{path.suffix}")
     if durable is None:
         durable = not any(part.startswith(UNFINISHED) for part in path.parts)
     try:
-        yield beside
+        yield temporary
         if durable:
-            sync(beside)
-        os.replace(beside, path)
+            sync(temporary)
+        os.replace(temporary, path)
         if durable:
             sync(path.parent)
     except BaseException as error:
         with suppress(OSError):
-            beside.unlink()
+            temporary.unlink()
         if isinstance(error, OSError):
             raise output_error(error, path) from error
         raise
 
 
 def write_bytes(path: str | Path, *parts: Buffer) -> None:
-    """Write a whole file of parts, one after the other, which saves joining them; see `replacing`.
+    """Write a file from parts, which saves concatenating them; see `replacing`.
 
     Arrays must be contiguous.
     """
-    with replacing(path) as beside, beside.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         for part in parts:
             file.write(part)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a whole UTF-8 file with line feeds on every system; see `replacing`.
+    """Write a UTF-8 file with line feeds on every system; see `replacing`.
 
-    Bytes of names of files that are no UTF-8 are written as escapes.
+    Bytes of file names that are not UTF-8 are written as escapes.
     """
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def sync(path: str | Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk.
+    """Wait until a file, or the entries of a folder, are on disk.
 
-    File systems that know no such thing, and systems that can't open folders, are let be.
+    Does nothing on file systems without support for it, and for folders where they can't be opened.
 
     Raises
     ------
     OSError
-        If the disk says that it failed.
+        If the disk reports a failure.
     """
     writable = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
     try:
@@ -126,7 +128,7 @@ def sync(path: str | Path) -> None:
 
 
 def sync_tree(folder: str | Path) -> None:
-    """Wait until all files in a folder and below it, and their names, are on the disk."""
+    """Wait until all files below a folder, and their names, are on disk."""
     for here, _folders, names in os.walk(folder):
         for name in names:
             sync(Path(here) / name)
@@ -134,7 +136,7 @@ def sync_tree(folder: str | Path) -> None:
 
 
 def make_folder(path: str | Path) -> Path:
-    """Create a folder and its parents, where they are missing, and return it.
+    """Create a folder and its parents if needed, and return it.
 
     Raises
     ------
@@ -151,28 +153,28 @@ def make_folder(path: str | Path) -> Path:
 
 @contextmanager
 def new_folder(path: str | Path) -> Iterator[Path]:
-    """Give an empty folder beside `path`, renamed to it if the block succeeds, else removed.
+    """Yield an empty temporary folder, renamed to `path` if the block succeeds, else removed.
 
-    The block should only write: its OSErrors are taken for trouble with the output.
+    The block should only write: its OSErrors become OutputErrors about `path`.
 
     Raises
     ------
     OutputError
-        If `path` is there and is not an empty folder, or can't be written.
+        If `path` exists and is not an empty folder, or can't be written.
     """
     path = Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise OutputError("isn't empty", where=path, remedy="choose a new folder")
     parent = make_folder(path.absolute().parent)
     try:
-        # The folder made by `tempfile` is private; the one inside has the usual permissions.
+        # The folder of `tempfile` is private; the one inside has the usual permissions.
         with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=parent) as private:
-            beside = make_folder(Path(private) / "made")
-            yield beside
-            sync_tree(beside)
+            temporary = make_folder(Path(private) / "made")
+            yield temporary
+            sync_tree(temporary)
             if path.exists():
                 path.rmdir()
-            os.replace(beside, path)
+            os.replace(temporary, path)
             sync(parent)
     except OSError as error:
         raise output_error(error, path) from error

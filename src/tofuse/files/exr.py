@@ -1,8 +1,10 @@
-"""OpenEXR images, as far as depth exports need it: scan lines, uncompressed, ZIP or ZIPS.
+"""The part of OpenEXR that depth exports use: scan lines, uncompressed, ZIP or ZIPS.
 
 The layout is that of "OpenEXR File Layout" of the Academy Software Foundation: a header of
 attributes, a table of offsets, and blocks of scan lines, channel after channel in each line. ZIP
 deflates the differences of neighbouring bytes, the even bytes of a block before the odd ones.
+
+Own code, as OpenCV's decoder is disabled by default.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ MAGIC = b"\x76\x2f\x31\x01"
 _SINGLE_SCAN_LINES = 2  # the version, with none of the flags for tiles, parts or deep data
 _LONG_NAMES = 0x400
 _TYPES: tuple[np.dtype[Any], ...] = (np.dtype("<u4"), np.dtype("<f2"), np.dtype("<f4"))
-_LINES = {0: 1, 2: 1, 3: 16}  # of a block, by compression: none, ZIPS, ZIP
+_LINES = {0: 1, 2: 1, 3: 16}  # per block, by compression: none, ZIPS, ZIP
 _COMPRESSIONS = ("none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
 _MAX_CHANNELS = 64
 
@@ -44,7 +46,7 @@ def parse_exr(data: bytes, path: str | Path) -> dict[str, Float32]:
     Raises
     ------
     InputError
-        If it is damaged or cut off, or of a kind that is not read (tiles, other compressions).
+        If it is damaged or cut off, or of an unsupported kind (tiles, other compressions).
     """
     header = _header(data, path)
     lines = _LINES[header.compression]
@@ -52,12 +54,12 @@ def parse_exr(data: bytes, path: str | Path) -> dict[str, Float32]:
     row = header.width * sum(kind.itemsize for kind in header.channels.values())
     offsets = _unpack(f"<{count}Q", data, header.end, path)
     image = np.zeros((header.height, row), np.uint8)
-    seen = np.zeros(header.height, bool)
+    decoded = np.zeros(header.height, bool)
     for offset in offsets:
         y, size = _unpack("<iI", data, offset, path)
         start = y - header.top
         if not 0 <= start < header.height or start % lines:
-            raise _damaged("a block lies outside the image", path)
+            raise _damaged("a block is outside the image", path)
         rows = min(lines, header.height - start)
         block = data[offset + 8 : offset + 8 + size]
         if len(block) < size:
@@ -65,8 +67,8 @@ def parse_exr(data: bytes, path: str | Path) -> dict[str, Float32]:
         image[start : start + rows] = _block(block, rows * row, header.compression, path).reshape(
             rows, row
         )
-        seen[start : start + rows] = True
-    if not seen.all():
+        decoded[start : start + rows] = True
+    if not decoded.all():
         raise _damaged("scan lines are missing", path)
     out: dict[str, Float32] = {}
     at = 0
@@ -80,7 +82,7 @@ def parse_exr(data: bytes, path: str | Path) -> dict[str, Float32]:
 
 
 def _block(data: bytes, size: int, compression: int, path: str | Path) -> UInt8:
-    """Return the `size` bytes of a block; what compression didn't make smaller is stored."""
+    """Return the `size` bytes of a block, which is stored as is if compression didn't help."""
     if compression == 0 or len(data) == size:
         if len(data) != size:
             raise _damaged("a block has the wrong size", path)
@@ -88,9 +90,9 @@ def _block(data: bytes, size: int, compression: int, path: str | Path) -> UInt8:
     try:
         raw = zlib.decompressobj().decompress(data, size + 1)
     except zlib.error as error:
-        raise _damaged("a block can't be unpacked", path) from error
+        raise _damaged("a block can't be decompressed", path) from error
     if len(raw) != size:
-        raise _damaged("a block unpacks to the wrong size", path)
+        raise _damaged("a block decompresses to the wrong size", path)
     differences = np.frombuffer(raw, np.uint8).copy()
     differences[1:] += np.uint8(128)
     values = np.cumsum(differences, dtype=np.uint8)
@@ -102,7 +104,7 @@ def _block(data: bytes, size: int, compression: int, path: str | Path) -> UInt8:
 
 def _header(data: bytes, path: str | Path) -> _Header:
     if not data.startswith(MAGIC):
-        what = "is empty" if not data else "is no OpenEXR image"
+        what = "is empty" if not data else "is not an OpenEXR image"
         raise InputError(what, where=path, remedy="check the file")
     (version,) = _unpack("<I", data, 4, path)
     if version & ~_LONG_NAMES != _SINGLE_SCAN_LINES:
@@ -112,37 +114,37 @@ def _header(data: bytes, path: str | Path) -> _Header:
             remedy="write it as scan lines of one part",
         )
     at = 8
-    found: dict[str, bytes] = {}
+    attributes: dict[str, bytes] = {}
     while data[at : at + 1] != b"\0":
         name, at = _name(data, at, path)
         _, at = _name(data, at, path)
         (size,) = _unpack("<I", data, at, path)
         at += 4
-        found[name] = data[at : at + size]
-        if len(found[name]) < size:
+        attributes[name] = data[at : at + size]
+        if len(attributes[name]) < size:
             raise InputError(
                 "is cut off within its header", where=path, remedy="copy the file again"
             )
         at += size
     at += 1
-    missing = [n for n in ("channels", "compression", "dataWindow") if n not in found]
+    missing = [n for n in ("channels", "compression", "dataWindow") if n not in attributes]
     if missing:
         raise _damaged(f"no {missing[0]}", path)
-    (compression,) = _unpack("<B", found["compression"], 0, path)
+    (compression,) = _unpack("<B", attributes["compression"], 0, path)
     if compression not in _LINES:
         kind = _COMPRESSIONS[compression] if compression < len(_COMPRESSIONS) else str(compression)
         raise InputError(
             f"is compressed by {kind}", where=path, remedy="write it with ZIP, ZIPS or none"
         )
-    left, top, right, bottom = _unpack("<4i", found["dataWindow"], 0, path)
+    left, top, right, bottom = _unpack("<4i", attributes["dataWindow"], 0, path)
     width, height = right - left + 1, bottom - top + 1
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise InputError(
-            f"claims to be {width} x {height} pixels",
+            f"declares {width} x {height} pixels",
             where=path,
             remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
         )
-    return _Header(width, height, top, compression, _channels(found["channels"], path), at)
+    return _Header(width, height, top, compression, _channels(attributes["channels"], path), at)
 
 
 def _channels(data: bytes, path: str | Path) -> dict[str, np.dtype[Any]]:
@@ -165,7 +167,7 @@ def _channels(data: bytes, path: str | Path) -> dict[str, np.dtype[Any]]:
 def _name(data: bytes, at: int, path: str | Path) -> tuple[str, int]:
     end = data.find(b"\0", at, at + 256)
     if end <= at:
-        raise _damaged("its header can't be followed", path)
+        raise _damaged("its header is invalid", path)
     return data[at:end].decode("latin-1"), end + 1
 
 

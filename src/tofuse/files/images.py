@@ -1,7 +1,7 @@
-"""Images: PNG and JPEG, checked before they are decoded.
+"""PNG and JPEG images, checked before they are decoded.
 
-A decoder fills what a truncated file lacks with zeros or grey and says so at most on stderr, and
-believes any size that a header claims. So the structure of a file is checked first.
+OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
+and allocates whatever size a header declares. So the structure of a file is checked first.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NOT_SOF = {0xC4, 0xC8, 0xCC}
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What the header of an image promises."""
+    """The size and type of an image, as its header declares them."""
 
     format: str
     width: int
@@ -48,7 +48,7 @@ def read_header(path: str | Path) -> ImageHeader:
     Raises
     ------
     InputError
-        If it is neither, is cut off within its header, or claims an absurd size.
+        If it is neither, is cut off within its header, or declares an absurd size.
     """
     head = read_head(path, 64)
     return _header(head if head.startswith(_PNG) else read_bytes(path, limit=MAX_IMAGE_BYTES), path)
@@ -64,7 +64,7 @@ def _header(data: bytes, path: str | Path) -> ImageHeader:
         raise InputError(what, where=path, remedy="check the file")
     if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
         raise InputError(
-            f"claims to be {header.width} x {header.height} pixels",
+            f"declares {header.width} x {header.height} pixels",
             where=path,
             remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
         )
@@ -108,7 +108,7 @@ def _check_whole(data: bytes, path: str | Path) -> None:
             break
         (checksum,) = struct.unpack_from(">I", data, end - 4)
         if zlib.crc32(view[at + 4 : end - 4]) != checksum:
-            raise InputError("is damaged (checksum of a PNG chunk)", where=path)
+            raise InputError("is damaged (wrong checksum of a PNG chunk)", where=path)
         if data[at + 4 : at + 8] == b"IEND":
             return
         at = end
@@ -125,9 +125,9 @@ def read_image(
     path
         The file.
     size
-        (width, height) that it must have.
+        Expected (width, height).
     dtype
-        "uint8" or "uint16" of the one channel that it must have (depth, amplitude, confidence).
+        Expected type of its single channel, "uint8" or "uint16" (depth, amplitude, confidence).
 
     Raises
     ------
@@ -144,7 +144,7 @@ def parse_image(
     size: tuple[int, int] | None = None,
     dtype: str | None = None,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG that is in memory; `path` names it in errors. See `read_image`."""
+    """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
     header = _header(data, path)
     if size is not None and (header.width, header.height) != size:
         raise InputError(
@@ -169,7 +169,7 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
     import cv2
 
     grey = header.channels < 3
-    # An orientation noted by a phone would turn the image away from its depth.
+    # The EXIF orientation of a phone would rotate the image relative to its depth.
     flags = cv2.IMREAD_IGNORE_ORIENTATION | (
         cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
         if grey
@@ -185,7 +185,7 @@ def _decode(data: bytes, header: ImageHeader, path: str | Path) -> NDArray[Any]:
 
 
 def read_color(path: str | Path) -> UInt8:
-    """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is repeated, 16 bits are cut to 8."""
+    """Read a PNG or JPEG as (H, W, 3) uint8 RGB; grey is replicated, 16 bits are reduced to 8."""
     return as_color(read_image(path))
 
 

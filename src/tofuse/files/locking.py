@@ -1,7 +1,7 @@
-"""One process at a time, by a lock on a file that goes away with the process that holds it.
+"""Locks between processes.
 
-`locked` waits for its turn, `Claim` refuses at once and says who is there. Both are locks of the
-system on an open file: a process that ended, however it ended, holds none.
+`locked` waits for a lock, `Claim` fails at once and names the holder. Both lock an open file by the
+operating system, which releases the lock when the process ends in any way.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
 
 _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES, errno.EDEADLK)
-_LONGEST_NOTE = 4096  # bytes that who holds a lock says of itself
+_MAX_NOTE_BYTES = 4096  # the holder's description of itself in the lock file
 _RETRIES = 100
 
 if sys.platform == "win32":
@@ -36,7 +36,7 @@ if sys.platform == "win32":
                 continue
 
     def _try(handle: int) -> None:
-        # The note lies before it: what is locked can't be read by others.
+        # Beyond the note: other processes can't read a locked range.
         os.lseek(handle, 1 << 30, os.SEEK_SET)
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
 
@@ -52,15 +52,16 @@ else:
 
 @contextmanager
 def locked(path: str | Path) -> Iterator[int]:
-    """Wait for the lock of a file, which is made where it is missing, and hold it in the block.
+    """Wait for the lock of a file, creating it if needed, and hold the lock during the block.
 
-    Gives the open file's descriptor. A child process that inherits it holds the lock as well, until
-    it ends (not on Windows). The file stays: removing it would let two hold locks of one name.
+    Yields the file descriptor. A child process that inherits it holds the lock as well, until it
+    ends (not on Windows). The file is not removed: otherwise two processes could lock two files of
+    one name.
 
     Raises
     ------
     OutputError
-        If the file can't be made or locked.
+        If the file can't be created or locked.
     """
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -77,11 +78,11 @@ def locked(path: str | Path) -> Iterator[int]:
 
 
 class Claim:
-    """The lock of something that one process at a time may change, until `release`.
+    """An exclusive lock that is acquired at once or not at all, until `release`.
 
-    The file names its holder. It is removed in the end; one that a dead process left is taken over.
-    Where a file system has no locks (some network drives), the note alone must do: it counts while
-    the process that it names is alive, or on another machine, which can't be asked.
+    The lock file names its holder, and is removed in the end; one left by a dead process is taken
+    over. On file systems without locks (some network drives) the note alone serves: it is valid
+    while the process that it names is alive, or if that ran on another machine.
     """
 
     def __init__(self, path: str | Path, *, what: str | Path) -> None:
@@ -90,14 +91,14 @@ class Claim:
         Parameters
         ----------
         path
-            The file of the lock.
+            The lock file.
         what
-            What is locked, for the message.
+            What is locked, for error messages.
 
         Raises
         ------
         OutputError
-            If another process holds it, or the file can't be made.
+            If another process holds it, or the file can't be created.
         """
         self._path = Path(path)
         try:
@@ -106,12 +107,12 @@ class Claim:
             raise output_error(error, what) from error
 
     def release(self) -> None:
-        """Give it back; nothing where that is done."""
+        """Release the lock; harmless if already released."""
         handle, self._handle = self._handle, None
         if handle is None:
             return
         try:
-            if sys.platform == "win32":  # there, what is open can't be removed
+            if sys.platform == "win32":  # where open files can't be removed
                 os.close(handle)
             with suppress(OSError):
                 os.unlink(self._path)
@@ -130,14 +131,14 @@ class Claim:
             try:
                 status = os.fstat(handle)
                 if not stat.S_ISREG(status.st_mode):
-                    raise OSError(errno.EINVAL, "its lock is no ordinary file")
-                held = _read_note(handle)
+                    raise OSError(errno.EINVAL, "its lock is not a regular file")
+                holder = _read_note(handle)
                 try:
                     _try(handle)
                 except OSError as error:
-                    if error.errno in _TAKEN or _alive(held):
-                        raise _refusal(what, held) from None
-                if not _is_at(status, self._path):  # its holder removed it just now
+                    if error.errno in _TAKEN or _alive(holder):
+                        raise _refusal(what, holder) from None
+                if not _is_at(status, self._path):  # removed by its holder in the meantime
                     os.close(handle)
                     continue
                 _write_note(handle)
@@ -165,21 +166,21 @@ def _write_note(handle: int) -> None:
 
 
 def _read_note(handle: int) -> dict[str, Any]:
-    """What the holder of a lock says of itself; nothing where it says nothing sensible."""
+    """The note of the holder of a lock; empty if it is invalid."""
     os.lseek(handle, 0, os.SEEK_SET)
     try:
-        note = json.loads(os.read(handle, _LONGEST_NOTE))
+        note = json.loads(os.read(handle, _MAX_NOTE_BYTES))
     except (ValueError, RecursionError):
         return {}
     return note if isinstance(note, dict) else {}
 
 
-def _alive(held: dict[str, Any]) -> bool:
-    """Whether the process that a note names may be at work; asked where there are no locks."""
-    pid, host = held.get("pid"), held.get("host")
+def _alive(holder: dict[str, Any]) -> bool:
+    """Whether the process that a note names may be running; used on file systems without locks."""
+    pid, host = holder.get("pid"), holder.get("host")
     if type(pid) is not int or pid <= 0 or not isinstance(host, str):
         return False
-    if host != platform.node() or sys.platform == "win32":  # where asking would end it
+    if host != platform.node() or sys.platform == "win32":  # where os.kill(pid, 0) would end it
         return True
     try:
         os.kill(pid, 0)
@@ -190,9 +191,11 @@ def _alive(held: dict[str, Any]) -> bool:
     return pid != os.getpid()
 
 
-def _refusal(what: str | Path, held: dict[str, Any]) -> OutputError:
-    known = [(word, str(held[key])) for key, word in _WHO if isinstance(held.get(key), int | str)]
-    who = ", ".join(f"{word} {text[:80]}" for word, text in known) or "one that does not say more"
+def _refusal(what: str | Path, holder: dict[str, Any]) -> OutputError:
+    known = [
+        (word, str(holder[key])) for key, word in _NOTE if isinstance(holder.get(key), int | str)
+    ]
+    who = ", ".join(f"{word} {text[:80]}" for word, text in known) or "unknown"
     return OutputError(
         f"is being written by another process ({who})",
         where=what,
@@ -200,4 +203,4 @@ def _refusal(what: str | Path, held: dict[str, Any]) -> OutputError:
     )
 
 
-_WHO = (("pid", "pid"), ("host", "on"), ("since", "since"))
+_NOTE = (("pid", "pid"), ("host", "on"), ("since", "since"))

@@ -1,7 +1,8 @@
-"""LZFSE streams (Apple's codec), which Record3D stores its depth in.
+"""LZFSE streams (Apple's codec), in which Record3D stores depth.
 
-The layout is that of Apple's reference, github.com/lzfse/lzfse: blocks, each begun by four bytes
-that tell its kind.
+The layout is that of Apple's reference implementation, github.com/lzfse/lzfse: blocks, each of
+which begins with four bytes that identify its kind. Own code, as there are no wheels of a decoder
+for Linux.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ _END, _RAW, _TABLED, _PACKED, _SMALL = b"bvx$", b"bvx-", b"bvx1", b"bvx2", b"bvx
 _HEADER = 32
 _SYMBOLS = 360
 
-# A symbol's count is coded by 2 to 14 bits, of which the lowest five tell how many.
+# A symbol's count has 2 to 14 bits; the lowest five determine their number.
 _TWO = {0b00: 0, 0b10: 1}
 _THREE = {0b001: 2, 0b101: 3}
 _FIVE = {0b00011: 4, 0b01011: 5, 0b10011: 6, 0b11011: 7}
 
 
 def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
-    """Decompress a stream that must hold exactly `size` bytes.
+    """Decompress a stream of exactly `size` bytes; `path` names it in errors.
 
     Raises
     ------
     InputError
-        If it is damaged, cut off, of another size, or of a kind that is not read.
+        If it is damaged, cut off, of another size, or contains unsupported blocks.
     """
     out = np.empty(size, np.uint8)
     at = done = 0
@@ -40,7 +41,7 @@ def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
             break
         if kind not in (_RAW, _PACKED):
             names = {_TABLED: "uncompressed tables", _SMALL: "LZVN"}
-            what = f"uses {names[kind]}, which isn't read" if kind in names else "is damaged"
+            what = f"uses {names[kind]}, which is not supported" if kind in names else "is damaged"
             raise InputError(f"{what} (LZFSE)", where=path, remedy="export the recording again")
         (count,) = _unpack("<I", data, at + 4, path)
         if done + count > size:
@@ -55,12 +56,14 @@ def lzfse_decompress(data: bytes, size: int, path: str | Path) -> bytes:
             at = _packed(data, at, out[: done + count], done, path)
         done += count
     if done != size:
-        raise InputError(f"unpacks to {done} bytes, not {size}", where=path, remedy="copy it again")
+        raise InputError(
+            f"decompresses to {done} bytes, not {size}", where=path, remedy="copy it again"
+        )
     return out.tobytes()
 
 
 def _packed(data: bytes, at: int, out: UInt8, done: int, path: str | Path) -> int:
-    """Decode a block with packed tables to the end of `out`; return where the next one begins."""
+    """Decode a block with packed tables to the end of `out`; return the next block's offset."""
     from tofuse.kernels.lzfse import STATES, lzfse_block
 
     _, _, first, second, third = _unpack("<4sIQQQ", data, at, path)
@@ -103,7 +106,7 @@ def _packed(data: bytes, at: int, out: UInt8, done: int, path: str | Path) -> in
 
 
 def _counts(data: bytes, path: str | Path) -> Int64:
-    """Unpack how many states each of the 360 symbols has."""
+    """Unpack the number of states of each of the 360 symbols."""
     bits, left = int.from_bytes(data, "little"), 8 * len(data)
     out = np.zeros(_SYMBOLS, np.int64)
     for k in range(_SYMBOLS if data else 0):

@@ -1,7 +1,7 @@
-"""Matroska files, as far as recordings of cameras need them: tracks, blocks, attachments, tags.
+"""The part of Matroska that camera recordings use: tracks, blocks, attachments, tags.
 
-Follows RFC 8794 (EBML) and RFC 9559 (Matroska). Only the heads of elements are read when a file is
-opened; the blocks themselves when they are asked for.
+Follows RFC 8794 (EBML) and RFC 9559 (Matroska). Only the headers of elements are read when a file
+is opened; blocks are read on demand. A file that was cut off is used up to there.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _TRACK, _VIDEO, _TAG, _SIMPLE_TAG, _FILE = 0xAE, 0xE0, 0x7373, 0x67C8, 0x61A7
 _BLOCK_GROUP, _BLOCK, _SIMPLE_BLOCK, _TIME = 0xA0, 0xA1, 0xA3, 0xE7
 _LACED = 0x06
 
-_MAX_VALUE = 64 << 20  # of an element that is kept in memory
+_MAX_VALUE = 64 << 20  # bytes of an element that is read into memory
 _MAX_BLOCK = 256 << 20
 _MAX_BLOCKS = 20_000_000
 
 
 @dataclass(frozen=True)
 class Block:
-    """One frame of a track: when it is, and where its bytes lie in the file."""
+    """One frame of a track: its time, and the range of its bytes in the file."""
 
     time_ns: int
     offset: int
@@ -41,9 +41,9 @@ class Block:
 
 @dataclass
 class Track:
-    """One track and its blocks in the order of the file.
+    """One track and its blocks in file order.
 
-    `private` describes the codec; `duration_ns` is that of a frame, 0 where it isn't told.
+    `private` is the codec's private data; `duration_ns` is that of a frame, 0 where not given.
     """
 
     number: int
@@ -57,21 +57,21 @@ class Track:
 
 
 class Matroska:
-    """An opened file.
+    """An open Matroska file.
 
     Attributes
     ----------
     tracks
-        In the order of the file.
+        In file order.
     tags, attachments
         By name.
     complete
-        False if the file ends within an element: it was cut off, and the rest is used.
+        False if the file was cut off within an element; what precedes is used.
 
     Raises
     ------
     InputError
-        If it can't be read or is no Matroska file.
+        If it can't be read or is not a Matroska file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,16 +87,16 @@ class Matroska:
             with path.open("rb") as self._file:
                 self._size = os.fstat(self._file.fileno()).st_size
                 if self._at(0, 4) != MAGIC:
-                    raise InputError("is no Matroska file", where=path, remedy="check the file")
+                    raise InputError("is not a Matroska file", where=path, remedy="check the file")
                 self._parse()
         except OSError as error:
             raise input_error(error, path) from error
 
     def read(self, block: Block) -> bytes:
-        """Return the bytes of a block; InputError if they aren't all there, or are laced."""
+        """Return the bytes of a block; InputError if it is cut off, or laced (several frames)."""
         if block.laced or block.size > _MAX_BLOCK:
             raise InputError(
-                f"holds a block at byte {block.offset} that isn't one frame", where=self.path
+                f"has a block at byte {block.offset} that isn't a single frame", where=self.path
             )
         try:
             with self.path.open("rb") as file:
@@ -129,7 +129,7 @@ class Matroska:
                     self._each(_FILE, begin, stop, self._attachment)
 
     def _elements(self, at: int, end: int) -> Iterator[tuple[int, int, int, bool]]:
-        """Yield each element's number, begin, end, and whether its size is told."""
+        """Yield each element's number, begin, end, and whether its size is known."""
         while at < end:
             head = self._at(at, 12)
             kind, first = _variable(head, 0, keep=True)
@@ -141,7 +141,7 @@ class Matroska:
             sized = size != (1 << 7 * (second - first)) - 1
             stop = begin + size if sized else end
             if stop > end:
-                # The file was cut off, or an element claims more than there is.
+                # The file was cut off, or an element declares too large a size.
                 self.complete = False
                 stop = end
             yield kind, begin, stop, sized
@@ -165,7 +165,7 @@ class Matroska:
                         self._block(first, last, time)
 
     def _before(self, start: int, kind: int) -> int:
-        """Return where the head of an element lies whose content begins at `start`."""
+        """Return the offset of the header of an element whose content begins at `start`."""
         name = kind.to_bytes(4, "big")
         head = self._at(max(start - 12, 0), min(start, 12))
         return max(start - 12, 0) + head.rfind(name)
@@ -186,13 +186,13 @@ class Matroska:
         time_ns = (time + relative) * self._scale_ns
         track.blocks.append(Block(time_ns, offset, stop - offset, laced))
 
-    def _each(self, kind: int, begin: int, end: int, use: object) -> None:
-        for found, start, stop, _ in self._elements(begin, end):
-            if found == kind:
+    def _each(self, wanted: int, begin: int, end: int, use: object) -> None:
+        for kind, start, stop, _ in self._elements(begin, end):
+            if kind == wanted:
                 use(start, stop)  # type: ignore[operator]
 
     def _values(self, begin: int, end: int) -> dict[int, bytes]:
-        """Bytes of each element between two positions that isn't too large."""
+        """The bytes of each element between two offsets, except of very large ones."""
         return {
             kind: self._at(start, stop - start)
             for kind, start, stop, _ in self._elements(begin, end)
@@ -230,9 +230,9 @@ class Matroska:
 
 
 def _variable(data: bytes, at: int, *, keep: bool = False) -> tuple[int, int]:
-    """Return a number of variable length and the position after it; 0, 0 if there is none.
+    """Return a variable-length integer and the position after it; 0, 0 if there is none.
 
-    `keep` leaves the bit that tells the length in it, as the names of elements have it.
+    `keep` leaves the length marker in it, as in element numbers.
     """
     if at >= len(data) or data[at] == 0:
         return 0, 0

@@ -1,4 +1,4 @@
-"""Memory that was freed, and that the C library keeps for itself."""
+"""Returning freed memory to the operating system."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 
 
 def give_back() -> None:
-    """Give freed memory back to the system, where the C library is known to keep it (glibc).
+    """Return freed memory to the operating system, where the C library (glibc) retains it.
 
-    What a stage leaves free is in pieces between what stays: the next one would take new memory.
+    The memory that a stage frees is fragmented, so that the next one would allocate more.
     """
     trim = _trim()
     if trim is not None:

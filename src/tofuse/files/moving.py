@@ -1,12 +1,12 @@
-"""Moving a set of files into a folder: all of them or none, whatever stops the program.
+"""Moving a set of files into a folder atomically: all of them or none, even after a crash.
 
-The files lie in a staging folder inside. A plan there says which go where, and which earlier ones
-they take the place of. It is written, and on the disk, before the first move, and removed after the
-last. So after a power cut either there is no plan, and nothing has moved; or the plan is there, and
-`recover` finishes what it says. Each move is one rename, of a file or of a whole folder of them.
+The files are in a staging folder inside it. A plan there lists which files are moved and which
+earlier ones they replace. It is synced to disk before the first move and removed after the last. So
+after a power cut either there is no plan, and nothing has moved; or there is one, and `recover`
+completes it. Each move is one rename, of a file or of a folder with all its files.
 
-A plan is believed only as far as it can be checked: it may name what a result is made of, and
-nothing else, and each thing must be what it was when the plan was made.
+A plan is not trusted: it may name only files that a result consists of, and each must be unchanged
+since the plan was written.
 """
 
 from __future__ import annotations
@@ -26,24 +26,23 @@ from tofuse.files.atomic import replacing, sync, sync_tree
 
 _ASIDE, _FORWARD, _BACK = "replaced", "plan.json", "undo.json"  # in the staging folder
 _MAX_PLAN_BYTES = 4 << 20
-_SAME_TIME_S = 2.0  # what file systems round times of change to
-_PART = re.compile(r"\..*\.part(\.\w+)?|\..*\.unfinished")  # what was being written
+_TIME_RESOLUTION_S = 2.0  # of modification times on FAT file systems
+_PART = re.compile(r"\..*\.part(\.\w+)?|\..*\.unfinished")  # temporary files
 
-# What a file was: its kind, size in bytes and time of change in s; of a folder, what its files
-# were.
+# Kind, size in bytes and modification time in s of a file; of a folder, the marks of its files.
 Mark = tuple[str, int, float] | dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Names:
-    """What a result is made of: files, and folders that hold certain ones and nothing else.
+    """The names that a result consists of: files, and folders with certain files only.
 
     Attributes
     ----------
     files, more
-        Names of files, and what further ones are like.
+        Names of files, and the pattern of further ones.
     folders
-        What names of folders are like, and what is in them.
+        Patterns of names of folders, and the names in them.
     """
 
     files: frozenset[str]
@@ -51,15 +50,15 @@ class Names:
     more: re.Pattern[str] | None = None
 
     def file(self, name: str) -> bool:
-        """Whether it is the name of a file."""
+        """Whether `name` is that of a file of a result."""
         return name in self.files or bool(self.more and self.more.fullmatch(name))
 
     def folder(self, name: str) -> Names | None:
-        """Return what a folder of this name holds; None if it is no name of a folder."""
+        """Return the names in the folder `name`; None if a result has no such folder."""
         return next((inner for like, inner in self.folders if like.fullmatch(name)), None)
 
     def is_whole(self, folder: Path) -> bool:
-        """Whether something is such a folder: no links, and nothing else inside."""
+        """Whether a path is such a folder, without links or other content."""
         inner = self.folder(folder.name)
         return (
             inner is not None
@@ -71,22 +70,23 @@ class Names:
         )
 
 
-class _UntrueError(Exception):
-    """Says what is wrong with a plan."""
+class _InvalidPlanError(Exception):
+    """A plan that is malformed or no longer matches the files."""
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is moved into place, and what is moved aside before, in that order.
+    """The files that are moved into place, and those that are moved aside before, in that order.
 
-    The first of the old is the last of the new: the file that says that all others are there.
+    The first of the old ones and the last of the new ones is the marker: it exists only while the
+    set is complete.
     """
 
     new: dict[str, Mark]
     old: dict[str, Mark]
 
     def carry_out(self, staging: Path, folder: Path) -> None:
-        """Move, or go on with it."""
+        """Make the moves, or the remaining ones."""
         for name in self.old:
             if not os.path.lexists(staging / _ASIDE / name):
                 os.replace(folder / name, staging / _ASIDE / name)
@@ -95,7 +95,7 @@ class _Plan:
                 os.replace(staging / name, folder / name)
 
     def undo(self, staging: Path, folder: Path) -> None:
-        """Move back, or go on with it."""
+        """Reverse the moves, or the remaining ones."""
         for name in reversed(self.new):
             if not os.path.lexists(staging / name):
                 os.replace(folder / name, staging / name)
@@ -104,7 +104,7 @@ class _Plan:
                 os.replace(staging / _ASIDE / name, folder / name)
 
     def check(self, names: Names, staging: Path, folder: Path) -> None:
-        """Refuse what is not where the plan says, or is not what it was."""
+        """Raise _InvalidPlanError if a file is missing from both places, or was changed."""
         for name, mark in self.old.items():
             aside = staging / _ASIDE / name
             _check(aside if os.path.lexists(aside) else folder / name, mark, names)
@@ -114,21 +114,21 @@ class _Plan:
 
 
 def move_all(staging: Path, folder: Path, names: Names, marker: str) -> None:
-    """Move all that is staged into a folder, in place of what has the names of a result there.
+    """Move all staged files into a folder, replacing the files of an earlier result there.
 
-    All is moved, or, if that fails, nothing.
+    If a move fails, all are reversed.
 
     Parameters
     ----------
     marker
-        The file that goes away first and comes last: where it is, everything is of one result.
+        The file that is removed first and added last: it marks a complete result.
 
     Raises
     ------
     OutputError
-        If something is in the way that is no part of a result.
+        If a name is taken by something that is not part of a result.
     OSError
-        If it fails; what was there before is there again.
+        If a move fails; the previous state is restored.
     """
     new = sorted((p.name for p in staging.iterdir()), key=lambda n: (n == marker, n))
     there = sorted((p.name for p in folder.iterdir()), key=lambda n: (n != marker, n))
@@ -141,8 +141,8 @@ def move_all(staging: Path, folder: Path, names: Names, marker: str) -> None:
     )
     (staging / _ASIDE).mkdir()
     sync_tree(staging)
-    with replacing(staging / _FORWARD, durable=True) as beside:
-        beside.write_text(json.dumps(asdict(plan)), encoding="utf-8")
+    with replacing(staging / _FORWARD, durable=True) as temporary:
+        temporary.write_text(json.dumps(asdict(plan)), encoding="utf-8")
     try:
         plan.carry_out(staging, folder)
     except BaseException:
@@ -154,51 +154,51 @@ def move_all(staging: Path, folder: Path, names: Names, marker: str) -> None:
 
 
 def _end(staging: Path, folder: Path, name: str) -> None:
-    """Let go of a plan that is carried out."""
+    """Remove a completed plan."""
     sync(folder)
     sync(staging)
     (staging / name).unlink()
 
 
-def is_stopped(staging: Path) -> bool:
-    """Whether moves were begun and not ended: nobody may read the folder before `recover`."""
+def is_interrupted(staging: Path) -> bool:
+    """Whether moves were interrupted: the folder must not be read before `recover`."""
     return any(os.path.lexists(staging / name) for name in (_FORWARD, _BACK))
 
 
 def places(staging: Path, folder: Path) -> tuple[Path, ...]:
-    """Where the files of the old and the new result are while moves go on."""
+    """Return the folders in which files of the old and the new result can be during the moves."""
     return (folder, staging / _ASIDE, staging)
 
 
 def recover(staging: Path, folder: Path, names: Names, marker: str) -> None:
-    """Finish the moves of a program that was stopped at them; nothing where there were none.
+    """Complete the moves of an interrupted program, if any.
 
     Raises
     ------
     OutputError
-        If what it left can't be trusted; then nothing is touched.
+        If the plan is invalid; then nothing is touched.
     OSError
-        If a move fails; it can be tried again.
+        If a move fails; calling again is safe.
     """
-    for name, way in ((_BACK, _Plan.undo), (_FORWARD, _Plan.carry_out)):
+    for name, move in ((_BACK, _Plan.undo), (_FORWARD, _Plan.carry_out)):
         if not os.path.lexists(staging / name):
             continue
         plan = checked_plan(staging, names, marker, name)
         try:
             plan.check(names, staging, folder)
-        except _UntrueError as untrue:
-            raise _untrusted(staging / name, untrue) from None
-        way(plan, staging, folder)
+        except _InvalidPlanError as error:
+            raise _invalid_plan(staging / name, error) from None
+        move(plan, staging, folder)
         _end(staging, folder, name)
 
 
-def check_stopped(staging: Path, names: Names, marker: str) -> None:
-    """Refuse a plan that says what no program of ours says, without looking at what it names.
+def check_interrupted(staging: Path, names: Names, marker: str) -> None:
+    """Check a plan of interrupted moves, if any, without looking at the files that it names.
 
     Raises
     ------
     OutputError
-        If there is such a plan.
+        If it is invalid.
     """
     for name in (_BACK, _FORWARD):
         if os.path.lexists(staging / name):
@@ -206,33 +206,33 @@ def check_stopped(staging: Path, names: Names, marker: str) -> None:
 
 
 def checked_plan(staging: Path, names: Names, marker: str, name: str) -> _Plan:
-    """Return a plan of which all names and kinds are those of a result."""
+    """Read a plan; OutputError unless all its names and kinds are those of a result."""
     path = staging / name
     try:
         for part in (staging, staging / _ASIDE):
             if not _is(part, stat.S_ISDIR):
-                raise _UntrueError(f"{part.name} is no folder")
+                raise _InvalidPlanError(f"{part.name} is not a folder")
         if not _is(path, stat.S_ISREG) or path.stat().st_size > _MAX_PLAN_BYTES:
-            raise _UntrueError("it is no small file")
+            raise _InvalidPlanError("it is not a small file")
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
         except (ValueError, RecursionError):
-            raise _UntrueError("it is not JSON") from None
+            raise _InvalidPlanError("it is not JSON") from None
         if not isinstance(data, dict) or set(data) != {"new", "old"}:
-            raise _UntrueError("it is no plan")
+            raise _InvalidPlanError("it is not a plan")
         plan = _Plan(*(_marks(data[key], names, key) for key in ("new", "old")))
         if plan.old and next(iter(plan.old)) != marker:
-            raise _UntrueError("it replaces what is no result")
+            raise _InvalidPlanError("it replaces something other than a result")
         if plan.new and list(plan.new)[-1] != marker:
-            raise _UntrueError("it makes no result")
+            raise _InvalidPlanError("it does not produce a result")
         return plan
-    except _UntrueError as untrue:
-        raise _untrusted(path, untrue) from None
+    except _InvalidPlanError as error:
+        raise _invalid_plan(path, error) from None
     except OSError as error:
-        raise _untrusted(path, error.strerror or error) from error
+        raise _invalid_plan(path, error.strerror or error) from error
 
 
-def _untrusted(path: Path, why: object) -> OutputError:
+def _invalid_plan(path: Path, why: object) -> OutputError:
     return OutputError(
         f"was not left by this program, or has changed since ({why}); nothing was touched",
         where=path,
@@ -242,17 +242,17 @@ def _untrusted(path: Path, why: object) -> OutputError:
 
 def _marks(data: object, names: Names, key: str) -> dict[str, Mark]:
     if not isinstance(data, dict):
-        raise _UntrueError("it is no plan")
-    found: dict[str, Mark] = {}
+        raise _InvalidPlanError("it is not a plan")
+    marks: dict[str, Mark] = {}
     for name, mark in data.items():
         inner = names.folder(name)
         if names.file(name) and _is_mark(mark, ("file", "link") if key == "old" else ("file",)):
-            found[name] = tuple(mark)
+            marks[name] = tuple(mark)
         elif inner is not None and isinstance(mark, dict):
-            found[name] = _marks(mark, inner, "within")
+            marks[name] = _marks(mark, inner, "within")
         else:
-            raise _UntrueError(f"it names {name!r:.80}")
-    return found
+            raise _InvalidPlanError(f"it names {name!r:.80}")
+    return marks
 
 
 def _is_mark(mark: object, kinds: tuple[str, ...] = ("file",)) -> bool:
@@ -266,7 +266,7 @@ def _is_mark(mark: object, kinds: tuple[str, ...] = ("file",)) -> bool:
 
 
 def _mark(path: Path, names: Names) -> Mark:
-    """What something of a result is."""
+    """The kind, size and time of a file of a result, or the marks of a folder's files."""
     status = path.lstat()
     inner = names.folder(path.name)
     if inner is not None and stat.S_ISDIR(status.st_mode) and names.is_whole(path):
@@ -278,13 +278,13 @@ def _mark(path: Path, names: Names) -> Mark:
 
 
 def _check(path: Path, mark: Mark, names: Names) -> None:
-    """Refuse what is not what it was."""
+    """Raise _InvalidPlanError if a file was changed since it was marked."""
     try:
         now = _mark(path, names)
     except (OSError, OutputError):
-        raise _UntrueError(f"{path.name} is not what it was") from None
+        raise _InvalidPlanError(f"{path.name} was changed") from None
     if not _same(now, mark):
-        raise _UntrueError(f"{path.name} is not what it was")
+        raise _InvalidPlanError(f"{path.name} was changed")
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -292,16 +292,16 @@ def _same(a: Any, b: Any) -> bool:
         return set(a) == set(b) and all(_same(a[name], b[name]) for name in a)
     if isinstance(a, dict) or isinstance(b, dict):
         return False
-    return bool(a[:2] == b[:2] and abs(a[2] - b[2]) <= _SAME_TIME_S)
+    return bool(a[:2] == b[:2] and abs(a[2] - b[2]) <= _TIME_RESOLUTION_S)
 
 
 def check_replaceable(path: Path, names: Names) -> None:
-    """Refuse to replace what only has the name of something of a result.
+    """Check that something with a name of a result may be replaced.
 
     Raises
     ------
     OutputError
-        If it is a folder in place of a file, or a folder that somebody has put something into.
+        If it is of another kind than in a result, or a folder with additional content.
     """
     if names.folder(path.name):
         good = names.is_whole(path)
@@ -312,18 +312,18 @@ def check_replaceable(path: Path, names: Names) -> None:
 
 
 def check_error(path: Path) -> OutputError:
-    """Say that something is no part of a result."""
+    """Return the error that something is not part of a result."""
     return OutputError(
-        "holds something other than the files of an earlier result",
+        "is not a file of an earlier result",
         where=path,
         remedy="move it away, or give another --out",
     )
 
 
 def clear(staging: Path, names: Names) -> bool:
-    """Remove a staging folder, as far as it holds what is staged; whether all of it is gone.
+    """Remove a staging folder with the files of a result in it, and return whether it is gone.
 
-    Links are never followed, and what has no name of ours stays.
+    Links are never followed, and other files stay.
     """
     if not os.path.lexists(staging):
         return True

@@ -129,7 +129,7 @@ def _read_header(data: bytes, path: str | Path) -> _Header:
     while "DATA" not in values:
         end = data.find(b"\n", at, _HEADER_LIMIT)
         if end < 0:
-            what = "is empty" if not data else "is no PCD file (its header has no DATA line)"
+            what = "is empty" if not data else "is not a PCD file (its header has no DATA line)"
             raise InputError(what, where=path, remedy=_COPY_AGAIN)
         words = data[at:end].decode("latin-1").split("#", 1)[0].split()
         at = end + 1
@@ -150,7 +150,7 @@ def _read_header(data: bytes, path: str | Path) -> _Header:
         kind = values["DATA"][0].lower()
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(
-            f"has a PCD header that can't be understood ({error})", where=path, remedy=_COPY_AGAIN
+            f"has an invalid PCD header ({error})", where=path, remedy=_COPY_AGAIN
         ) from error
     if kind not in ("ascii", "binary", "binary_compressed"):
         raise InputError(f"has PCD data of the kind {kind!r}", where=path, remedy=_COPY_AGAIN)
@@ -159,7 +159,7 @@ def _read_header(data: bytes, path: str | Path) -> _Header:
             f"declares {points} points in {width} x {height}", where=path, remedy=_COPY_AGAIN
         )
     if points > MAX_POINTS or max(counts, default=1) > 65536:
-        raise InputError(f"claims to hold {points} points", where=path, remedy=_COPY_AGAIN)
+        raise InputError(f"declares {points} points", where=path, remedy=_COPY_AGAIN)
     if len(viewpoint) != 7 or not all(map(math.isfinite, viewpoint)):
         viewpoint = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     return _Header(names, dtypes, counts, width, height, points, viewpoint, kind, at)

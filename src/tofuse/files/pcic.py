@@ -1,8 +1,8 @@
-"""PCIC streams of ifm's cameras: frames of chunks between "star" and "stop".
+"""PCIC streams of ifm's cameras: frames, each of chunks between "star" and "stop".
 
-Each chunk has a head of little-endian words (kind, size, size of the head, version, width, height,
-pixel format, time stamp in us, frame, status, seconds, nanoseconds), from version 3 on followed by
-JSON.
+Each chunk has a header of little-endian words (kind, size, header size, version, width, height,
+pixel format, timestamp in us, frame, status, seconds, nanoseconds), followed by JSON since version
+3.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MAX_FRAMES = 1 << 20
 
 @dataclass(frozen=True)
 class Chunk:
-    """One chunk of a frame: its head, and where its bytes lie in the stream."""
+    """One chunk of a frame: its header, and the range of its bytes in the stream."""
 
     kind: int
     width: int
@@ -42,19 +42,19 @@ class Chunk:
 
     @property
     def time(self) -> float:
-        """Seconds of the camera's clock."""
+        """Timestamp in s of the camera's clock."""
         if self.seconds or self.nanoseconds:
             return self.seconds + self.nanoseconds / 1e9
         return self.time_us / 1e6
 
 
 def pcic_frames(data: bytes, path: str | Path) -> list[dict[int, Chunk] | InputError]:
-    """Find the frames of a stream: chunks by kind, or the error in the place of a damaged one.
+    """Find the frames of a stream: for each its chunks by kind, or the error if it is damaged.
 
     Raises
     ------
     InputError
-        If there is no frame.
+        If there are no frames.
     """
     frames: list[dict[int, Chunk] | InputError] = []
     at = data.find(BEGIN)
@@ -67,12 +67,12 @@ def pcic_frames(data: bytes, path: str | Path) -> list[dict[int, Chunk] | InputE
             frames.append(error)
         at = data.find(BEGIN, at)
     if not frames:
-        raise InputError("is no PCIC stream", where=path, remedy="check the file")
+        raise InputError("is not a PCIC stream", where=path, remedy="check the file")
     return frames
 
 
 def _chunks(data: bytes, at: int, where: str) -> tuple[dict[int, Chunk], int]:
-    found: dict[int, Chunk] = {}
+    chunks: dict[int, Chunk] = {}
     while data[at : at + 4] != END:
         if at + _HEAD > len(data):
             raise InputError("is cut off", where=where, remedy="copy the file again")
@@ -86,7 +86,7 @@ def _chunks(data: bytes, at: int, where: str) -> tuple[dict[int, Chunk], int]:
             seconds, nanoseconds = struct.unpack_from("<2I", data, at + 40)
         if version >= 3 and head > 48:
             about = _json(data[at + 48 : at + head])
-        found[kind] = Chunk(
+        chunks[kind] = Chunk(
             kind,
             width,
             height,
@@ -99,7 +99,7 @@ def _chunks(data: bytes, at: int, where: str) -> tuple[dict[int, Chunk], int]:
             at + size,
         )
         at += size
-    return found, at + 4
+    return chunks, at + 4
 
 
 def _json(data: bytes) -> dict[str, Any]:
@@ -116,13 +116,13 @@ def chunk_image(data: bytes, chunk: Chunk, where: str) -> NDArray[Any]:
     Raises
     ------
     InputError
-        If it holds no image, or less of it than it says.
+        If it is not an image, or is cut off.
     """
     if chunk.format >= len(_TYPES) or not (
         1 <= chunk.width <= _MAX_SIDE and 1 <= chunk.height <= _MAX_SIDE
     ):
         raise InputError(
-            f"chunk {chunk.kind} is no image ({chunk.width} x {chunk.height}, "
+            f"chunk {chunk.kind} is not an image ({chunk.width} x {chunk.height}, "
             f"format {chunk.format})",
             where=where,
         )

@@ -21,15 +21,15 @@ def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
     Raises
     ------
     InputError
-        Naming `where`, if it is something else, or cut off.
+        Naming `where`, if it is not such an image, or is cut off.
     """
     header = _HEADER.match(data)
     if header is None:
-        raise InputError("is no binary PGM image", where=where, remedy="copy the file again")
-    width, height, most = (int(each) for each in header.groups())
-    if not 0 < width * height <= MAX_PIXELS or not 0 < most < 65536:
-        raise InputError(f"claims {width} x {height} pixels up to {most}", where=where)
-    dtype = np.dtype(">u2" if most > 255 else "u1")
+        raise InputError("is not a binary PGM image", where=where, remedy="copy the file again")
+    width, height, largest = (int(each) for each in header.groups())
+    if not 0 < width * height <= MAX_PIXELS or not 0 < largest < 65536:
+        raise InputError(f"declares {width} x {height} pixels up to {largest}", where=where)
+    dtype = np.dtype(">u2" if largest > 255 else "u1")
     size = width * height * dtype.itemsize
     if len(data) < header.end() + size:
         raise InputError("is cut off before its end", where=where, remedy="copy the file again")

@@ -1,4 +1,4 @@
-"""One rigid motion in a file: a 4x4 matrix, JSON with one, or a line as in a TUM trajectory."""
+"""A rigid motion in a file: a 4x4 matrix, JSON with one, or a line as in a TUM trajectory."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _MAX_BYTES = 16 << 20
 
 
 def read_pose(path: str | Path) -> Float64:
-    """Read a (4, 4) T_target_source, as exactly as the file has it.
+    """Read a (4, 4) T_target_source, with the precision of the file.
 
-    The file holds 16 numbers, row by row; or `tx ty tz qx qy qz qw`, maybe after a timestamp; or
-    JSON: a 4x4 list, or an object with one as its `T_target_source`. In text # starts a comment.
+    The file contains 16 numbers, row by row; or `tx ty tz qx qy qz qw`, possibly after a timestamp;
+    or JSON: a 4x4 list, or an object with one as its `T_target_source`. In text # starts a comment.
 
     Raises
     ------
     InputError
-        Naming file and field, if it can't be read or holds no rigid motion.
+        Naming file and field, if it can't be read or is not a rigid motion.
     """
     text = read_text(path, limit=_MAX_BYTES)
     if text.lstrip()[:1] in ("{", "["):
@@ -82,14 +82,14 @@ def _from_numbers(text: str, path: str | Path) -> Float64:
                 numbers.append(float(word))
             except ValueError as error:
                 raise InputError(
-                    f"{word[:40]!r} is no number", where=f"{path}, line {count}", remedy=_REMEDY
+                    f"{word[:40]!r} is not a number", where=f"{path}, line {count}", remedy=_REMEDY
                 ) from error
             if not math.isfinite(numbers[-1]):
-                raise InputError(f"holds {word}", where=f"{path}, line {count}", remedy=_REMEDY)
+                raise InputError(f"contains {word}", where=f"{path}, line {count}", remedy=_REMEDY)
     if len(numbers) == 16:
         return np.array(numbers).reshape(4, 4)
     if len(numbers) not in (7, 8):
-        raise InputError(f"holds {len(numbers)} numbers", where=path, remedy=_REMEDY)
+        raise InputError(f"contains {len(numbers)} numbers", where=path, remedy=_REMEDY)
     row = np.array(numbers[-7:])
     norm = float(np.linalg.norm(row[3:]))
     if abs(norm - 1) > 0.1:

@@ -1,4 +1,4 @@
-"""Reading files and folders that come from outside."""
+"""Reading external files and folders."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _REASONS = {
     errno.EPERM: ("may not be read (permission denied)", "change its permissions"),
     errno.ELOOP: ("is a link that leads back to itself", "replace the link"),
     errno.EISDIR: ("is a folder", "give a file"),
-    errno.ENOTDIR: ("lies inside something that is no folder", "check the path"),
+    errno.ENOTDIR: ("is inside something that is not a folder", "check the path"),
     errno.ENAMETOOLONG: ("has too long a name", "check the path"),
 }
 
 
 def input_error(error: OSError, path: str | Path) -> InputError:
-    """Say in one line why `path` can't be read, and what to do."""
+    """Return the error that `path` can't be read, with reason and remedy."""
     problem, remedy = _REASONS.get(
         error.errno or 0, (f"can't be read ({error.strerror or error})", "check the file")
     )
@@ -38,17 +38,17 @@ def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:
     Raises
     ------
     InputError
-        If it can't be read, is no ordinary file, or is larger.
+        If it can't be read, is not a regular file, or is larger.
     """
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
-            kind = "a folder" if path.is_dir() else "no ordinary file"
+            kind = "a folder" if path.is_dir() else "not a regular file"
             raise InputError(f"is {kind}", where=path, remedy="give a file")
         size = path.stat().st_size
         if size > limit:
             raise InputError(
-                f"has {size >> 20} MiB, more than the {limit >> 20} MiB that are read",
+                f"has {size >> 20} MiB, more than the limit of {limit >> 20} MiB",
                 where=path,
                 remedy="check that it is the file you meant",
             )
@@ -56,7 +56,7 @@ def read_bytes(path: str | Path, *, limit: int = MAX_BYTES) -> bytes:
     except OSError as error:
         raise input_error(error, path) from error
     except ValueError as error:  # a NUL in the name
-        raise InputError(f"is no path ({error})", where=repr(str(path))) from error
+        raise InputError(f"is not a path ({error})", where=repr(str(path))) from error
 
 
 def read_head(path: str | Path, size: int) -> bytes:
@@ -64,7 +64,7 @@ def read_head(path: str | Path, size: int) -> bytes:
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
-            raise InputError("is no ordinary file", where=path, remedy="give a file")
+            raise InputError("is not a regular file", where=path, remedy="give a file")
         with path.open("rb") as file:
             return file.read(size)
     except OSError as error:
@@ -72,12 +72,23 @@ def read_head(path: str | Path, size: int) -> bytes:
 
 
 def parsed(parse: Callable[[str], Any], text: str, *, where: str | Path, what: str) -> Any:
-    """Return what a parser of JSON or TOML makes of a text from outside.
+    """Parse external JSON or TOML.
+
+    Parameters
+    ----------
+    parse
+        Function from text to data, such as `json.loads`.
+    text
+        The text.
+    where
+        Its source, for errors.
+    what
+        Its format, for errors.
 
     Raises
     ------
     InputError
-        If it is broken, or nested more deeply than any that means something.
+        If it is invalid or too deeply nested.
     """
     try:
         return parse(text)
@@ -106,7 +117,7 @@ def name_order(path: Path) -> list[tuple[int, int, str]]:
 
 
 def list_folder(path: str | Path) -> list[Path]:
-    """Return what lies in a folder, hidden things left out, in name order.
+    """Return the visible entries of a folder in name order, see `name_order`.
 
     Raises
     ------
@@ -122,16 +133,16 @@ def list_folder(path: str | Path) -> list[Path]:
 
 
 def files_with(path: str | Path, *suffixes: str) -> list[Path]:
-    """Return what a folder holds with one of the suffixes (any case), in name order.
+    """Return the entries of a folder with one of the suffixes (any case), in name order.
 
-    Also what is no file, or a link that leads nowhere: it stands for a frame, which can't be read,
-    and left out it would move all others in time. What has another suffix is none.
+    Including non-files and dangling links: each stands for an unreadable frame, without which all
+    later ones would be assigned wrong times.
     """
     return [p for p in list_folder(path) if p.suffix.lower() in suffixes]
 
 
 def files_named(path: Path, named: Callable[[str], object]) -> list[Path]:
-    """Return files of a folder whose name is `named`, in name order; none if it is no folder."""
+    """Return the files in a folder whose name satisfies `named`; none if it is not a folder."""
     if not is_folder(path):
         return []
     try:
@@ -141,12 +152,12 @@ def files_named(path: Path, named: Callable[[str], object]) -> list[Path]:
 
 
 def if_file(path: Path) -> Path | None:
-    """Return the path if it is that of a file that can be looked at."""
+    """Return the path if it is an accessible file, else None."""
     return path if is_file(path) else None
 
 
 def is_file(path: Path) -> bool:
-    """Whether `path` is a file that can be looked at."""
+    """Whether `path` is an accessible file."""
     try:
         return path.is_file()
     except OSError:
@@ -154,7 +165,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether `path` is a folder that can be looked at."""
+    """Whether `path` is an accessible folder."""
     try:
         return path.is_dir()
     except OSError:

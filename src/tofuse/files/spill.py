@@ -1,9 +1,9 @@
-"""What does not fit into memory: objects made of arrays, kept on disk until they are asked for.
+"""A store for objects made of arrays that spills the least recently used ones to disk.
 
-A recording may be hours long, and its end asks for views of its beginning. Items are held in memory
-as long as a budget allows; of those that were asked for longest ago the arrays are then read back
-from a temporary file. It is read and not mapped, so that what is resident is what was budgeted.
-What comes back is equal to what went in, to the bit: no result depends on the budget.
+A recording may be hours long, and its last frames may need views of its first. Items stay in memory
+within a budget; the arrays of others are read back from a temporary file. The file is read instead
+of mapped, so that the resident memory is what was budgeted. Arrays are restored bit by bit: no
+result depends on the budget.
 """
 
 from __future__ import annotations
@@ -25,25 +25,24 @@ from tofuse.errors import OutputError
 from tofuse.files.atomic import output_error
 from tofuse.files.memory import give_back
 
-_PIECE = 16 << 20  # bytes that are copied at a time
-_OFTEN = 128 << 20  # bytes that leave memory before it is given back to the system
+_PIECE = 16 << 20  # bytes copied at a time
+_TRIM_BYTES = 128 << 20  # evicted between two returns of free memory to the system
 
 
 class SpillFile:
-    """A temporary file that only grows, and is gone with the process, however that ends.
+    """A temporary file that is only appended to, and is removed when the process ends in any way.
 
     Parameters
     ----------
     folder
-        Where it is; None for the system's folder of temporary files. It is made when something is
-        written.
+        Its folder; None for the system's temporary folder. The file is created at the first write.
 
     Attributes
     ----------
     folder
-        As it was given, as text.
+        As given, as text.
     size
-        Bytes in it.
+        In bytes.
     """
 
     def __init__(self, folder: str | Path | None = None) -> None:
@@ -52,11 +51,12 @@ class SpillFile:
         self._file: IO[bytes] | None = None
 
     def append(self, data: UInt8) -> int:
-        """Write at the end; returns where that is. OutputError where the disk is full."""
+        """Append bytes and return their offset; OutputError if the disk is full."""
         offset = self.size
         try:
             if self._file is None:
-                # Unbuffered: an error comes with what caused it, and nothing is held twice.
+                # Unbuffered: errors are raised by the write that causes them, and memory is not
+                # doubled.
                 self._file = tempfile.TemporaryFile(  # noqa: SIM115 - closed by `close`
                     prefix="tofuse-", dir=self.folder, buffering=0
                 )
@@ -71,7 +71,7 @@ class SpillFile:
         return offset
 
     def read(self, offset: int, out: UInt8) -> None:
-        """Fill `out` with what was written there."""
+        """Fill `out` with the bytes at an offset."""
         left = out.data
         try:
             assert self._file is not None
@@ -80,18 +80,18 @@ class SpillFile:
                 count = self._file.readinto(left)  # type: ignore[attr-defined]
                 if not count:
                     raise OutputError(
-                        "a temporary file of this run has lost its end", where=self._where
+                        "a temporary file of this run was truncated", where=self._where
                     )
                 left = left[count:]
         except OSError as error:
             raise _no_room(error, self._where) from error
 
     def pieces(self) -> list[Piece]:
-        """All of it, piece by piece, each read when it is asked for."""
+        """Return the content as pieces that are read when they are converted to arrays."""
         return [Piece(self, k, min(_PIECE, self.size - k)) for k in range(0, self.size, _PIECE)]
 
     def close(self) -> None:
-        """Remove it."""
+        """Remove the file."""
         if self._file is not None:
             self._file.close()
         self._file, self.size = None, 0
@@ -101,7 +101,7 @@ class SpillFile:
         return Path(self.folder or tempfile.gettempdir())
 
     def __getstate__(self) -> dict[str, Any]:
-        """All of it. Who has much of it to keep takes its `pieces` instead."""
+        """Return the whole content; `pieces` is for contents that don't fit into memory."""
         return {"folder": self.folder, "data": [piece.copy() for piece in self.pieces()]}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -112,7 +112,7 @@ class SpillFile:
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """Some of a temporary file: an array once NumPy asks for it."""
+    """A range of bytes of a temporary file, read when NumPy converts it to an array."""
 
     file: SpillFile
     offset: int
@@ -134,16 +134,18 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(eq=False)
 class _Entry:
-    """What is known of an item that is not in memory.
+    """The part of an item that always stays in memory.
 
     Attributes
     ----------
     shell
-        The item with empty arrays in place of those that are its own.
+        The item with empty arrays in place of those that can be spilled.
     shapes
         Of these arrays, by field.
+    nbytes
+        Of these arrays together.
     offset
-        Where they are in the file; None where they were never written.
+        Of these arrays in the file; None if they were never written.
     """
 
     shell: Any
@@ -153,18 +155,18 @@ class _Entry:
 
 
 class Spill(Generic[T]):
-    """Keeps dataclass objects, by number: few of them in memory, the arrays of all others on disk.
+    """Stores dataclass objects by number: within a budget in memory, the arrays of others on disk.
 
-    Fields that are arrays may go to disk. What is no array stays in memory, and so does an array
-    that is the very same as in the item before (the rays of all views of one camera, say). Fields
-    that take no part in `__init__` are taken for derived, and may be lost. Any thread may call.
+    Only arrays are spilled, except those that are identical (`is`) to those of the item before,
+    such as the rays of a common camera. Fields that are not parameters of `__init__` are considered
+    derived and may be lost. Thread-safe.
 
     Parameters
     ----------
     budget
-        Bytes of arrays that may stay in memory; the newest item does in any case.
+        Bytes of arrays to keep in memory; the newest item is kept in any case.
     folder
-        Where the temporary file is to be; see `SpillFile`.
+        Of the temporary file; see `SpillFile`.
     """
 
     def __init__(self, budget: int, folder: Path | None = None) -> None:
@@ -172,21 +174,21 @@ class Spill(Generic[T]):
             raise ValueError(f"budget is {budget}, not 0 or more")
         self._budget = budget
         self._entries: dict[int, _Entry] = {}
-        self._held: OrderedDict[int, T] = OrderedDict()  # the longest unused first
-        self._held_bytes = 0
+        self._resident: OrderedDict[int, T] = OrderedDict()  # least recently used first
+        self._resident_bytes = 0
         self._next = 0
-        self._let_go = 0  # bytes since memory was given back
+        self._evicted_bytes = 0  # since free memory was returned to the system
         self._last: dict[str, NDArray[Any]] = {}
         self._file = SpillFile(folder)
         self._lock = RLock()
 
     def put(self, item: T) -> int:
-        """Keep an item; returns its number, one more than that of the item before.
+        """Store an item and return its number, one more than that of the item before.
 
         Raises
         ------
         OutputError
-            If there is no room on the disk for what memory can't hold.
+            If the disk has no room for the spilled arrays.
         """
         fields = {
             f.name: getattr(item, f.name)
@@ -197,43 +199,43 @@ class Spill(Generic[T]):
         with self._lock:
             own = {n: _compact(a) for n, a in arrays.items() if self._last.get(n) is not a}
             if any(own[name] is not arrays[name] for name in own):
-                # Sums may differ with the layout, which is lost on disk: it must not matter.
+                # The layout is lost on disk, and sums depend on it: it must be the same in memory.
                 item = type(item)(**(fields | own))
             self._last = arrays
             number, self._next = self._next, self._next + 1
-            # Of as many columns: items may look at that when they are made.
+            # Only the first dimension is emptied: items may check the others in `__post_init__`.
             empty = {n: np.empty((0, *a.shape[1:])[: a.ndim], a.dtype) for n, a in own.items()}
             self._entries[number] = _Entry(
                 type(item)(**(fields | empty)),
                 {name: a.shape for name, a in own.items()},
                 sum(a.nbytes for a in own.values()),
             )
-            self._hold(number, item)
+            self._keep(number, item)
         return number
 
     def get(self, number: int) -> T:
-        """Return an item, the same object as long as it is in memory; KeyError if there is none."""
+        """Return an item, the same object while it is in memory; KeyError if there is none."""
         with self._lock:
-            if number in self._held:
-                self._held.move_to_end(number)
-                return self._held[number]
+            if number in self._resident:
+                self._resident.move_to_end(number)
+                return self._resident[number]
             entry = self._entries[number]
             item: T = dataclasses.replace(entry.shell, **self._read(entry))
-            self._hold(number, item)
+            self._keep(number, item)
             return item
 
     def drop(self, number: int) -> None:
-        """Forget an item, if it is there. What it takes on the disk is free when all is."""
+        """Remove an item, if it exists. Its disk space is freed by `close`."""
         with self._lock:
             entry = self._entries.pop(number, None)
-            if entry is not None and self._held.pop(number, None) is not None:
-                self._held_bytes -= entry.nbytes
+            if entry is not None and self._resident.pop(number, None) is not None:
+                self._resident_bytes -= entry.nbytes
 
     def close(self) -> None:
-        """Forget all items, and remove the file."""
+        """Remove all items and the file."""
         with self._lock:
             self._entries, self._last = {}, {}
-            self._held, self._held_bytes = OrderedDict(), 0
+            self._resident, self._resident_bytes = OrderedDict(), 0
             self._file.close()
 
     def __len__(self) -> int:
@@ -241,36 +243,36 @@ class Spill(Generic[T]):
 
     @property
     def nbytes(self) -> int:
-        """Of the arrays of all items, in memory or not."""
+        """Bytes of the arrays of all items, in memory or not."""
         with self._lock:
             return sum(entry.nbytes for entry in self._entries.values())
 
     @property
-    def held_bytes(self) -> int:
-        """Of the arrays that are in memory."""
-        return self._held_bytes
+    def resident_bytes(self) -> int:
+        """Bytes of the arrays that are in memory."""
+        return self._resident_bytes
 
     @property
     def spilled_bytes(self) -> int:
-        """Written to disk so far."""
+        """Bytes written to disk so far."""
         return self._file.size
 
-    def _hold(self, number: int, item: T) -> None:
-        self._held[number] = item
-        self._held_bytes += self._entries[number].nbytes
-        while self._held_bytes > self._budget and len(self._held) > 1:
-            oldest = next(iter(self._held))
+    def _keep(self, number: int, item: T) -> None:
+        self._resident[number] = item
+        self._resident_bytes += self._entries[number].nbytes
+        while self._resident_bytes > self._budget and len(self._resident) > 1:
+            oldest = next(iter(self._resident))
             self._write(oldest)
-            del self._held[oldest]
-            self._held_bytes -= self._entries[oldest].nbytes
-            self._let_go += self._entries[oldest].nbytes
-        if self._let_go > _OFTEN:
-            # Else what is free lies in pieces between what stays, and more than the budget is held.
-            self._let_go = 0
+            del self._resident[oldest]
+            self._resident_bytes -= self._entries[oldest].nbytes
+            self._evicted_bytes += self._entries[oldest].nbytes
+        if self._evicted_bytes > _TRIM_BYTES:
+            # Free memory is fragmented: without this, more than the budget stays resident.
+            self._evicted_bytes = 0
             give_back()
 
     def _write(self, number: int) -> None:
-        entry, item = self._entries[number], self._held[number]
+        entry, item = self._entries[number], self._resident[number]
         if entry.offset is not None:
             return
         start = self._file.size
@@ -280,24 +282,24 @@ class Spill(Generic[T]):
 
     def _read(self, entry: _Entry) -> Mapping[str, NDArray[Any]]:
         assert entry.offset is not None
-        offset, found = entry.offset, {}
+        offset, arrays = entry.offset, {}
         for name, shape in entry.shapes.items():
-            found[name] = np.empty(shape, getattr(entry.shell, name).dtype)
-            self._file.read(offset, _bytes_of(found[name]))
-            offset += found[name].nbytes
-        return found
+            arrays[name] = np.empty(shape, getattr(entry.shell, name).dtype)
+            self._file.read(offset, _bytes_of(arrays[name]))
+            offset += arrays[name].nbytes
+        return arrays
 
     def __getstate__(self) -> dict[str, Any]:
-        """Items as they are, if all are in memory; else all of them as they are on disk."""
+        """Return the items in memory if none was spilled; else all of them as they are on disk."""
         with self._lock:
-            held = self._held
+            resident = self._resident
             if self._file.size:
-                for number in held:
+                for number in resident:
                     self._write(number)
-                held = OrderedDict()
+                resident = OrderedDict()
             return self.__dict__ | {
-                "_held": held,
-                "_held_bytes": self._held_bytes if held else 0,
+                "_resident": resident,
+                "_resident_bytes": self._resident_bytes if resident else 0,
                 "_last": {},
                 "_lock": None,
             }
@@ -308,12 +310,12 @@ class Spill(Generic[T]):
 
 @dataclasses.dataclass(frozen=True)
 class Scratch:
-    """What may be kept for later, and where.
+    """Memory and disk for temporary data.
 
     Attributes
     ----------
     budget
-        Bytes of arrays in memory; as good as unlimited unless given.
+        Bytes of arrays in memory; practically unlimited unless given.
     folder
         Of temporary files; see `SpillFile`.
     """
@@ -321,9 +323,9 @@ class Scratch:
     budget: int = 1 << 62
     folder: Path | None = None
 
-    def part(self, share: float) -> Spill[Any]:
-        """Return a new store with a share of the budget."""
-        return Spill(int(share * self.budget), self.folder)
+    def part(self, fraction: float) -> Spill[Any]:
+        """Return a new store with a fraction of the budget."""
+        return Spill(int(fraction * self.budget), self.folder)
 
 
 def _is_array(value: Any) -> bool:
@@ -331,7 +333,7 @@ def _is_array(value: Any) -> bool:
 
 
 def _compact(array: NDArray[Any]) -> NDArray[Any]:
-    """The array in C order, holding on to no larger one."""
+    """The array in C order, copied if it is a view into a larger one."""
     base = array.base
     larger = isinstance(base, np.ndarray) and base.nbytes > array.nbytes
     if array.flags.c_contiguous and not larger:
@@ -340,14 +342,14 @@ def _compact(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _bytes_of(array: NDArray[Any]) -> UInt8:
-    """Of an array in C order; what is written there is written to the array."""
+    """A writable view of the bytes of an array in C order."""
     return array.reshape(-1).view(np.uint8) if array.size else np.empty(0, np.uint8)
 
 
 def _no_room(error: OSError, where: Path) -> OutputError:
-    told = output_error(error, where)
+    cause = output_error(error, where)
     return OutputError(
-        f"what memory can't hold {told.problem}",
+        f"temporary data {cause.problem}",
         where=where,
         remedy="free some space there, name another folder in TMPDIR, or give more --memory",
     )

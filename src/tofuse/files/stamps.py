@@ -1,4 +1,4 @@
-"""What tells whether files are still the same, without reading them."""
+"""Stamps that show whether files have changed, without reading them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Stamp = tuple[str, int, int]
 
 
 def stamp(path: Path) -> Stamp:
-    """Path, size in bytes and time of change in ns of a file; of a link to nowhere, its own."""
+    """Return path, size in bytes and modification time in ns of a file, or of a dangling link."""
     try:
         status = path.stat()
     except OSError:
@@ -18,9 +18,9 @@ def stamp(path: Path) -> Stamp:
 
 
 def stamps_in(folder: Path, without: Path) -> list[Stamp]:
-    """Stamps of all files in a folder and below it, in order; `without` is a folder left out."""
-    found = []
+    """Return the stamps of all files below a folder, in order, except those below `without`."""
+    stamps = []
     for here, folders, names in os.walk(folder):
         folders[:] = sorted(f for f in folders if Path(here) / f != without)
-        found += [stamp(Path(here) / name) for name in sorted(names)]
-    return found
+        stamps += [stamp(Path(here) / name) for name in sorted(names)]
+    return stamps

@@ -15,21 +15,23 @@ from tofuse.files.reading import read_text
 
 
 def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
-    """Parse rows of numbers, (N, C): blanks, commas or semicolons between, '#' starts a comment.
+    """Parse rows of numbers, (N, C).
+
+    Separators are blanks, commas and semicolons; '#' starts a comment.
 
     Parameters
     ----------
     text
-        The text; empty lines are left out.
+        The text; empty lines are skipped.
     path
         Names the file in errors.
     skip
-        Number of leading lines to leave out.
+        Number of leading lines to skip.
 
     Raises
     ------
     InputError
-        If something is no number, or rows have different lengths.
+        If a cell is not a number, or rows have different lengths.
     """
     text = text.replace(",", " ").replace(";", " ")
     if "\0" in text:
@@ -45,7 +47,7 @@ def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
     except (ValueError, OverflowError) as error:
         reason = str(error).split("; use", 1)[0].removesuffix(".")
         raise InputError(
-            f"is no table of numbers ({reason})", where=path, remedy="check the file"
+            f"is not a table of numbers ({reason})", where=path, remedy="check the file"
         ) from error
 
 
@@ -55,14 +57,14 @@ def read_numbers(path: str | Path) -> Float64:
 
 
 def read_columns(path: str | Path) -> dict[str, Float64]:
-    """Read a CSV file whose first line names the columns: name to (N,) numbers.
+    """Read a CSV file with a header line: (N,) numbers by column name.
 
     Empty cells are NaN.
 
     Raises
     ------
     InputError
-        If there is no such line, a name comes twice, or a row has another length.
+        If there is no header, a name is repeated, or a row has another length.
     """
     rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
     if not rows:
@@ -88,7 +90,7 @@ def read_columns(path: str | Path) -> dict[str, Float64]:
 
 
 def write_columns(path: str | Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write what `read_columns` reads, every number in full."""
+    """Write (N,) columns as `read_columns` reads them, every number in full precision."""
     names = list(columns)
     arrays = [np.asarray(columns[name], float) for name in names]
     if len({a.shape for a in arrays}) > 1 or any(a.ndim != 1 for a in arrays):

@@ -16,7 +16,7 @@ from tofuse.files.reading import read_bytes
 # Tags of the TIFF 6.0 specification.
 _WIDTH, _HEIGHT, _SAMPLES = 256, 257, 277
 _PIECES = ((273, 279), (324, 325))  # offsets and sizes of strips, or of tiles
-_CODES = {1: "B", 3: "H", 4: "I"}  # of the types that hold whole numbers
+_CODES = {1: "B", 3: "H", 4: "I"}  # of the integer types
 _MAX_TAGS = 256
 
 
@@ -28,12 +28,12 @@ def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[
     path
         The file.
     size
-        (width, height) that it must have.
+        Expected (width, height).
 
     Raises
     ------
     InputError
-        If it is no TIFF of one channel, is cut off or damaged, or of another size.
+        If it is not a TIFF of one channel, is cut off or damaged, or of another size.
     """
     import cv2
 
@@ -55,7 +55,7 @@ def read_tiff(path: str | Path, size: tuple[int, int] | None = None) -> NDArray[
 
 
 def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
-    """Return width and height of the first image, after a look at all that its tags promise.
+    """Return width and height of the first image, after checking that its data is complete.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
-        what = "is empty" if not data else "is no TIFF image"
+        what = "is empty" if not data else "is not a TIFF image"
         raise InputError(what, where=path, remedy="check the file")
     try:
         tags = _tags(data, order)
@@ -80,7 +80,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
         raise InputError("is a damaged TIFF", where=path, remedy="copy the file again") from error
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(
-            f"claims to be {width} x {height} pixels",
+            f"declares {width} x {height} pixels",
             where=path,
             remedy=f"give an image of 1 to {MAX_PIXELS} pixels",
         )
@@ -92,7 +92,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
 
 
 def _tags(data: bytes, order: str) -> dict[int, list[int]]:
-    """Return the whole numbers of the first directory's tags."""
+    """The integer values of the tags of the first directory."""
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)
     if count > _MAX_TAGS:

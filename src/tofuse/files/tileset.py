@@ -1,4 +1,4 @@
-"""3D Tiles 1.1 (OGC 22-025r4): a tree of boxes, whose glTF files stand for all below them."""
+"""3D Tiles 1.1 (OGC 22-025r4): a tree of boxes with glTF files at several levels of detail."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from tofuse.errors import InputError
 from tofuse.files.atomic import write_text
 from tofuse.files.reading import read_bytes
 
-# Tiles have z up; what draws glTF in them turns its y there: (x, y, z) becomes (x, -z, y).
+# Tiles have z up; renderers rotate the y axis of glTF there: (x, y, z) becomes (x, -z, y).
 R_TILES_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_DEEPEST = 40
-_THINNEST_M = 1e-3  # half of a box: some viewers take the inverse of its axes
+_MAX_DEPTH = 40
+_MIN_HALF_M = 1e-3  # half the size of a box: some viewers invert its axes
 
 
 @dataclass(eq=False)
 class Tile:
-    """A box of a model.
+    """A node of the tree.
 
     Attributes
     ----------
     low, high
-        (3,) corners of the box around it and all below, m, in the axes of the glTF files: y up.
+        (3,) corners in m of the bounding box, including all children, in glTF axes: y up.
     error_m
-        How far off it is from the whole model; 0 for what is the model.
+        Geometric error in m relative to the full model; 0 at the leaves.
     content
-        Name of its glTF file beside the tileset; None where it has none.
+        Name of its glTF file in the folder of the tileset; None if it has none.
     faces
         Triangles of its file.
     children
-        They take its place where more is to be seen.
+        Tiles that replace it at higher detail.
     """
 
     low: Float64
@@ -47,18 +47,30 @@ class Tile:
     children: list[Tile] = field(default_factory=list)
 
     def walk(self) -> Iterator[Tile]:
-        """It and all below."""
+        """Yield this tile and all below it."""
         yield self
         for child in self.children:
             yield from child.walk()
 
 
 def write_tileset(path: str | Path, root: Tile, *, generator: str, extras: dict[str, Any]) -> None:
-    """Write a tree of tiles; see `replacing` for errors. `extras` are kept as they are."""
+    """Write a tree of tiles; see `replacing` for errors.
+
+    Parameters
+    ----------
+    path
+        The tileset.json.
+    root
+        The tree.
+    generator
+        The writing program, as the file states it.
+    extras
+        JSON data to store with it.
+    """
     document = {
         "asset": {"version": "1.1", "generator": generator},
         "extras": extras,
-        # What is wrong if nothing is drawn.
+        # The error if nothing is rendered.
         "geometricError": float(np.linalg.norm(root.high - root.low)),
         "root": {**_tile(root), "refine": "REPLACE"},
     }
@@ -66,10 +78,10 @@ def write_tileset(path: str | Path, root: Tile, *, generator: str, extras: dict[
 
 
 def _tile(tile: Tile) -> dict[str, Any]:
-    middle, half = R_TILES_GLTF @ (tile.low + tile.high) / 2, (tile.high - tile.low) / 2
-    axes = np.diag(np.maximum(np.abs(R_TILES_GLTF @ half), _THINNEST_M))
+    centre, half = R_TILES_GLTF @ (tile.low + tile.high) / 2, (tile.high - tile.low) / 2
+    axes = np.diag(np.maximum(np.abs(R_TILES_GLTF @ half), _MIN_HALF_M))
     out: dict[str, Any] = {
-        "boundingVolume": {"box": [*middle.tolist(), *axes.ravel().tolist()]},
+        "boundingVolume": {"box": [*centre.tolist(), *axes.ravel().tolist()]},
         "geometricError": tile.error_m,
         "extras": {"faces": tile.faces},
     }
@@ -86,33 +98,33 @@ def read_tileset(path: str | Path) -> tuple[Tile, dict[str, Any]]:
     Raises
     ------
     InputError
-        If it can't be read, is damaged, or is no such file.
+        If it can't be read, is damaged, or was written by another program.
     """
     try:
         document = json.loads(read_bytes(path))
         if document["asset"]["version"] != "1.1":
-            raise ValueError(f"of version {document['asset']['version']}")
+            raise ValueError(f"version {document['asset']['version']}")
         return _read(document["root"], 0), dict(document["extras"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"is no tileset of ours, or damaged ({error})",
+            f"is not a tileset written by tofuse, or is damaged ({error})",
             where=path,
-            remedy="copy the whole folder, or make it again",
+            remedy="copy the whole folder, or create it again",
         ) from error
 
 
 def _read(data: dict[str, Any], depth: int) -> Tile:
     box = np.array(data["boundingVolume"]["box"], float)
-    if box.shape != (12,) or not np.isfinite(box).all() or depth > _DEEPEST:
-        raise ValueError("a box is wrong")
-    middle = R_TILES_GLTF.T @ box[:3]
+    if box.shape != (12,) or not np.isfinite(box).all() or depth > _MAX_DEPTH:
+        raise ValueError("invalid bounding box")
+    centre = R_TILES_GLTF.T @ box[:3]
     half = np.abs(R_TILES_GLTF.T @ box[3:].reshape(3, 3).sum(0))
     content = data["content"]["uri"] if "content" in data else None
     if content is not None and Path(content).name != content:
-        raise ValueError(f"{content!r} is not beside it")
+        raise ValueError(f"{content!r} is not in its folder")
     return Tile(
-        middle - half,
-        middle + half,
+        centre - half,
+        centre + half,
         float(data["geometricError"]),
         content,
         int(data["extras"]["faces"]),

@@ -22,13 +22,14 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
 
     Returns
     -------
-    (N,) timestamps in s and (N, 4, 4) T_world_camera, in the order of the file. Comments after
-    '#' and empty lines are left out; quaternions are normalised.
+    (N,) timestamps in s and (N, 4, 4) T_world_camera, in file order. Comments after '#' and empty
+    lines are skipped; quaternions are normalised.
 
     Raises
     ------
     InputError
-        Naming file and line, if a line isn't 8 finite numbers or its quaternion isn't one.
+        Naming file and line, if a line isn't 8 finite numbers or its quaternion isn't of unit
+        length.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -43,9 +44,11 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
         if len(row) != 8:
             raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
         if not np.isfinite(row).all():
-            raise InputError("holds a number that is not finite", where=where, remedy=_TUM)
+            raise InputError("contains a number that is not finite", where=where, remedy=_TUM)
         if abs(float(np.linalg.norm(row[4:])) - 1) > 0.1:
-            raise InputError("holds no unit quaternion", where=where, remedy=_TUM)
+            raise InputError(
+                "contains a quaternion that is not of unit length", where=where, remedy=_TUM
+            )
         rows.append(row)
     table = np.array(rows, float).reshape(-1, 8)
     poses = np.tile(np.eye(4), (len(table), 1, 1))
@@ -59,10 +62,9 @@ _TUM = "write 'timestamp tx ty tz qx qy qz qw'"
 
 
 def write_tum(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) -> None:
-    """Write (N,) timestamps in s and (N, 4, 4) T_world_camera; poses that are NaN are left out.
+    """Write (N,) timestamps in s and (N, 4, 4) T_world_camera; poses that are NaN are skipped.
 
-    Every number is the shortest text that reads back as the same float64, so the same trajectory
-    gives the same bytes.
+    Every number is the shortest text that reads back as the same float64.
     """
     write_text(path, tum_text(timestamps, poses))
 
@@ -86,9 +88,9 @@ def tum_text(timestamps: ArrayLike, poses: ArrayLike) -> str:
 
 
 def write_kitti(path: str | Path, poses: ArrayLike) -> None:
-    """Write (N, 4, 4) T_world_camera as KITTI's odometry has them: the upper 3 x 4, row by row.
+    """Write (N, 4, 4) T_world_camera in KITTI's odometry format: the upper 3 x 4, row by row.
 
-    The format has no times and no gaps: poses that are NaN are left out.
+    The format has no timestamps and no gaps: poses that are NaN are skipped.
     """
     T = _known(poses)
     rows = T[:, :3].reshape(-1, 12).tolist()
@@ -96,12 +98,12 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> None:
 
 
 def write_log(path: str | Path, poses: ArrayLike, numbers: ArrayLike) -> None:
-    """Write (N, 4, 4) T_world_camera as a trajectory of Open3D; poses that are NaN are left out.
+    """Write (N, 4, 4) T_world_camera as an Open3D trajectory; poses that are NaN are skipped.
 
     Parameters
     ----------
     numbers
-        (N,) of the frames: each pose has a line `n n n+1` before its matrix.
+        (N,) frame numbers: each pose has a line `n n n+1` before its matrix.
     """
     known = np.isfinite(np.asarray(poses, float)).all((1, 2))
     lines = []
@@ -122,10 +124,10 @@ def associate(
     limit: float = ASSOCIATION_LIMIT_S,
     exclusive: bool = True,
 ) -> Intp:
-    """For each of (N,) timestamps, the index of the nearest of (M,) others, or -1.
+    """Return for each of (N,) timestamps the index of the nearest of (M,) others, or -1.
 
-    Only within `limit` seconds (inclusive, give or take a nanosecond); if `exclusive`, an entry
-    that is nearest to several goes to the nearest of them alone. Neither needs to be sorted.
+    Both are in s, in any order. Matches are within `limit` seconds (inclusive, plus a nanosecond);
+    if `exclusive`, each of the others is matched at most once, to the nearest timestamp.
     """
     times, others = np.asarray(timestamps, float), np.asarray(others, float)
     out = np.full(len(times), -1, np.intp)
@@ -138,7 +140,7 @@ def associate(
     nearer = np.abs(ordered[before] - times) <= np.abs(ordered[after] - times)
     best = np.where(nearer, before, after)
     gap = np.abs(ordered[best] - times)
-    # By gap, so that an entry wanted twice goes to the nearer one.
+    # In order of the gap, so that conflicts are won by the nearer one.
     taken = np.zeros(len(ordered), bool)
     for k in np.argsort(gap, kind="stable"):
         if gap[k] <= limit + 1e-9 and not taken[best[k]]:
@@ -154,7 +156,10 @@ def associated_poses(
     *,
     limit: float = ASSOCIATION_LIMIT_S,
 ) -> Float64:
-    """Poses (N, 4, 4) at the timestamps, from (M,) others with (M, 4, 4) poses; NaN where none."""
+    """Return poses (N, 4, 4) at timestamps (N,), matched to (M,) others with (M, 4, 4) poses.
+
+    Timestamps without a match within `limit` seconds have NaN; see `associate`.
+    """
     index = associate(timestamps, others, limit=limit)
     out = np.full((len(index), 4, 4), np.nan)
     out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]

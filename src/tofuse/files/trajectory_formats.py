@@ -1,8 +1,8 @@
-"""Trajectories as other programs write them, told apart by what is in the file.
+"""Trajectories in the formats of other programs, detected from the content of the file.
 
 TUM, EuRoC (CSV), KITTI, Open3D and Redwood (.log), COLMAP (images.txt), nerfstudio and
-NeRFCapture (transforms.json), NumPy (.npy), and the result of a run. Some have a time for each
-pose, the others the number of its frame.
+NeRFCapture (transforms.json), NumPy (.npy), and the result of a run. Some have a timestamp for each
+pose, others the number of its frame.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tofuse.files.trajectory import associated_poses, read_tum
 from tofuse.geometry import se3
 from tofuse.geometry.quaternion import to_matrix
 
-# Files that a folder may hold poses in, the first that is there counts.
+# Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
 _KNOWN = "TUM, EuRoC, KITTI, .log, COLMAP's images.txt, transforms.json or .npy"
 # Times in nanoseconds are larger than any in seconds.
 _NANOSECONDS = 1e12
-# Digits of a number that an int64 holds in any case.
+# Digits that always fit into an int64.
 _DIGITS = 18
 # Cameras of OpenGL look along -z, with y up.
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -36,7 +36,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class TimedPoses:
-    """Poses of a camera, and which frames they belong to.
+    """Poses of a camera, with the timestamps or numbers of their frames.
 
     Attributes
     ----------
@@ -45,8 +45,7 @@ class TimedPoses:
     timestamps
         (N,) s; None where the format has none.
     frames
-        (N,) numbers of their frames where it has no timestamps: counted from 0, or as in the names
-        of the images.
+        (N,) frame numbers where it has no timestamps: from 0, or as in the names of the images.
     """
 
     poses: Float64
@@ -54,9 +53,9 @@ class TimedPoses:
     frames: Intp | None = None
 
     def of_frames(self, timestamps: Float64, frames: Intp) -> Float64:
-        """(M, 4, 4) poses of frames with these times and numbers (M,), NaN where there is none.
+        """Return (M, 4, 4) poses of frames with timestamps (M,) and numbers (M,), NaN if unknown.
 
-        If there are as many poses as frames, and they are counted from 0, they are in their order.
+        As many poses as frames, numbered from 0, are those of the frames in their order.
         """
         if self.timestamps is not None:
             return associated_poses(timestamps, self.timestamps, self.poses)
@@ -71,14 +70,14 @@ class TimedPoses:
         return out
 
     def timed(self, clock: Clock | None, where: str | Path) -> tuple[Float64, Float64]:
-        """(M,) times and (M, 4, 4) poses, those whose frames the clock knows.
+        """Return (M,) timestamps and (M, 4, 4) poses, of the frames that the clock contains.
 
-        Without times and without a clock the numbers of the frames are the times.
+        Without timestamps and without a clock the frame numbers serve as timestamps.
 
         Raises
         ------
         InputError
-            If the clock knows none of the frames; it names `where`.
+            Naming `where`, if the clock contains none of the frames.
         """
         if self.timestamps is not None:
             return self.timestamps, self.poses
@@ -92,24 +91,24 @@ class TimedPoses:
         return clock[0][known], poses[known]
 
 
-# (N,) times and (N,) numbers of the frames of a recording.
+# (N,) timestamps and (N,) numbers of the frames of a recording.
 Clock = tuple[Float64, Intp]
 
 
 def read_poses(path: str | Path) -> TimedPoses:
-    """Read a trajectory of any of the formats, or that in a folder.
+    """Read a trajectory in any of the formats, from a file or a folder.
 
     Raises
     ------
     InputError
-        If there is none, or it can't be read.
+        If there is none, it can't be read, or its format is unknown.
     """
     path = Path(path)
     if is_folder(path):
-        found = next((path / name for name in NAMES if is_file(path / name)), None)
-        if found is None:
-            raise InputError(f"holds none of {', '.join(NAMES)}", where=path)
-        path = found
+        first = next((path / name for name in NAMES if is_file(path / name)), None)
+        if first is None:
+            raise InputError(f"contains none of {', '.join(NAMES)}", where=path)
+        path = first
     suffix = path.suffix.lower()
     if suffix == ".npy":
         return _numpy(path)
@@ -118,7 +117,7 @@ def read_poses(path: str | Path) -> TimedPoses:
         return _transforms(text, path)
     rows = list(_rows(text))
     if not rows:
-        raise InputError("holds no poses", where=path, remedy=f"give {_KNOWN}")
+        raise InputError("contains no poses", where=path, remedy=f"give {_KNOWN}")
     return _reader(rows, path)(rows, path)
 
 
@@ -127,7 +126,7 @@ _Reader = Callable[[_Rows, Path], TimedPoses]
 
 
 def _reader(rows: _Rows, path: Path) -> _Reader:
-    """Which format lines are of, by how many cells they have."""
+    """The reader of a text format, detected from the number of cells per line."""
     first = rows[0][1]
     count = len(first)
     if count == 3 and len(rows) > 1 and len(rows[1][1]) == 4:
@@ -141,7 +140,7 @@ def _reader(rows: _Rows, path: Path) -> _Reader:
     if count == 8:
         return _tum
     raise InputError(
-        f"has lines of {count} columns, as no trajectory that is known has",
+        f"has {count} columns, as no known trajectory format",
         where=path,
         remedy=f"give {_KNOWN}",
     )
@@ -181,7 +180,7 @@ def _numbers(rows: _Rows, path: Path, count: int) -> tuple[Float64, list[int]]:
                 f"has {len(row)} numbers, the first line {count} or more",
                 where=f"{path}, line {number}",
             )
-        if np.isfinite(row).all():  # programs write NaN where they were lost
+        if np.isfinite(row).all():  # programs write NaN where tracking failed
             table.append(row)
             lines.append(number)
     return np.array(table, float).reshape(-1, count), lines
@@ -195,7 +194,8 @@ def _from_quaternions(q_xyzw: Float64, t: Float64, path: Path, lines: Sequence[i
     off = np.abs(np.linalg.norm(q_xyzw, axis=1) - 1)
     if (off > 0.1).any():
         raise InputError(
-            "holds no unit quaternion", where=f"{path}, line {lines[int(np.argmax(off))]}"
+            "contains a quaternion that is not of unit length",
+            where=f"{path}, line {lines[int(np.argmax(off))]}",
         )
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     poses[:, :3, 3] = t
@@ -205,7 +205,7 @@ def _from_quaternions(q_xyzw: Float64, t: Float64, path: Path, lines: Sequence[i
 
 
 def _euroc(rows: _Rows, path: Path) -> TimedPoses:
-    """Lines of ns, x y z, qw qx qy qz, and maybe more, as EuRoC's ground truth."""
+    """Lines of ns, x y z, qw qx qy qz, and possibly more, as in EuRoC's ground truth."""
     table, lines = _numbers(rows, path, 8)
     poses = _from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], path, lines)
     return TimedPoses(poses, timestamps=1e-9 * table[:, 0])
@@ -242,8 +242,8 @@ def _log(rows: _Rows, path: Path) -> TimedPoses:
 
 
 def _colmap(rows: _Rows, path: Path) -> TimedPoses:
-    """COLMAP's images: id, qw qx qy qz, x y z of T_camera_world, camera, name; then points."""
-    # The second line of each image holds its points in threes; those have no name in the tenth.
+    """COLMAP's images: id, qw qx qy qz, x y z of T_camera_world, camera, name; then its points."""
+    # The second line of each image lists its points as triples, without a name in column 10.
     images = [(n, c) for n, c in rows if len(c) == 10 and not _is_number(c[9])]
     table, lines = _numbers(images, path, 8)
     T_camera_world = _from_quaternions(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
@@ -256,7 +256,7 @@ def _transforms(text: str, path: Path) -> TimedPoses:
     try:
         data: Any = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON ({error})", where=path) from error
+        raise InputError(f"is not valid JSON ({error})", where=path) from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError("has no list 'frames'", where=path, remedy=f"give {_KNOWN}")
@@ -276,12 +276,12 @@ def _transforms(text: str, path: Path) -> TimedPoses:
 def _numpy(path: Path) -> TimedPoses:
     """(N, 4, 4) or (N, 3, 4), one for each frame, NaN where there is none."""
     try:
-        # Mapped, so that a header can't make us allocate more than the file holds.
+        # Mapped, so that a damaged header can't cause an allocation larger than the file.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
         raise input_error(error, path) from error
-    except Exception as error:  # its header is Python, and damaged Python raises anything
-        raise InputError("is no array", where=path, remedy="write it by numpy.save") from error
+    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
+        raise InputError("is not an array", where=path, remedy="write it by numpy.save") from error
     if table.ndim != 3 or table.shape[1:] not in ((4, 4), (3, 4)) or table.dtype.kind not in "fiu":
         raise InputError(f"is of shape {table.shape}", where=path, remedy="write (N, 4, 4)")
     out = np.tile(np.eye(4), (len(table), 1, 1))
@@ -296,16 +296,16 @@ def _stacked(poses: Sequence[Float64]) -> Float64:
 
 
 def _numbers_in(names: Sequence[str], path: Path) -> Intp:
-    """The last number in each name, which counts frames."""
-    found = [re.findall(r"[0-9]+", Path(name).stem) for name in names]
-    if not all(found):
-        missing = names[[bool(digits) for digits in found].index(False)]
+    """The last number in each file name: the frame number."""
+    digits_in = [re.findall(r"[0-9]+", Path(name).stem) for name in names]
+    if not all(digits_in):
+        missing = names[[bool(digits) for digits in digits_in].index(False)]
         raise InputError(
-            f"names the image {missing!r}, which has no number",
+            f"has an image without a number in its name, {missing!r}",
             where=path,
             remedy="name images by the number of their frame",
         )
-    numbers = np.array([int(digits[-1][-_DIGITS:]) for digits in found], np.intp)
+    numbers = np.array([int(digits[-1][-_DIGITS:]) for digits in digits_in], np.intp)
     if len(np.unique(numbers)) != len(numbers):
-        raise InputError("names two images with the same number", where=path)
+        raise InputError("has two images with the same number", where=path)
     return numbers

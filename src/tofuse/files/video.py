@@ -15,12 +15,12 @@ MAX_SIDE = 8192
 
 
 class Video:
-    """A video whose frames are read by their index; quick where they are read in order.
+    """A video with random access to its frames; fast if they are read in order.
 
     Attributes
     ----------
     width, height, count
-        As its header says.
+        As its header declares.
 
     Raises
     ------
@@ -45,7 +45,9 @@ class Video:
         except (cv2.error, ValueError, OverflowError):
             usable = False
         if not usable or not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
-            raise InputError("is no video that can be decoded", where=path, remedy="copy it again")
+            raise InputError(
+                "is not a video that can be decoded", where=path, remedy="copy it again"
+            )
 
     def read(self, index: int) -> UInt8:
         """Return frame `index` as (H, W, 3) RGB; InputError if it can't be decoded."""

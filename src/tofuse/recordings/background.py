@@ -1,4 +1,4 @@
-"""What stands still before a still camera, and what moves in front of it."""
+"""Segmentation of a moving object from the background of a stationary camera."""
 
 from __future__ import annotations
 
@@ -15,109 +15,110 @@ from tofuse.arrays import Bool, Float32, Float64, Int32
 from tofuse.errors import InputError
 from tofuse.recordings.frames import RangeFrame
 
-# A surface is seen if this share of the frames, and as many frames, agree on its depth.
-_LEAST_SHARE, _LEAST_FRAMES = 0.15, 3
-# Depths agree if they lie within so many sigmas, and this share of the depth, of each other.
-_SIGMAS, _SHARE = 5.0, 0.01
+# A surface exists where this fraction of the frames, and this number, agree on its depth.
+_MIN_FRACTION, _MIN_AGREEING = 0.15, 3
+# Depths agree within this number of sigmas plus this fraction of the depth.
+_SIGMAS, _RELATIVE = 5.0, 0.01
 _NORMAL_MEDIAN = 0.6745
 
 _OPTION = "--object"
 _LEAVE = "leave it out if the camera moves; else "
-_CUT = "cut the background off with --max-depth, a box or a mask"
-_FEWEST = 6
-# Neighbours whose depths differ by more than this share of the depth are two surfaces.
+_CUT = "crop the background with --max-depth, a box or a mask"
+_MIN_FRAMES = 6
+# Neighbouring depths that differ by more than this fraction are on different surfaces.
 _JUMP = 0.04
-# A pixel is still if this share of the frames see its background, and swept if this share do not.
-_STILL, _SWEPT = 0.8, 0.04
-# Share of a side of the image that must be still.
-_STILL_SIDE = 0.6
-# Share of the pixels before the background that is enough to be an object.
-_LEAST_OBJECT = 0.002
-# The rim of what passes mixes its light with that of the background; look as far for its inside.
+# A pixel is static if this fraction of the frames see its background, and swept by the object if
+# this fraction do not.
+_STATIC, _SWEPT = 0.8, 0.04
+# Fraction of an image border that must be static.
+_STATIC_BORDER = 0.6
+# Smallest fraction of foreground pixels of an object.
+_MIN_OBJECT = 0.002
+# The object's rim has mixed pixels; its depth is taken from the interior within this distance.
 _NEAR_PIXELS = 6
-# Least share of the rim of a piece of the object that must continue what passes beside it.
-_LEAST_JOINED = 0.25
-# Pieces of the foreground smaller than this share of the largest are speckle.
+# Smallest fraction of the rim of an object's segment that must continue the passing object.
+_MIN_JOINED = 0.25
+# Foreground components smaller than this fraction of the largest are speckle.
 _SPECKLE = 0.02
-# Share of the outline of the foreground at which its surface must end.
-_LEAST_OUTLINE = 0.5
-# Share of the foreground that must not be within a pixel of its outline.
-_LEAST_INNER = 0.4
-# Percentiles between which the depths of the object lie, and by how much of that it may be larger.
-# Light of object and background mixes to any depth, even one nearer than both.
+# Fraction of the outline of the foreground at which its surface must end.
+_MIN_OUTLINE = 0.5
+# Fraction of the foreground that must be farther than a pixel from its outline.
+_MIN_INNER = 0.4
+# Percentiles of the depths of the object, and the relative margin around their interval. Mixed
+# pixels of object and background can have any depth, even one nearer than both.
 _REACH = (2, 98)
-_BEYOND = 0.5
+_MARGIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class FarSurface:
-    """The farthest surface of each pixel, over some frames of one still camera.
+    """The farthest surface at each pixel over frames of a stationary camera.
 
     Attributes
     ----------
     z
-        (H, W) float32 its z depth in m: the median of the depths that agree; infinite where most
-        frames measure nothing, 0 where no depths agree.
+        (H, W) float32 z depth in m: the median of the depths that agree; infinite where most frames
+        have no measurement, 0 where no depths agree.
     sigma
         (H, W) float32 standard deviation in m of one measurement of it; 0 where there is none.
-    share
-        (H, W) float32, share of the frames that see nothing else: its depth, or nothing at all.
+    static_fraction
+        (H, W) float32 fraction of the frames with its depth or without a measurement.
     """
 
     z: Float32
     sigma: Float32
-    share: Float32
+    static_fraction: Float32
 
 
 def far_surface(frames: Sequence[RangeFrame]) -> FarSurface:
-    """Find the farthest surface that each pixel sees in several frames.
+    """Find the farthest surface that each pixel observes in several frames.
 
     Parameters
     ----------
     frames
-        At least 3, of one size, in which things in front of the background have moved.
+        At least 3, of the same size, in which the objects before the background moved.
     """
     z = np.stack([frame.z for frame in frames])
     z[~np.stack([frame.valid for frame in frames])] = 0
     count = len(z)
-    least = max(_LEAST_FRAMES, int(np.ceil(_LEAST_SHARE * count)))
+    min_frames = max(_MIN_AGREEING, int(np.ceil(_MIN_FRACTION * count)))
     valid = z > 0
-    falling = np.sort(z, axis=0)[::-1]
-    tolerance = _SIGMAS * _spatial_sigma(z) + np.float32(_SHARE) * falling[0]
-    middle = np.zeros_like(falling[0])
-    found = np.zeros(middle.shape, bool)
-    for k in range(count - least + 1):
-        low = falling[k + least - 1]
-        fits = ~found & (low > 0) & (falling[k] - low <= tolerance)
-        middle[fits] = falling[k + least // 2][fits]
+    descending = np.sort(z, axis=0)[::-1]
+    tolerance = _SIGMAS * _spatial_sigma(z) + np.float32(_RELATIVE) * descending[0]
+    centre = np.zeros_like(descending[0])
+    found = np.zeros(centre.shape, bool)
+    for k in range(count - min_frames + 1):
+        low = descending[k + min_frames - 1]
+        fits = ~found & (low > 0) & (descending[k] - low <= tolerance)
+        centre[fits] = descending[k + min_frames // 2][fits]
         found |= fits
-    agree = valid & found & (np.abs(z - middle) <= tolerance)
+    agree = valid & found & (np.abs(z - centre) <= tolerance)
     depth = _median(z, agree)
     sigma = _median(np.abs(z - depth), agree) / np.float32(_NORMAL_MEDIAN)
-    nothing = ~valid
-    empty = 2 * np.count_nonzero(nothing, axis=0) > count
+    missing = ~valid
+    empty = 2 * np.count_nonzero(missing, axis=0) > count
     return FarSurface(
         np.where(empty, np.float32(np.inf), depth),
         np.where(empty, np.float32(0), sigma),
-        np.where(empty, nothing, agree | nothing).mean(0, dtype=np.float32),
+        np.where(empty, missing, agree | missing).mean(0, dtype=np.float32),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class MovingObject:
-    """What moves before a still background, as some frames of a recording show it.
+    """An object that moves before a static background, segmented by its depth.
 
     Attributes
     ----------
     far
-        The farthest surface of each pixel.
+        The farthest surface at each pixel.
     limit
-        (H, W) float32 z in m: what is nearer is in front of the background. Infinite where the
+        (H, W) float32 z in m below which a point is before the background. Infinite where the
         object always hides it.
     own
-        (H, W) mask of the pixels at which it does.
+        (H, W) mask of the pixels at which the object always hides the background.
     reach
-        (near, far) depths in m of the object.
+        (min, max) z in m of the object.
     """
 
     far: FarSurface
@@ -126,155 +127,157 @@ class MovingObject:
     reach: tuple[float, float]
 
     def mask(self, z: Float32) -> Bool:
-        """(H, W) mask of the pixels of a z image (0: invalid) that show the object."""
+        """Return the (H, W) mask of the object in a z image (H, W), 0 where invalid."""
         near, far = self.reach
-        more = _BEYOND * (far - near)
-        reached = (z > 0) & (z >= near - more) & (z <= far + more)
-        return _without_speckle(reached & (z < self.limit))
+        margin = _MARGIN * (far - near)
+        in_reach = (z > 0) & (z >= near - margin) & (z <= far + margin)
+        return _without_speckle(in_reach & (z < self.limit))
 
 
 def moving_object(
-    frames: Sequence[RangeFrame], sigmas: float = 4.0, share: float = 0.02
+    frames: Sequence[RangeFrame], sigmas: float = 4.0, relative: float = 0.02
 ) -> MovingObject:
-    """Tell an object that moves from the background of a camera that stands still.
+    """Segment a moving object from the background of a stationary camera.
 
     Parameters
     ----------
     frames
         Spread over the recording.
-    sigmas, share
-        How far in front of the background a point must be: in standard deviations of the
-        background's depth, and as a share of it; both together.
+    sigmas, relative
+        Distance of a point from the background, in standard deviations of the background's depth
+        plus a fraction of this depth.
 
     Raises
     ------
     InputError
-        If the camera moves, nothing moves, or the object can't be told from what it stands on.
+        If the camera moves, nothing moves, or the object can't be separated from its support.
     """
-    if len(frames) < _FEWEST:
+    if len(frames) < _MIN_FRAMES:
         raise InputError(
-            f"needs {_FEWEST} frames to learn what the background is, not {len(frames)}",
+            f"needs {_MIN_FRAMES} frames to learn the background, not {len(frames)}",
             where=_OPTION,
             remedy=_CUT,
         )
     if len({frame.depth.shape for frame in frames}) > 1:
-        raise InputError("needs images of one size", where=_OPTION, remedy=_CUT)
+        raise InputError("needs images of the same size", where=_OPTION, remedy=_CUT)
     far = far_surface(frames)
-    far_z = _spread(far.z)
+    far_z = _filled(far.z)
     background = np.isfinite(far_z)
     limit = far_z.copy()
-    limit[background] -= (sigmas * far.sigma + np.float32(share) * far_z)[background]
+    limit[background] -= (sigmas * far.sigma + np.float32(relative) * far_z)[background]
     z = np.stack([frame.z for frame in frames])
     z[~np.stack([frame.valid for frame in frames])] = 0
     front = np.stack([_without_speckle((image > 0) & (image < limit)) for image in z])
-    often = front.mean(0)
+    frequency = front.mean(0)
     if background.any():
-        _check_still(far, often)
+        _check_still(far, frequency)
     inner = np.stack([ndimage.binary_erosion(image, np.ones((3, 3))) for image in front])
-    own = _own(ndimage.median_filter(far_z, 3), _spread(_median(z, inner)), often)
+    own = _always_hidden(ndimage.median_filter(far_z, 3), _filled(_median(z, inner)), frequency)
     limit[own] = np.inf
     depths = np.concatenate([z[inner], far.z[own & background & (far.z > 0)]])
-    near, beyond = np.percentile(depths, _REACH) if len(depths) else (0.0, np.inf)
-    found = MovingObject(far, limit, own, (float(near), float(beyond)))
-    _check_whole([found.mask(image) for image in z], z)
-    return found
+    low, high = np.percentile(depths, _REACH) if len(depths) else (0.0, np.inf)
+    segmentation = MovingObject(far, limit, own, (float(low), float(high)))
+    _check_complete([segmentation.mask(image) for image in z], z)
+    return segmentation
 
 
 def _spatial_sigma(z: Float32) -> Float32:
-    """(H, W) noise of z (N, H, W): what neighbouring pixels do not have in common."""
-    sides = []
+    """(H, W) noise of z (N, H, W), from second differences of neighbouring pixels."""
+    by_axis = []
     for axis in (1, 2):
         line = np.moveaxis(z, axis, 2)
         bend = np.full(line.shape, np.nan, np.float32)
         three = (line[..., 2:] > 0) & (line[..., 1:-1] > 0) & (line[..., :-2] > 0)
         second = np.abs(line[..., 2:] - 2 * line[..., 1:-1] + line[..., :-2])
         bend[..., 1:-1] = np.where(three, second, np.nan)
-        sides.append(_median(np.moveaxis(bend, 2, axis), None))
+        by_axis.append(_median(np.moveaxis(bend, 2, axis), None))
     # The second difference of independent noise has six times its variance.
-    sigma = np.fmin(*sides) / np.float32(np.sqrt(6) * _NORMAL_MEDIAN)
+    sigma = np.fmin(*by_axis) / np.float32(np.sqrt(6) * _NORMAL_MEDIAN)
     known = sigma[np.isfinite(sigma)]
     typical = np.float32(np.median(known)) if len(known) else np.float32(0)
     return np.where(np.isfinite(sigma), sigma, typical)
 
 
 def _median(values: Float32, where: Bool | None) -> Float32:
-    """Median (H, W) over the first axis of (N, H, W), 0 (NaN without `where`) of none."""
+    """Median (H, W) over the first axis of (N, H, W); 0 (NaN without `where`) if there is none."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of an empty slice
+        warnings.simplefilter("ignore", RuntimeWarning)  # for empty slices
         if where is None:
             return np.nanmedian(values, axis=0).astype(np.float32)
         found = np.nanmedian(np.where(where, values, np.nan), axis=0)
     return np.nan_to_num(found).astype(np.float32)
 
 
-def _check_still(far: FarSurface, often: Float64) -> None:
-    """Refuse a background that does not stay where it is around the image, and one that is all."""
-    still = far.share >= _STILL
-    sides = sorted(float(side.mean()) for side in (still[0], still[-1], still[:, 0], still[:, -1]))
-    # The object may reach beyond one side of the image, as one that stands on the floor does.
-    if sides[1] < _STILL_SIDE:
+def _check_still(far: FarSurface, frequency: Float64) -> None:
+    """Refuse images whose borders are not static, and those without a moving object."""
+    static = far.static_fraction >= _STATIC
+    borders = (static[0], static[-1], static[:, 0], static[:, -1])
+    sides = sorted(float(border.mean()) for border in borders)
+    # The object may extend beyond one border, such as one that stands on the floor.
+    if sides[1] < _STATIC_BORDER:
         raise InputError(
-            "needs a camera that stands still and a background around the object, and "
-            f"{sum(side < _STILL_SIDE for side in sides)} sides of the image change",
+            "needs a stationary camera and a background around the object, and "
+            f"{sum(side < _STATIC_BORDER for side in sides)} image borders change",
             where=_OPTION,
             remedy=_LEAVE + _CUT,
         )
-    if often.mean() < _LEAST_OBJECT:
+    if frequency.mean() < _MIN_OBJECT:
         raise InputError(
-            "nothing moves before the background",
+            "nothing moves in front of the background",
             where=_OPTION,
             remedy=_LEAVE + _CUT,
         )
 
 
-def _check_whole(masks: Sequence[Bool], z: Float32) -> None:
-    """Refuse an object of which only parts or the rim are found, as it stands on what is behind."""
+def _check_complete(masks: Sequence[Bool], z: Float32) -> None:
+    """Refuse an object of which only parts or the rim were segmented."""
     outline = float(np.mean([_outline(mask, image) for mask, image in zip(masks, z, strict=True)]))
     inner = sum(int(ndimage.binary_erosion(mask, np.ones((3, 3))).sum()) for mask in masks)
-    if outline < _LEAST_OUTLINE or inner < _LEAST_INNER * np.sum(masks):
+    if outline < _MIN_OUTLINE or inner < _MIN_INNER * np.sum(masks):
         raise InputError(
-            "what moves can't be told from what is behind it",
+            "the moving object can't be separated from the background",
             where=_OPTION,
             remedy=_CUT,
         )
 
 
-def _own(z: Float32, passing: Float32, often: Float64) -> Bool:
-    """Say where the far surface z (H, W) is the object's own, as it hides the background always.
+def _always_hidden(z: Float32, passing: Float32, frequency: Float64) -> Bool:
+    """Mask (H, W) where the far surface z is the object itself, as it always hides the background.
 
-    Such a piece of the far surface lies nearer than the pieces around it. Where the object passes
-    before these (in the share `often` of the frames), it is about as near as the piece (`passing`,
-    0 where unknown). Only part of the rim must be like that: the object may stand on something.
+    Such a segment of the far surface is nearer than the segments around it. Where the object passes
+    before these (in the fraction `frequency` of the frames), its depth (`passing`, 0 where unknown)
+    is about that of the segment. Only part of the rim must satisfy this: the object may stand on
+    something.
     """
-    label = _pieces(z)
+    label = _segments(z)
     count = int(label.max()) + 1
     rim, joined = np.zeros(count), np.zeros(count)
     for a, b in _neighbours():
         for p, q in ((a, b), (b, a)):
             apart = label[p] != label[q]
             here, own = label[p][apart], z[p][apart]
-            behind = np.minimum(z[q][apart], 2 * own)  # even where there is nothing
-            before, seen = passing[q][apart], often[q][apart]
-            # Nearer to the piece than to what it passes before.
+            behind = np.minimum(z[q][apart], 2 * own)  # finite even where nothing is measured
+            before, passes = passing[q][apart], frequency[q][apart]
+            # Nearer to the segment than to the surface behind.
             near = np.abs(before - own) < 0.5 * np.abs(behind - own)
-            continues = (own < behind) & (seen > _SWEPT) & near
+            continues = (own < behind) & (passes > _SWEPT) & near
             rim += np.bincount(here, minlength=count)
             joined += np.bincount(here, weights=continues, minlength=count)
-    is_own = joined > _LEAST_JOINED * np.maximum(rim, 1)
+    is_own = joined > _MIN_JOINED * np.maximum(rim, 1)
     is_own[0] = False
     return np.asarray(is_own[label])
 
 
-def _spread(z: Float32) -> Float32:
-    """Fill the zeros of an image (H, W) from the nearest pixel that has a value, if it is near."""
-    away, nearest = ndimage.distance_transform_edt(z <= 0, return_indices=True)
-    return np.where(away <= _NEAR_PIXELS, z[tuple(nearest)], np.float32(0))
+def _filled(z: Float32) -> Float32:
+    """Fill the zeros of an image (H, W) from the nearest valid pixel within `_NEAR_PIXELS`."""
+    distance, nearest = ndimage.distance_transform_edt(z <= 0, return_indices=True)
+    return np.where(distance <= _NEAR_PIXELS, z[tuple(nearest)], np.float32(0))
 
 
-def _pieces(z: Float32) -> Int32:
-    """Number the pieces of a depth image (H, W) that have no jumps in them, from 1; 0 where z is 0.
+def _segments(z: Float32) -> Int32:
+    """Label the segments of a depth image (H, W) without jumps, from 1; 0 where z is 0.
 
-    Pixels at a jump count to the piece on their side of it.
+    Pixels at a jump belong to the segment on their side of it.
     """
     rows, columns = z.shape
     pixel = np.arange(rows * columns).reshape(rows, columns)
@@ -292,12 +295,12 @@ def _pieces(z: Float32) -> Int32:
 
 
 def _neighbours() -> tuple[tuple[tuple[slice, slice], tuple[slice, slice]], ...]:
-    """Index every pair of neighbouring pixels: along the rows, and along the columns."""
+    """Slices for all pairs of neighbouring pixels: along the rows, and along the columns."""
     return ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:, :], np.s_[:-1, :]))
 
 
 def _without_speckle(mask: Bool) -> Bool:
-    """Drop the small pieces of a mask."""
+    """Remove the small components of a mask."""
     label, count = ndimage.label(mask)
     if count < 2:
         return mask
@@ -307,7 +310,7 @@ def _without_speckle(mask: Bool) -> Bool:
 
 
 def _outline(mask: Bool, z: Float32) -> float:
-    """Share of a mask's outline at which the surface ends: beyond lies nothing, or another one."""
+    """Fraction of a mask's outline at which the surface ends: a jump, or no measurement."""
     total = ends = 0
     for a, b in _neighbours():
         for p, q in ((a, b), (b, a)):

@@ -1,4 +1,4 @@
-"""camera.json: how the camera of a native recording is described."""
+"""camera.json: the description of the camera of a native recording."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tofuse.geometry.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, R
 from tofuse.geometry.se3 import check_pose
 from tofuse.recordings.frames import AmplitudeKind, DepthKind
 
-# What no camera is beyond: a frame in a month, a million a second; light modulated at 15 GHz and
-# at 1.5 kHz.
+# Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
+# at 15 GHz to 1.5 kHz.
 _RATES_HZ = (1e-7, 1e6)
 _PERIODS_M = (0.01, 1e5)
 
@@ -48,9 +48,9 @@ _KEYS = (
 
 @dataclass(frozen=True, eq=False)
 class ColorCamera:
-    """A colour camera that colour images are not registered to depth for.
+    """The camera of colour images that are not registered to depth.
 
-    `T_color_depth` (4, 4) maps points in m of the depth camera's frame into the colour camera's.
+    `T_color_depth` (4, 4) maps points in m from the depth camera's frame to the colour camera's.
     """
 
     camera: Pinhole
@@ -64,7 +64,7 @@ class CameraFile:
     Attributes
     ----------
     camera
-        None where the model is "rays" (then rays.npy holds it) or a recording of clouds has none.
+        None if the model is "rays" (it is in rays.npy then), and for clouds.
     size
         (width, height), or None for clouds.
     depth_unit_m
@@ -72,13 +72,13 @@ class CameraFile:
     depth_kind
         "z" or "range".
     frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor
-        As in the format, None where not given.
+        See the native format in docs/formats.md; None where not given.
     color_registered
-        Whether a colour image without a camera of its own shows what depth shows.
+        Whether colour without its own camera is registered to depth.
     color
-        None where colour is registered to depth.
+        The colour camera, unless colour has the pixels of depth.
     unknown
-        Keys that mean nothing here.
+        Unknown keys.
     """
 
     camera: Pinhole | None
@@ -102,21 +102,21 @@ def read_json(path: str | Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If the file can't be read, is broken (with line and column), or holds something else.
+        If the file can't be read, is invalid (with line and column), or is not an object.
     """
     text = read_text(path, limit=64 << 20)
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(
-            f"is broken JSON ({error.msg}, line {error.lineno} column {error.colno})",
+            f"is invalid JSON ({error.msg}, line {error.lineno} column {error.colno})",
             where=path,
             remedy="correct it there",
         ) from error
     except (RecursionError, ValueError) as error:
-        raise InputError("is broken JSON", where=path, remedy="write it again") from error
+        raise InputError("is invalid JSON", where=path, remedy="write it again") from error
     if not isinstance(data, dict):
-        raise InputError("holds no JSON object", where=path, remedy="write {...}")
+        raise InputError("is not a JSON object", where=path, remedy="write {...}")
     return data
 
 
@@ -127,12 +127,25 @@ def number_in(
     default: float | None = None,
     remedy: str = "correct it",
 ) -> float:
-    """Return a number of what was read from a file; `remedy` is for one that is too large.
+    """Return a number of JSON data.
+
+    Parameters
+    ----------
+    data
+        The object.
+    name
+        Its field.
+    where
+        The file, for errors.
+    default
+        The value if it is missing; required unless given.
+    remedy
+        The remedy if it is too large.
 
     Raises
     ------
     InputError
-        If it is missing and has no default, is no number, or does not fit into a float.
+        If it is missing and has no default, is not a number, or does not fit into a float.
     """
     value = data.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -152,12 +165,12 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     path
         The file.
     clouds
-        Whether it belongs to a recording of clouds, which needs no camera.
+        Whether the recording has clouds, which need no camera.
 
     Raises
     ------
     InputError
-        Naming file and field, with what to write instead.
+        Naming file and field, with a remedy.
     """
     data = read_json(path)
     get = _Fields(data, str(path))
@@ -166,7 +179,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         raise get.error(
             "schema",
             f"is {schema!r}" if "schema" in data else "is missing",
-            f"write {SCHEMA}, the only version there is",
+            f"write {SCHEMA}, the only version",
         )
     camera = size = None
     color = None
@@ -174,10 +187,10 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     kind: DepthKind = "z"
     if not (clouds and "model" not in data):
         camera, size = _lens(get)
-        unit = get.positive("depth_unit_m", needed=True, hint=_METRES) or 0.001
+        unit = get.positive("depth_unit_m", required=True, hint=_METRES) or 0.001
         if not 1e-9 <= unit <= 1:
             raise get.error("depth_unit_m", f"is {unit}", "give the metres of one count, at most 1")
-        kind = get.choice("depth_kind", ("z", "range"), needed=True)  # type: ignore[assignment]
+        kind = get.choice("depth_kind", ("z", "range"), required=True)  # type: ignore[assignment]
         color = _color(get)
     return CameraFile(
         camera,
@@ -197,19 +210,19 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
 
 
 def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[CameraFile, Camera]:
-    """Read a camera.json and the rays.npy beside it, which overrides the lens model.
+    """Read a camera.json and the rays.npy in its folder, which overrides the lens model.
 
     Parameters
     ----------
     path
         The file.
     size
-        Width and height of the images that the camera is given for, where they are known.
+        Expected width and height, if known.
 
     Raises
     ------
     InputError
-        As `read_camera_file`; also if the sizes disagree, or the model is "rays" without a table.
+        As `read_camera_file`; also if the sizes differ, or the model is "rays" without a table.
     """
     path = Path(path)
     description = read_camera_file(path)
@@ -241,7 +254,7 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
 
 
 def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
-    """Refuse an image (H, W) or (H, W, 3) that isn't of its camera's size, by an InputError."""
+    """Raise InputError, naming `where`, unless an image (H, W, ...) has the size of its camera."""
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"is {image.shape[1]} x {image.shape[0]} pixels, its camera "
@@ -254,28 +267,30 @@ def check_size(image: NDArray[Any], camera: Camera, where: str | Path) -> None:
 def read_rays(path: Path) -> RayTable:
     """Read a rays.npy: (H, W, 2) float32 of x/z and y/z."""
     try:
-        # Mapped first, so that a header can't make us allocate more than the file holds.
+        # Mapped first, so that a damaged header can't cause an allocation larger than the file.
         table = np.load(path, mmap_mode="r", allow_pickle=False)
         if not isinstance(table, np.ndarray) or table.dtype.kind != "f":
-            raise ValueError("no array of floats")
+            raise ValueError("not an array of floats")
         if table.ndim != 3 or table.shape[2] != 2:
             raise ValueError(f"shape {table.shape}, not (H, W, 2)")
         rays = np.array(table, float)
         if (np.abs(rays[np.isfinite(rays)]) > MAX_SLOPE).any():
-            raise ValueError("rays at right angles to the axis and beyond")
+            raise ValueError("rays at 90 degrees from the optical axis or more")
         return RayTable(np.where(np.isfinite(rays), rays, np.nan).astype(np.float32))
     except OSError as error:
         raise input_error(error, path) from error
     except InputError as error:
         raise InputError(error.problem, where=path, remedy=error.remedy) from error
-    except Exception as error:  # NumPy parses the header as Python: anything may come out
+    except Exception as error:  # NumPy evaluates the header as Python, which can raise anything
         raise InputError(
-            f"is no table of rays ({error})", where=path, remedy="save (H, W, 2) float32 by NumPy"
+            f"is not a table of rays ({error})",
+            where=path,
+            remedy="save (H, W, 2) float32",
         ) from error
 
 
 def camera_fields(camera: Camera) -> dict[str, Any]:
-    """Return the fields of camera.json that describe a lens; a ray table gives only its size."""
+    """Return the fields of camera.json that describe a camera; only the size of a ray table."""
     if isinstance(camera, RayTable):
         return {"model": "rays", "width": camera.width, "height": camera.height}
     if not isinstance(camera, Pinhole):
@@ -300,10 +315,10 @@ class _Fields:
     def error(self, field: str, problem: str, remedy: str) -> InputError:
         return InputError(problem, where=f"{self.where}: {field}", remedy=remedy)
 
-    def number(self, field: str, *, needed: bool = False, hint: str = "a number") -> float | None:
+    def number(self, field: str, *, required: bool = False, hint: str = "a number") -> float | None:
         value = self.data.get(field)
         if value is None:
-            if needed:
+            if required:
                 raise self.error(field, "is missing", f"give {hint}")
             return None
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -317,9 +332,9 @@ class _Fields:
         return value
 
     def positive(
-        self, field: str, *, needed: bool = False, hint: str = "a positive number"
+        self, field: str, *, required: bool = False, hint: str = "a positive number"
     ) -> float | None:
-        value = self.number(field, needed=needed, hint=hint)
+        value = self.number(field, required=required, hint=hint)
         if value is not None and value <= 0:
             raise self.error(field, f"is {value}", f"give {hint}")
         return value
@@ -331,7 +346,7 @@ class _Fields:
         return value
 
     def pixels(self, field: str) -> int:
-        value = self.number(field, needed=True, hint="a number of pixels")
+        value = self.number(field, required=True, hint="a number of pixels")
         if value is None or value != int(value) or not 2 <= value <= 16384:
             raise self.error(field, f"is {value}", "give a whole number of pixels, 2 to 16384")
         return int(value)
@@ -348,9 +363,9 @@ class _Fields:
             raise self.error(field, f"is {value!r:.60}", "write true or false")
         return value
 
-    def choice(self, field: str, choices: tuple[str, ...], *, needed: bool = False) -> str | None:
+    def choice(self, field: str, choices: tuple[str, ...], *, required: bool = False) -> str | None:
         value = self.data.get(field)
-        if value is None and not needed:
+        if value is None and not required:
             return None
         if value not in choices or not isinstance(value, str):
             problem = "is missing" if field not in self.data else f"is {value!r:.60}"
@@ -359,22 +374,22 @@ class _Fields:
 
 
 def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
-    model = get.choice("model", (*MODELS, "rays"), needed=True)
+    model = get.choice("model", (*MODELS, "rays"), required=True)
     size = (get.pixels("width"), get.pixels("height"))
     if model == "rays" or model is None:
         return None, size
     values: dict[str, float] = {}
     for name in ("fx", "fy"):
-        values[name] = get.positive(name, needed=True) or 1.0
+        values[name] = get.positive(name, required=True) or 1.0
     for name in ("cx", "cy"):
-        values[name] = get.number(name, needed=True) or 0.0
+        values[name] = get.number(name, required=True) or 0.0
     order = DISTORTION_ORDER[model]
     given = get.data.get("distortion")
     given = [] if given is None else given
     if not isinstance(given, list):
         raise get.error("distortion", f"is {given!r:.60}", f"give a list [{' '.join(order)}]")
     for k, value in enumerate(given):
-        _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", needed=True)
+        _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", required=True)
     extra = given[len(order) :]
     if any(extra):
         raise get.error(
@@ -384,20 +399,31 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
         )
     values |= {name: float(v) for name, v in zip(order, given, strict=False)}
     cls = MODELS[model]
-    known = {f.name for f in fields(cls)}
-    values = {name: v for name, v in values.items() if name in known}
+    parameters = {f.name for f in fields(cls)}
+    values = {name: v for name, v in values.items() if name in parameters}
     return checked_lens(cls, size, values, get.where), size
 
 
 def checked_lens(
     cls: type[Pinhole], size: tuple[int, int], values: dict[str, float], where: str | Path
 ) -> Pinhole:
-    """Make a camera of numbers from a file.
+    """Return a camera with parameters from a file.
+
+    Parameters
+    ----------
+    cls
+        The lens model.
+    size
+        (width, height) in pixels.
+    values
+        The other parameters by name.
+    where
+        The file, for errors.
 
     Raises
     ------
     InputError
-        Naming the file and the number, if it isn't finite or can't be true.
+        Naming the file and the parameter, if it isn't finite or plausible.
     """
     for name, value in values.items():
         low = 0.01 if name in ("fx", "fy") else -1e6
@@ -430,5 +456,5 @@ def _color(get: _Fields) -> ColorCamera | None:
     try:
         matrix = np.array(data.get("T_color_depth"), float)
     except (TypeError, ValueError, OverflowError) as error:
-        raise get.error(field, "is no 4x4 matrix", "give four rows of four numbers") from error
+        raise get.error(field, "is not a 4x4 matrix", "give four rows of four numbers") from error
     return ColorCamera(camera, check_pose(matrix, where=f"{get.where}: {field}"))

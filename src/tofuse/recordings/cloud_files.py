@@ -28,7 +28,7 @@ _STEP_M = 1000.0  # coordinates of maps are moved by whole kilometres
 
 F = TypeVar("F", bound=Frame)
 LoadFrame = Callable[[Path, int, float], Frame]
-LoadMoved = Callable[[Path, int, float, Float64], Frame]
+LoadShifted = Callable[[Path, int, float, Float64], Frame]
 
 
 class CloudFileSource(FileSource):
@@ -42,7 +42,7 @@ class CloudFileSource(FileSource):
         In the order of frames.
     load_frame
         Reads a file, given its index and timestamp.
-    load_moved
+    load_shifted
         Does so in double precision, and takes a shift (3,) off the coordinates: coordinates of maps
         don't fit into float32. All files are moved by the same, found from the first that can be
         read, which is `shift_m` in `metadata`.
@@ -53,11 +53,11 @@ class CloudFileSource(FileSource):
         path: Path,
         files: list[Path],
         load_frame: LoadFrame,
-        load_moved: LoadMoved | None = None,
+        load_shifted: LoadShifted | None = None,
     ) -> None:
         super().__init__(np.arange(len(files), dtype=float))
         self.files = files
-        self.load_frame, self.load_moved = load_frame, load_moved
+        self.load_frame, self.load_shifted = load_frame, load_shifted
         self._far = False
         self._kept: dict[int, Frame] = {}  # read to find shift and camera
         self._seen: Deprojection | None = None
@@ -70,7 +70,7 @@ class CloudFileSource(FileSource):
             if is_file(path / "odometry.txt"):
                 self.odometry = tum_poses(self, path / "odometry.txt")
         self._shift = np.zeros(3)
-        if load_moved is not None:
+        if load_shifted is not None:
             self._shift, self._kept = find_shift(self._read, len(files))
             note_shift(self, path, self._shift)
             self._seen = self._deprojection()
@@ -95,8 +95,8 @@ class CloudFileSource(FileSource):
 
     def _read(self, index: int) -> Frame:
         file, time = self.files[index], float(self.timestamps[index])
-        if self.load_moved is not None and self._shift.any():
-            return self.load_moved(file, index, time, self._shift)
+        if self.load_shifted is not None and self._shift.any():
+            return self.load_shifted(file, index, time, self._shift)
         return self.load_frame(file, index, time)
 
     def _deprojection(self) -> Deprojection | None:
@@ -219,7 +219,7 @@ def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
     return Sniff(SURE, f"{len(files)} {' and '.join(kinds)} file{'s'[: len(files) > 1]}")
 
 
-def needed_files(path: Path, *suffixes: str) -> list[Path]:
+def required_files(path: Path, *suffixes: str) -> list[Path]:
     """As `cloud_files`, or raise InputError if there are none."""
     files = cloud_files(path, *suffixes)
     if not files:

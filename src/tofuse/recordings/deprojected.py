@@ -1,9 +1,9 @@
-"""Clouds deprojected from the images of a camera: the camera, recovered from the points.
+"""Recovering the camera of clouds that were deprojected from depth images.
 
-Programs that export a depth image as a cloud leave out the pixels without a measurement, and with
-them the grid. The points still lie on the rays of the pixels, whose slopes x/z and y/z form a
-lattice that the lens has bent smoothly. It is followed from the middle outwards: a polynomial that
-maps slopes to columns and rows is fitted to ever larger parts of it.
+Programs that export a depth image as a cloud drop the pixels without a measurement, and so the
+grid. The points are still on the rays of the pixels, whose slopes x/z and y/z form a lattice that
+is smoothly distorted by the lens. It is traced from its centre outwards: a polynomial from slopes
+to columns and rows is fitted to increasingly large parts of it.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.organised import PINHOLE_PIXELS
 
-# Points that the polynomial is fitted to, at most, and columns and rows of an image.
-_SAMPLED, _FEWEST, _MOST = 8000, 24, 8192
-# Points in the middle that show the step of the lattice, and the part of it that is fitted first,
-# in steps; each further part reaches so much further.
-_MIDDLE, _FIRST, _FURTHER = 400, 4.0, 1.2
-# The steps to the nearest neighbours in the middle vary by less than this share.
+# Largest number of points to fit, and limits of the columns and rows of an image.
+_SAMPLED, _MIN_SIDE, _MAX_SIDE = 8000, 24, 8192
+# Number of central points that determine the spacing of the lattice; the radius of the part that is
+# fitted first, in steps of the lattice; and the factor by which it grows.
+_CENTRAL, _FIRST, _GROWTH = 400, 4.0, 1.2
+# Relative variation of the steps to the nearest neighbours in the centre.
 _REGULAR = 0.1
-# Degree of the polynomial by the reach of the part, in steps. A lens of Brown's model is of degree
-# 7 in the slopes; those of others are as smooth.
+# Degree of the polynomial by the radius of the part, in steps. Brown's model has degree 7 in the
+# slopes; other lenses are as smooth.
 _DEGREES = ((8.0, 1), (16.0, 3), (48.0, 5), (np.inf, 7))
-# How far points lie from their pixel's centre, in pixels: rounded coordinates shift them. Of points
-# that are anywhere a quarter lie so near. On the way outwards most must, as the polynomial is
-# extrapolated; then all points that the camera is recovered from, and nearly all of other frames.
-_OFF, _ON_THE_WAY, _ON_CENTRES = 0.25, 0.9, 0.99
-# Newton steps from pixels to slopes.
+# Distance of points from their pixel's centre, in pixels, as coordinates are rounded: a quarter of
+# randomly placed points are as near. While the fit grows most must be, as the polynomial is
+# extrapolated; then all points of the clouds used, and nearly all of other frames.
+_OFF, _WHILE_GROWING, _ON_CENTRES = 0.25, 0.9, 0.99
+# Newton iterations from pixels to slopes.
 _STEPS = 6
-# Slopes that are mapped at a time, for the processor's cache.
+# Slopes mapped at a time, for the CPU cache.
 _CHUNK = 8192
 
 
@@ -47,7 +47,9 @@ class Deprojection:
     Attributes
     ----------
     camera
-        With just the columns and rows where something was measured.
+        Cropped to the columns and rows with measurements.
+    lattice
+        Maps slopes to its pixels.
     """
 
     camera: Camera
@@ -65,7 +67,7 @@ class Deprojection:
         at, good = self.lattice.pixels(points)
         if len(points) and good.mean() < _ON_CENTRES:
             raise InputError(
-                "has points off the rays of those before it",
+                "has points off the rays of the previous clouds",
                 where=f"frame {cloud.index}",
                 remedy="keep the clouds of each camera apart",
             )
@@ -88,7 +90,7 @@ class Deprojection:
             vectors = np.full((*shape, 3), np.nan, np.float32)
             vectors[row, column] = normals[good]
             normals = vectors
-        # Files don't say how the amplitude was made from the received light.
+        # The relation of the amplitude to the received light is unknown.
         return RangeFrame(
             cloud.index,
             cloud.timestamp,
@@ -102,7 +104,7 @@ class Deprojection:
 
 
 def find_deprojection(clouds: Sequence[CloudFrame]) -> Deprojection | None:
-    """Return the camera that all of some clouds were deprojected from; None if there is none."""
+    """Return the camera from which all clouds were deprojected; None if there is none."""
     if any(np.any(cloud.origin) for cloud in clouds):
         return None
     points = [cloud.points for cloud in clouds if len(cloud)]
@@ -112,102 +114,102 @@ def find_deprojection(clouds: Sequence[CloudFrame]) -> Deprojection | None:
     lattice = _Lattice.of(slopes)
     if lattice is None:
         return None
-    placed = [lattice.pixels(p) for p in points]
-    # Nothing may be lost: where points are off the rays, or share one, they are no image's.
-    if not all(good.all() and len(np.unique(at, axis=0)) == len(at) for at, good in placed):
+    pixels = [lattice.pixels(p) for p in points]
+    # No point may be lost: points off the rays or on a common ray are not from an image.
+    if not all(good.all() and len(np.unique(at, axis=0)) == len(at) for at, good in pixels):
         return None
-    at = np.concatenate([at for at, _ in placed])
+    at = np.concatenate([at for at, _ in pixels])
     low, high = at.min(0), at.max(0)
     width, height = (int(n) for n in high - low + 1)
-    if min(width, height) < _FEWEST or max(width, height) > _MOST:
+    if min(width, height) < _MIN_SIDE or max(width, height) > _MAX_SIDE:
         return None
-    lattice = lattice.moved(low)
+    lattice = lattice.with_origin(low)
     camera = _camera(lattice, at - low, np.concatenate(slopes), width, height)
     return None if camera is None else Deprojection(camera, lattice)
 
 
 @dataclass(frozen=True, eq=False)
 class _Lattice:
-    """A polynomial from slopes (N, 2) to columns and rows.
+    """A polynomial from slopes (N, 2) to columns and rows (N, 2).
 
     Attributes
     ----------
-    middle, reach
-        Slopes that are the origin and the unit of its variables.
+    centre, reach
+        Origin (2,) and unit of its variables, as slopes.
     degree, terms
-        And (terms, 2) coefficients.
+        Its degree, and (K, 2) coefficients.
     """
 
-    middle: Float64
+    centre: Float64
     reach: float
     degree: int
     terms: Float64
 
     @classmethod
     def of(cls, slopes: Sequence[Float64]) -> _Lattice | None:
-        """Follow the lattice that the slopes (N, 2) of all clouds are on; None if there is none."""
+        """Fit the lattice of the slopes (N, 2) of all clouds; None if there is none."""
         rng = np.random.default_rng(0)
-        share = _SAMPLED // len(slopes)
-        some = np.concatenate(
-            [s if len(s) <= share else s[rng.choice(len(s), share, replace=False)] for s in slopes]
+        quota = _SAMPLED // len(slopes)
+        sample = np.concatenate(
+            [s if len(s) <= quota else s[rng.choice(len(s), quota, replace=False)] for s in slopes]
         )
-        found = _middle_of(slopes[0])
-        if found is None:
+        spacing = _central_spacing(slopes[0])
+        if spacing is None:
             return None
-        middle, step = found
-        # Around the middle all points are needed; further out some are enough.
-        near = np.concatenate([s[(np.abs(s - middle) < 2 * _FIRST * step).all(1)] for s in slopes])
-        lattice = cls(middle, 1.0, 1, np.concatenate([np.zeros((1, 2)), np.diag(1 / step)]))
-        reach, farthest = _FIRST, float(np.abs((some - middle) / step).max())
+        centre, step = spacing
+        # All points are needed around the centre; farther out a sample is sufficient.
+        near = np.concatenate([s[(np.abs(s - centre) < 2 * _FIRST * step).all(1)] for s in slopes])
+        lattice = cls(centre, 1.0, 1, np.concatenate([np.zeros((1, 2)), np.diag(1 / step)]))
+        reach, farthest = _FIRST, float(np.abs((sample - centre) / step).max())
         while True:
-            pool = near if reach < 2 * _FIRST else some
-            part = pool[(np.abs(pool - middle) <= reach * step).all(1)]
-            fitted = lattice._refined(part, reach * float(step.max()), reach)
+            pool = near if reach < 2 * _FIRST else sample
+            part = pool[(np.abs(pool - centre) <= reach * step).all(1)]
+            fitted = lattice._refitted(part, reach * float(step.max()), reach)
             if fitted is not None:
                 lattice = fitted
-            elif len(part) > _MIDDLE:
+            elif len(part) > _CENTRAL:
                 return None
             if reach >= farthest:
                 return lattice
-            reach *= _FURTHER
+            reach *= _GROWTH
 
-    def _refined(self, slopes: Float64, reach: float, steps: float) -> _Lattice | None:
-        """Fit to a part of the lattice, that it is known to nearly; None where it isn't."""
+    def _refitted(self, slopes: Float64, reach: float, steps: float) -> _Lattice | None:
+        """Fit to a part of the lattice that this one predicts approximately; None if it doesn't."""
         at = self(slopes)
         pixel = np.rint(at)
         good = (np.abs(at - pixel) < _OFF).all(1)
-        degree = next(degree for most, degree in _DEGREES if steps <= most)
+        degree = next(degree for limit, degree in _DEGREES if steps <= limit)
         size = (degree + 1) * (degree + 2) // 2
-        if good.sum() < 2 * size or good.mean() < _ON_THE_WAY:
+        if good.sum() < 2 * size or good.mean() < _WHILE_GROWING:
             return None
-        variables = (slopes[good] - self.middle) / reach
+        variables = (slopes[good] - self.centre) / reach
         fit = np.linalg.lstsq(_powers(variables, degree), pixel[good], rcond=None)[0]
         terms = np.asarray(fit, np.float64)
-        return _Lattice(self.middle, reach, degree, terms)
+        return _Lattice(self.centre, reach, degree, terms)
 
     def __call__(self, slopes: Float64) -> Float64:
-        """(N, 2) columns and rows of slopes (N, 2)."""
+        """Return columns and rows (N, 2) of slopes (N, 2)."""
         out = np.empty((len(slopes), 2))
         for k in range(0, len(slopes), _CHUNK):
             part = slice(k, k + _CHUNK)
-            variables = (slopes[part] - self.middle) / self.reach
+            variables = (slopes[part] - self.centre) / self.reach
             out[part] = _powers(variables, self.degree) @ self.terms
         return out
 
     def pixels(self, points: Float32) -> tuple[Intp, Bool]:
-        """(N, 2) nearest pixels of points (N, 3), and (N,) which points lie at their centres."""
+        """Return the nearest pixels (N, 2) of points (N, 3), and (N,) whether at their centres."""
         at = self(points[:, :2].astype(np.float64) / points[:, 2:])
         pixel = np.rint(at)
         return pixel.astype(np.intp), np.asarray((np.abs(at - pixel) < _OFF).all(1))
 
-    def moved(self, origin: Intp) -> _Lattice:
-        """Count columns and rows from `origin` (2,)."""
+    def with_origin(self, origin: Intp) -> _Lattice:
+        """Return the lattice with columns and rows counted from `origin` (2,)."""
         terms = self.terms.copy()
         terms[0] -= origin
-        return _Lattice(self.middle, self.reach, self.degree, terms)
+        return _Lattice(self.centre, self.reach, self.degree, terms)
 
     def slopes(self, pixels: Float64, start: Float64) -> Float64:
-        """(N, 2) slopes of pixels (N, 2), by Newton's method from slopes near by."""
+        """Return slopes (N, 2) of pixels (N, 2), by Newton's method from slopes `start`."""
         out, tiny = start, 1e-4 * self.reach
         right, down = np.array([tiny, 0]), np.array([0, tiny])
         for _ in range(_STEPS):
@@ -220,7 +222,7 @@ class _Lattice:
 
 
 def _powers(variables: Float64, degree: int) -> Float64:
-    """(N, terms) all products of powers of two variables (N, 2) up to a degree, 1 first."""
+    """(N, K) monomials of two variables (N, 2) up to a total degree, the constant first."""
     x, y = variables.T
     by_x, by_y = [np.ones(len(x))], [np.ones(len(y))]
     for _ in range(degree):
@@ -231,29 +233,29 @@ def _powers(variables: Float64, degree: int) -> Float64:
     )
 
 
-def _middle_of(slopes: Float64) -> tuple[Float64, Float64] | None:
-    """A slope (2,) amid others (N, 2), and the steps (2,) from it to its neighbours, or None."""
-    if len(slopes) < _FEWEST**2:
+def _central_spacing(slopes: Float64) -> tuple[Float64, Float64] | None:
+    """The central slope (2,) of (N, 2), and the spacing (2,) of the lattice there, or None."""
+    if len(slopes) < _MIN_SIDE**2:
         return None
     off = np.abs(slopes - np.median(slopes, axis=0)).max(1)
-    part = slopes[np.argpartition(off, _MIDDLE)[:_MIDDLE]]
+    part = slopes[np.argpartition(off, _CENTRAL)[:_CENTRAL]]
     flat = np.column_stack([part, np.zeros(len(part))])
-    beside, _ = KdTree(flat).neighbours(flat, 5)
-    apart = np.abs(part[beside[:, 1:]] - part[:, None]).reshape(-1, 2)
+    nearest, _ = KdTree(flat).neighbours(flat, 5)
+    gaps = np.abs(part[nearest[:, 1:]] - part[:, None]).reshape(-1, 2)
     steps = []
     for along in (0, 1):
-        lies = apart[:, along] > 3 * apart[:, 1 - along]
-        if lies.sum() < _FEWEST:
+        aligned = gaps[:, along] > 3 * gaps[:, 1 - along]
+        if aligned.sum() < _MIN_SIDE:
             return None
-        step = float(np.median(apart[lies, along]))
-        if not step > 0 or np.mean(np.abs(apart[lies, along] / step - 1) < _REGULAR) < 0.5:
+        step = float(np.median(gaps[aligned, along]))
+        if not step > 0 or np.mean(np.abs(gaps[aligned, along] / step - 1) < _REGULAR) < 0.5:
             return None
         steps.append(step)
     return part[np.argmin(np.abs(part - np.median(part, axis=0)).max(1))], np.array(steps)
 
 
 def _camera(lattice: _Lattice, at: Intp, slopes: Float64, width: int, height: int) -> Camera | None:
-    """The camera with the mean slope (N, 2) of each pixel (N, 2); of others as the lattice goes."""
+    """The camera with the mean slope (N, 2) of each pixel (N, 2); elsewhere that of the lattice."""
     cell = at @ (1, width)
     count = np.bincount(cell, minlength=width * height)
     sums = np.stack([np.bincount(cell, s, minlength=width * height) for s in slopes.T], axis=1)

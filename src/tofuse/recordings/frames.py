@@ -1,7 +1,7 @@
-"""The two kinds of view: a grid seen by a camera, and a bare cloud.
+"""The two kinds of view: a depth image of a camera, and a cloud.
 
-Both offer the `View` protocol, which is all that cloud registration needs. All arrays are
-read-only by convention: a method that changes something returns a new frame.
+Both implement the `View` protocol, which is all that cloud registration needs. All arrays are
+read-only by convention: methods return new frames.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SATURATED_AMPLITUDE = 65535.0
 
 
 class View(Protocol):
-    """What both kinds of view have: N points with what is known of each, in the view's frame."""
+    """The common interface of both kinds of view: N points with columns, in the view's frame."""
 
     @property
     def index(self) -> int:
@@ -39,7 +39,7 @@ class View(Protocol):
 
     @property
     def timestamp(self) -> float:
-        """Seconds."""
+        """Timestamp in s."""
         ...
 
     @property
@@ -64,7 +64,7 @@ class View(Protocol):
 
     @property
     def color(self) -> UInt8 | None:
-        """(N, 3) RGB; None if not recorded."""
+        """(N, 3) uint8 RGB; None if not recorded."""
         ...
 
     @property
@@ -102,20 +102,19 @@ class RangeFrame:
     sigma_image
         (H, W) float32, standard deviation of the range in m.
     shared_sigma_image
-        (H, W) float32, standard deviation of that error of the range in m which a pixel shares
-        with its neighbours, so that it does not average out; on top of `sigma_image`.
+        (H, W) float32, standard deviation of the range error in m that is correlated between
+        neighbouring pixels, so that it does not average out; in addition to `sigma_image`.
     normal_image
         (H, W, 3) float32 unit normals towards the camera, NaN where unknown.
     amplitude_kind
-        What the amplitude counts: "raw", the modulated light that arrived, which falls with the
-        square of the range; "range_compensated", that times the square of the range (and divided
-        by the falloff of lens and lamp), which is the surface's albedo but for its slope; "ir",
-        active brightness by a map of the maker's own, to be taken as raw.
+        "raw": the received modulated light, which decreases with the square of the range;
+        "range_compensated": multiplied by the square of the range (and divided by the falloff of
+        lens and illumination), which is the albedo times the cosine of incidence; "ir": active
+        brightness by the maker's own mapping, treated as raw.
     ambiguity_m
-        Range in m after which the measurement repeats; None where not known.
+        Range in m after which the phase repeats; None if not known.
     color_registered
-        Whether the colour of a pixel is that of the point it measures; if not, it is good for
-        colouring only.
+        Whether the colour of a pixel is that of its point; if not, it is used only for display.
     """
 
     index: int
@@ -156,7 +155,7 @@ class RangeFrame:
                     remedy="use the camera of these images",
                 )
         depth = np.asarray(self.depth, np.float32)
-        # Readers leave hardly anything else, so that no copy has to be made.
+        # Frames of readers rarely need this copy.
         good = (depth >= 0) & (depth < np.inf)
         if not good.all():
             depth = np.where(good, depth, np.float32(0))
@@ -219,7 +218,7 @@ class RangeFrame:
     def keep(self, mask: Bool) -> Self:
         """Return the frame with every pixel outside the (H, W) mask made invalid."""
         kept = object.__new__(type(self))
-        # What was checked when this one was made need not be again.
+        # Without the checks of __post_init__, which this frame has passed.
         for each in fields(self):
             object.__setattr__(kept, each.name, getattr(self, each.name))
         object.__setattr__(kept, "depth", np.where(mask, self.depth, np.float32(0)))
@@ -228,7 +227,7 @@ class RangeFrame:
 
 @dataclass(frozen=True, eq=False)
 class CloudFrame:
-    """One view without a camera: N points, non-finite ones dropped when it is made by `of`."""
+    """A view without a camera: N points, see `View`; `of` drops non-finite ones."""
 
     index: int
     timestamp: float
@@ -249,7 +248,7 @@ class CloudFrame:
 
     @classmethod
     def of(cls, points: ArrayLike, *, index: int = 0, timestamp: float = 0.0) -> Self:
-        """Make a view of an (N, 3) array in m, dropping non-finite points."""
+        """Return a cloud of an (N, 3) array in m, without non-finite points."""
         array = np.asarray(points)
         if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
             raise InputError(
@@ -262,7 +261,7 @@ class CloudFrame:
 
     @property
     def valid(self) -> Bool:
-        """(N,) mask; every point of a cloud is valid."""
+        """(N,) mask: all points of a cloud are valid."""
         return np.ones(len(self.points), bool)
 
     def __len__(self) -> int:

@@ -54,12 +54,12 @@ _LENS = ("fx", "fy", "cx", "cy")
 
 
 class NativeSource(FileSource):
-    """Reads a native folder.
+    """A native folder.
 
     Attributes
     ----------
     camera
-        Of all frames; None for clouds.
+        The camera of all frames; None for clouds.
     description
         Content of camera.json.
     imu
@@ -97,7 +97,7 @@ class NativeSource(FileSource):
         self.rays = self._channel("rays", ".npy")
         self.by_frequency = self._frequencies()
         if camera_file is not None:
-            self.rays = []  # the given camera is that of all frames
+            self.rays = []  # a given camera applies to all frames
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
@@ -179,7 +179,7 @@ class NativeSource(FileSource):
         return table
 
     def _frame_lenses(self) -> list[Pinhole | InputError]:
-        """Lens of each frame, where frames.csv tells fx, fy, cx and cy."""
+        """The lens of each frame, if frames.csv contains fx, fy, cx and cy."""
         columns, camera = self.frame_columns, self.camera
         if columns is None or not isinstance(camera, Pinhole) or not set(_LENS) <= set(columns):
             return []
@@ -204,7 +204,7 @@ class NativeSource(FileSource):
             return load_camera(given or path)
         if given is not None:
             raise InputError(
-                "means nothing for a recording of clouds", where="--camera", remedy="leave it out"
+                "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
             )
         if is_file(path):
             return read_camera_file(path, clouds=True), None
@@ -219,7 +219,7 @@ class NativeSource(FileSource):
             raise self._count_error(path, f"{len(table)} lines")
         if table.shape[1] != 1:
             raise InputError(
-                f"has {table.shape[1]} numbers in a line", where=path, remedy="give one, in seconds"
+                f"has {table.shape[1]} numbers per line", where=path, remedy="give one, in seconds"
             )
         self.timestamps = table[:, 0]
         check_timestamps(self.timestamps, path, self.warnings)
@@ -236,11 +236,11 @@ class NativeSource(FileSource):
         return files
 
     def _frequencies(self) -> dict[float, list[Path]]:
-        """Return the images of depth measured at each frequency, in Hz, where there are several."""
+        """The depth images by modulation frequency in Hz, if several were recorded separately."""
         folder = self.folder / "frequencies"
         if self.is_clouds or not is_folder(folder):
             return {}
-        found: dict[float, list[Path]] = {}
+        images: dict[float, list[Path]] = {}
         for part in list_folder(folder):
             try:
                 hertz = float(part.name)
@@ -250,19 +250,19 @@ class NativeSource(FileSource):
                 raise InputError(
                     "isn't a frequency", where=part, remedy="name the folder in Hz, as 30000000"
                 )
-            found[hertz] = files_with(part, ".png")
-            if len(found[hertz]) != len(self.files):
-                raise self._count_error(part, f"{len(found[hertz])} images")
-        if len(found) == 1:
+            images[hertz] = files_with(part, ".png")
+            if len(images[hertz]) != len(self.files):
+                raise self._count_error(part, f"{len(images[hertz])} images")
+        if len(images) == 1:
             raise InputError(
-                "holds one frequency", where=folder, remedy="give two or more, or remove it"
+                "has only one frequency", where=folder, remedy="give two or more, or remove it"
             )
-        return found
+        return images
 
     def _combined(
         self, index: int, camera: Camera, size: tuple[int, int], kind: DepthKind
     ) -> Float32:
-        """Return the depth that all frequencies agree on; 0 where they don't."""
+        """The depth that is consistent with all frequencies; 0 where there is none."""
         unit = self.description.depth_unit_m
         periods = [SPEED_OF_LIGHT / (2 * hertz) for hertz in self.by_frequency]
         ranges = []
@@ -302,20 +302,20 @@ class NativeSource(FileSource):
         path = self.folder / "imu.csv"
         if self.gravity is None:
             self.warnings.append(
-                f"{path}: has no columns timestamp, ax, ay, az, so it does not tell what is down"
+                f"{path}: has no columns timestamp, ax, ay, az, so gravity is unknown"
             )
         elif not np.isfinite(self.gravity).any():
-            self.warnings.append(f"{path}: nothing was measured at the time of any frame")
+            self.warnings.append(f"{path}: has no samples near the time of any frame")
 
-    def _count_error(self, where: Path, what: str) -> InputError:
+    def _count_error(self, where: Path, count: str) -> InputError:
         return InputError(
-            f"has {what}, {self.files[0].parent.name}/ has {len(self.files)} files",
+            f"has {count}, {self.files[0].parent.name}/ has {len(self.files)} files",
             where=where,
             remedy="make the counts agree, or remove it",
         )
 
     def _check_sizes(self) -> None:
-        """Refuse a camera.json of other images, as far as the first readable header tells."""
+        """Compare the size in camera.json with the first readable header of each channel."""
         if self.camera is None:
             return
         for channel in (self.files, self.amplitude, self.confidence, self.sigma):
@@ -332,7 +332,7 @@ class NativeSource(FileSource):
             try:
                 header = read_header(path)
             except InputError:
-                continue  # that frame's own trouble, told when it is read
+                continue  # an error of that frame alone, raised when it is read
             if (header.width, header.height) != size:
                 raise InputError(
                     f"is {header.width} x {header.height} pixels, camera.json says "
@@ -346,7 +346,7 @@ class NativeSource(FileSource):
         about = self.description
         if about.unknown:
             self.warnings.append(
-                f"{self.folder / 'camera.json'}: means nothing here: {', '.join(about.unknown)}"
+                f"{self.folder / 'camera.json'}: unknown fields ignored: {', '.join(about.unknown)}"
             )
         for name in ("sensor", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"):
             if getattr(about, name) is not None:
@@ -362,40 +362,40 @@ class NativeSource(FileSource):
 
 
 def same_distortion(a: Pinhole, b: Pinhole) -> bool:
-    """Whether two lenses differ in nothing but focal lengths and principal point."""
+    """Whether two lenses differ only in focal lengths and principal point."""
     return type(a) is type(b) and all(
         getattr(a, f.name) == getattr(b, f.name) for f in fields(a) if f.name not in _LENS
     )
 
 
 def depth_from_counts(counts: NDArray[np.generic], unit_m: float) -> Float32:
-    """Depth in m (float32) of stored counts; 0 and 65535 give 0."""
+    """Return depth in m (float32) of stored counts (H, W); 0 and 65535 give 0."""
     depth = counts.astype(np.float32) * np.float32(unit_m)
     depth[counts == INVALID_DEPTH] = 0
     return depth
 
 
 def read_correction(path: Path) -> DepthCorrection:
-    """Read a correction.npz, refusing one that unpacks to more than any camera needs."""
+    """Read a correction.npz; InputError if it is invalid, or decompresses to an absurd size."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(item.file_size for item in archive.infolist())
     except (OSError, ValueError, zipfile.BadZipFile):
-        size = 0  # the loader says what is wrong
+        size = 0  # reported by the loader
     try:
         if size <= MAX_CORRECTION_BYTES:
             return DepthCorrection.load(path)
     except MemoryError:
         pass
     raise InputError(
-        "unpacks to more than a correction can be", where=path, remedy="write it again"
+        "decompresses to more than a correction can be", where=path, remedy="write it again"
     )
 
 
 def corrected_depth(
     correction: DepthCorrection, camera: Camera, depth: Float32, kind: DepthKind
 ) -> Float32:
-    """Depth (H, W) of a kind, in m, after the correction of the radial range behind it."""
+    """Return depth (H, W) in m of the given kind, after correction of its radial range."""
     if kind == "range":
         return correction.correct(depth)
     return z_from_range(camera, correction.correct(range_from_z(camera, depth)))
@@ -404,34 +404,34 @@ def corrected_depth(
 class RecordingWriter:
     """Writes a native folder, frame by frame.
 
-    Every file is written beside and renamed; camera.json comes last, in `finish`, so that an
-    interrupted recording is never mistaken for a whole one.
+    Every file is written atomically; camera.json comes last, in `finish`, so that an interrupted
+    recording is never mistaken for a complete one.
 
     Parameters
     ----------
     folder
-        Made if missing; must be empty.
+        Created if missing; must be empty.
     camera
-        Of all frames; a RayTable goes to rays.npy. None for clouds.
+        The camera of all frames; a RayTable is written to rays.npy. None for clouds.
     depth_unit_m
         Metres per count.
     depth_kind
-        What is stored, "z" or "range"; frames are converted.
+        Kind of the stored depth, "z" or "range"; frames are converted.
     frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sensor
-        As in the format; None: not written.
+        See `CameraFile`; None: not written.
     sigma_unit_m
         Metres per count of sigma; None: frames' sigma is not written.
     color_registered
-        Whether the frames' colour is what depth shows.
+        Whether colour is registered to depth.
     own_cameras
-        Whether to write each frame's camera: its lens where it is one of the kind of `camera` with
-        the same distortion, else its rays.
+        Whether to write a camera per frame: its lens if it has the model and distortion of
+        `camera`, else its rays.
 
     Attributes
     ----------
     out_of_range
-        Pixels so far whose depth or amplitude didn't fit into 16 bits (depth became invalid,
-        amplitude the largest unsaturated value).
+        Number of pixels so far whose depth or amplitude didn't fit into 16 bits (depth became
+        invalid, amplitude the largest unsaturated value).
 
     Raises
     ------
@@ -489,18 +489,20 @@ class RecordingWriter:
         Raises
         ------
         InputError
-            If the frame has another camera's size or kind, or not the channels of the first.
+            If the frame has another size, kind or set of channels than the first.
         """
-        channels = self._write_clouds if isinstance(frame, CloudFrame) else self._write_images
-        channels(frame)  # type: ignore[arg-type]
+        if isinstance(frame, CloudFrame):
+            self._write_cloud(frame)
+        else:
+            self._write_images(frame)
         self._times.append(float(frame.timestamp))
 
     def _name(self, channel: str, suffix: str) -> Path:
         return make_folder(self.folder / channel) / f"{len(self):06d}{suffix}"
 
-    def _write_clouds(self, frame: CloudFrame) -> None:
+    def _write_cloud(self, frame: CloudFrame) -> None:
         if self.camera is not None:
-            raise InputError("is a cloud", where=f"frame {frame.index}", remedy="add images only")
+            raise InputError("is a cloud", where=f"frame {frame.index}", remedy="add only images")
         self._check_channels(frame, "cloud")
         write_ply(
             self._name("cloud", ".ply"),
@@ -548,13 +550,13 @@ class RecordingWriter:
         if isinstance(common, Pinhole):
             if not isinstance(own, Pinhole) or not same_distortion(own, common):
                 raise InputError(
-                    "has another kind of lens than the first",
+                    "has another lens model than the first",
                     where=f"frame {len(self)}",
                     remedy="give a RayTable as the common camera",
                 )
             self._lenses.append((own.fx, own.fy, own.cx, own.cy))
             return
-        with replacing(self._name("rays", ".npy")) as beside, beside.open("wb") as file:
+        with replacing(self._name("rays", ".npy")) as temporary, temporary.open("wb") as file:
             np.save(file, np.asarray(own.rays(), np.float32))
 
     def _check_channels(self, frame: Frame, *names: str) -> None:
@@ -589,18 +591,18 @@ class RecordingWriter:
         imu: Mapping[str, NDArray[np.generic]] | None = None,
         frames: Mapping[str, NDArray[np.generic]] | None = None,
     ) -> Path:
-        """Write what belongs to the whole recording, camera.json last, and return the folder.
+        """Write the files of the whole recording, camera.json last, and return the folder.
 
         Parameters
         ----------
         groundtruth, odometry
             (N, 4, 4) T_world_camera of the frames added, NaN where unknown.
         correction
-            Depth correction that readers are to apply: frames were added uncorrected.
+            Depth correction for readers to apply to the frames, which were added uncorrected.
         imu
             Columns of imu.csv by name.
         frames
-            Columns of frames.csv by name, one value for each frame.
+            Columns (N,) of frames.csv by name.
 
         Raises
         ------
@@ -613,8 +615,8 @@ class RecordingWriter:
             if poses is not None:
                 write_tum(self.folder / f"{name}.txt", self._times, poses)
         if correction is not None:
-            with replacing(self.folder / "correction.npz") as beside:
-                correction.save(beside)
+            with replacing(self.folder / "correction.npz") as temporary:
+                correction.save(temporary)
         if imu is not None:
             write_columns(self.folder / "imu.csv", imu)
         if self._lenses:
@@ -627,8 +629,8 @@ class RecordingWriter:
                 )
             write_columns(self.folder / "frames.csv", frames)
         if isinstance(self.camera, RayTable):
-            with replacing(self.folder / "rays.npy") as beside:
-                np.save(beside, np.asarray(self.camera.table, np.float32))
+            with replacing(self.folder / "rays.npy") as temporary:
+                np.save(temporary, np.asarray(self.camera.table, np.float32))
         write_text(self.folder / "timestamps.txt", "".join(exact(t) + "\n" for t in self._times))
         write_text(self.folder / "camera.json", json.dumps(self._about, indent=1) + "\n")
         return self.folder

@@ -1,4 +1,4 @@
-"""Opening a recording: which reader, and one recording from several paths."""
+"""Opening a recording: choice of the reader, and joining of several paths."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from tofuse.recordings.rig import FILE_NAME, read_rig
 from tofuse.recordings.rig_source import RigSource
 from tofuse.recordings.sources import JoinedSource, LimitedSource
 
-# Recordings that only their maker's program can read: what they hold, and what to do.
+# Proprietary recordings: problem and remedy by suffix.
 CLOSED = {
     ".rrf": (
-        "holds raw phases of a pmd camera, whose layout and calibration aren't published",
+        "contains raw phases of a pmd camera, whose layout and calibration aren't published",
         "play it by pmd's Royale and export its frames as PLY (sampleExportPLY), or record the "
         "camera's ROS topics, and give those",
     ),
@@ -31,7 +31,7 @@ CLOSED = {
     ),
 }
 
-# A folder with these may be depth images whose camera is not told.
+# A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
 
 
@@ -49,28 +49,28 @@ def open_recording(
     min_depth: float | None = None,
     max_depth: float | None = None,
 ) -> Recording:
-    """Open a recording, guessing its format from what lies there.
+    """Open a recording; its format is detected from names and contents.
 
     Parameters
     ----------
     paths
         Files or folders; several are joined in the order given. A folder of native or SR4000
-        recordings is one recording, joined in name order; with a rig.json beside them they are the
-        cameras of a rig, one image of each in turn.
+        recordings is joined in name order; if it contains a rig.json, they are the cameras of a
+        rig, one image of each in turn.
     format
-        Name of a reader, where guessing isn't wanted.
+        Name of a reader, instead of detection.
     camera
         A camera.json that replaces the recording's own camera.
     topic
-        Which topic of a bag holds the depth images or clouds, where guessing isn't wanted.
+        Topic of a bag with the depth images or clouds, instead of detection.
     min_depth, max_depth
-        Points nearer or farther are left out, in m: by z in images, by distance in clouds.
+        In m; nearer or farther points are dropped: by z in images, by distance in clouds.
 
     Raises
     ------
     InputError
-        If the format is unsure (with what was seen, and which option settles it), or nothing can
-        be read.
+        If the format is ambiguous (with what was found, and the option to state it), or nothing
+        can be read.
     """
     if not paths:
         raise InputError("no recording was given", remedy="give a path")
@@ -80,7 +80,7 @@ def open_recording(
         rig = _rig_source(Path(paths[0]), format, options)
         if min_depth is not None or max_depth is not None:
             raise InputError(
-                "have no meaning for a rig", where="min_depth, max_depth", remedy="leave them out"
+                "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
             )
         return Recording.of(rig, str(paths[0]), "rig")
     for path in paths:
@@ -100,7 +100,7 @@ def open_recording(
 
 
 def is_rig_folder(path: str | Path) -> bool:
-    """Whether a path is a folder of recordings of a rig's cameras, with a rig.json beside them."""
+    """Whether a path is a folder with a rig.json and a recording of each camera of the rig."""
     path = Path(path)
     return is_folder(path) and is_file(path / FILE_NAME)
 
@@ -110,7 +110,7 @@ def _rig_source(
     format: str | None,  # noqa: A002
     options: ReaderOptions,
 ) -> RigSource:
-    """The recordings in a rig's folder, each in a folder called as its camera."""
+    """The recordings in a rig's folder, each in a folder named after its camera."""
     rig = read_rig(folder / FILE_NAME)
     recordings = []
     for camera in rig.cameras:
@@ -119,11 +119,11 @@ def _rig_source(
             raise InputError(
                 f"has no recording of the camera {camera.name!r}",
                 where=folder,
-                remedy=f"put it into {path}, or take the camera out of {FILE_NAME}",
+                remedy=f"put it into {path}, or remove the camera from {FILE_NAME}",
             )
         found = _resolve(path, format)
         if len(found) > 1:
-            raise InputError("holds several recordings", where=path, remedy="leave one")
+            raise InputError("contains several recordings", where=path, remedy="leave one")
         source = found[0].reader.open(found[0].path, options)
         _check_usable(source, path)
         recordings.append(Recording.of(source, path, name_of(found[0].reader)))
@@ -131,42 +131,42 @@ def _rig_source(
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Located:
     path: Path
     reader: Reader
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse what can't be read to its end: reading it could wait for ever."""
+    """Refuse special files such as pipes: reading them could block for ever."""
     try:
-        odd = path.exists() and not path.is_file() and not path.is_dir()
+        special = path.exists() and not path.is_file() and not path.is_dir()
     except (OSError, ValueError):
-        return  # told where it is opened
-    if odd:
+        return  # reported when it is opened
+    if special:
         raise InputError(
             "is neither a file nor a folder", where=path, remedy="give a recording's path"
         )
 
 
-def _resolve(path: Path, format: str | None) -> list[_Found]:  # noqa: A002
-    """Return the recordings at a path, each with its reader."""
+def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
+    """The recordings at a path, each with its reader."""
     try:
         path.stat()
     except OSError as error:
         raise input_error(error, path) from error
     except ValueError as error:
-        raise InputError(f"is no path ({error})", where=repr(str(path))) from error
+        raise InputError(f"is not a path ({error})", where=repr(str(path))) from error
     children = list_folder(path) if path.is_dir() else []
     if path.is_dir() and not children:
         raise InputError("is an empty folder", where=path, remedy="give a recording")
     if format is not None:
         return _resolve_as(path, format)
     sniffs = _sniff(path)
-    # A camera.json or a format's own names outweigh a cloud that lies beside them.
+    # A camera.json or names of one format outweigh a cloud in the same folder.
     best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
     sure = {n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, SURE)}
     if len(sure) == 1:
-        return [_Found(path, readers()[next(iter(sure))])]
+        return [_Located(path, readers()[next(iter(sure))])]
     if len(sure) > 1:
         saw = "; ".join(f"{name}: {sniff.saw}" for name, sniff in sure.items())
         raise InputError(
@@ -183,7 +183,7 @@ def _resolve(path: Path, format: str | None) -> list[_Found]:  # noqa: A002
     raise _unsure(path, sniffs, children)
 
 
-def _resolve_as(path: Path, format: str) -> list[_Found]:  # noqa: A002
+def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
     choices = readers()
     if format not in choices:
         raise InputError(
@@ -195,8 +195,8 @@ def _resolve_as(path: Path, format: str) -> list[_Found]:  # noqa: A002
     if reader.joinable and path.is_dir() and reader.sniff(path) is None:
         parts = [p for p in list_folder(path) if is_folder(p) and reader.sniff(p) is not None]
         if parts:
-            return [_Found(p, reader) for p in parts]
-    return [_Found(path, reader)]
+            return [_Located(p, reader) for p in parts]
+    return [_Located(path, reader)]
 
 
 def _sniff(path: Path) -> dict[str, Sniff]:
@@ -204,8 +204,8 @@ def _sniff(path: Path) -> dict[str, Sniff]:
     return {name: sniff for name, sniff in found.items() if sniff is not None}
 
 
-def _parts(path: Path) -> list[_Found]:
-    """Return the recordings in a folder, if they are one recording together; else refuse."""
+def _parts(path: Path) -> list[_Located]:
+    """The recordings in a folder, if any; InputError if they can't be joined."""
     if not is_folder(path):
         return []
     found: dict[Path, str] = {}
@@ -223,35 +223,33 @@ def _parts(path: Path) -> list[_Found]:
     reader = readers()[formats[0]]
     if len(formats) > 1 or not reader.joinable:
         raise InputError(
-            f"holds several recordings: {listed}",
+            f"contains several recordings: {listed}",
             where=path,
             remedy="give the one you mean, or several in their order",
         )
-    return [_Found(p, reader) for p in found]
+    return [_Located(p, reader) for p in found]
 
 
 def _unsure(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
     if sniffs:
         saw = "; ".join(dict.fromkeys(sniff.saw for sniff in sniffs.values()))
-        settle = [sniff.settle or f"give --format {name}" for name, sniff in sniffs.items()]
+        remedies = [sniff.remedy or f"give --format {name}" for name, sniff in sniffs.items()]
         return InputError(
-            f"isn't surely a recording: there is {saw}",
+            f"may not be a recording: there is {saw}",
             where=path,
-            remedy=", or ".join(dict.fromkeys(settle)),
+            remedy=", or ".join(dict.fromkeys(remedies)),
         )
     remedy = "check the path"
     if path.is_dir():
         kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
         saw = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
-        what = f"is no recording that is known: there are {saw}"
+        problem = f"is not a recording of a known format: there are {saw}"
         if any(kind.lower() in _IMAGES for kind in kinds):
-            remedy = (
-                "put the depth images into a folder depth/ in it, and a camera.json beside that"
-            )
+            remedy = "put the depth images into a folder depth/ in it, next to a camera.json"
     else:
-        what = f"is no recording that is known: a file with the suffix {path.suffix!r}"
+        problem = f"is not a recording of a known format: a file with the suffix {path.suffix!r}"
     return InputError(
-        what, where=path, remedy=f"{remedy}, or give --format ({', '.join(readers())})"
+        problem, where=path, remedy=f"{remedy}, or give --format ({', '.join(readers())})"
     )
 
 
@@ -261,14 +259,14 @@ def _check_depths(nearest: float | None, farthest: float | None) -> None:
             raise InputError(f"is {value}", where=name, remedy="give metres, 0 or more")
     if nearest is not None and farthest is not None and nearest >= farthest:
         raise InputError(
-            f"{nearest} and {farthest} leave nothing",
+            f"{nearest} and {farthest} leave no points",
             where="--min-depth, --max-depth",
             remedy="give the smaller first",
         )
 
 
 def _check_usable(source: Source, path: str | Path) -> None:
-    """Refuse a recording of which no frame can be read; stops at the first that can."""
+    """Refuse a recording without a readable frame; stops at the first readable one."""
     first: UnreadableFrameError | None = None
     for index in range(len(source.timestamps)):
         try:
@@ -288,21 +286,21 @@ def _check_usable(source: Source, path: str | Path) -> None:
 
 
 def _short_names(paths: list[Path]) -> list[str]:
-    """Return the last part of each path, or all of it where that isn't unique."""
+    """The last part of each path, or whole paths if these are not unique."""
     names = [p.name for p in paths]
     return names if len(set(names)) == len(names) else [str(p) for p in paths]
 
 
 def read_reference(path: str | Path) -> TimedPoses:
-    """Read the reference poses in a file, or those that a recording of any format comes with.
+    """Read reference poses from a trajectory file, or from a recording of any format.
 
     Raises
     ------
     InputError
-        If it can't be read, or the recording comes with no reference.
+        If it can't be read, or the recording has no reference poses.
     """
     path = Path(path)
-    if not path.is_dir() or (path / "groundtruth.txt").is_file():  # then the images don't matter
+    if not path.is_dir() or (path / "groundtruth.txt").is_file():  # the images are not needed then
         try:
             return read_poses(path / "groundtruth.txt" if path.is_dir() else path)
         except InputError as no_trajectory:
@@ -321,7 +319,7 @@ def read_reference(path: str | Path) -> TimedPoses:
     poses = recording.reference
     if poses is None or not np.isfinite(poses).all((1, 2)).any():
         raise InputError(
-            "comes with no reference poses",
+            "has no reference poses",
             where=path,
             remedy="give a trajectory, such as TUM's (timestamp tx ty tz qx qy qz qw)",
         )

@@ -15,34 +15,34 @@ UNSURE = 0.5
 
 @dataclass(frozen=True)
 class Sniff:
-    """What a reader makes of a path at first sight.
+    """A reader's guess whether a path has its format.
 
     Attributes
     ----------
     confidence
-        0 to 1; a path is opened unasked only from `SURE` on. 1 is for names and contents that
+        0 to 1; a path is opened automatically from `SURE` on. 1 is for names and contents that
         no other format has.
     saw
-        What speaks for it, for messages.
-    settle
-        What a person should do where the reader isn't sure.
+        The evidence, for messages.
+    remedy
+        What to do if the confidence is below `SURE`.
     """
 
     confidence: float
     saw: str
-    settle: str = ""
+    remedy: str = ""
 
 
 @dataclass(frozen=True)
 class ReaderOptions:
-    """What a person may add to what lies on disk.
+    """What the user may state in addition to the recording.
 
     Attributes
     ----------
     camera
         A camera.json that replaces the recording's own.
     topic
-        Of a bag, where the guessed one isn't wanted.
+        Of a bag, instead of the detected one.
     """
 
     camera: Path | None = None
@@ -50,19 +50,19 @@ class ReaderOptions:
 
 
 class Reader(Protocol):
-    """Reads one format. Registered by ``@part("reader", name)`` in a module of `readers`.
+    """A reader of one format, registered by ``@part("reader", name)`` in a module of `readers`.
 
     Attributes
     ----------
     joinable
-        Whether a folder of such recordings is one recording, joined in name order.
+        Whether a folder of such recordings is joined to one recording, in name order.
     """
 
     part_kind: ClassVar[str] = "reader"
     joinable: ClassVar[bool]
 
     def sniff(self, path: Path) -> Sniff | None:
-        """Look at names and first bytes; None if it is something else. Raises no errors."""
+        """Detect the format from names and first bytes; None if it is another one. Never raises."""
         ...
 
     def open(self, path: Path, options: ReaderOptions) -> Source:
@@ -71,16 +71,16 @@ class Reader(Protocol):
         Raises
         ------
         InputError
-            If it can't be used as a whole.
+            If the recording as a whole is unusable.
         """
         ...
 
 
 def refuse_camera(options: ReaderOptions, name: str) -> None:
-    """Raise InputError if a camera was given for a format that brings its own points."""
+    """Raise InputError if a camera was given for the format `name`, which stores points."""
     if options.camera is not None:
         raise InputError(
-            f"means nothing for the format {name!r}, which stores points",
+            f"does not apply to the format {name!r}, which stores points",
             where="--camera",
             remedy="leave it out",
         )

@@ -21,7 +21,7 @@ def file_of(path: Path, *suffixes: str) -> Path | None:
     return files[0] if len(files) == 1 else None
 
 
-def needed_file(path: Path, *suffixes: str) -> Path:
+def required_file(path: Path, *suffixes: str) -> Path:
     """Return what `file_of` returns, or any file that was given by name; refuse the rest."""
     found = file_of(path, *suffixes)
     if found is not None:

@@ -1,4 +1,4 @@
-"""What the readers share: a base for sources over files, poses beside frames, joining, limits."""
+"""Sources for readers: files, pose files, joined recordings and depth limits."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.recordings.frames import CloudFrame, Frame, RangeFrame
 from tofuse.recordings.recording import Source
 
-FARTHEST_M = 1e9  # beyond it, a coordinate is damage
+FARTHEST_M = 1e9  # larger coordinates are considered damaged
 
 
 class FileSource(ABC):
-    """A source whose frames are files; any trouble with one of them is that frame's alone.
+    """A source whose frames are files; an error in one of them affects only its frame.
 
     Attributes
     ----------
     concurrent
-        Whether frames can be read by several threads at once: `load` changes nothing.
+        Whether several threads can read frames concurrently: `load` has no side effects.
     """
 
     concurrent = False
@@ -48,10 +48,9 @@ class FileSource(ABC):
         """Read frame `index`; raise InputError if it can't be read."""
 
     def whole_color(self, index: int) -> UInt8 | None:
-        """Return the colour of a frame as large as it was recorded, if it shows what depth shows.
+        """Return the colour of a frame at its recorded resolution, if it has the view of depth.
 
-        (H, W, 3) RGB of the same view as depth, at another resolution; None where there is none.
-        Raise InputError if it can't be read.
+        (H, W, 3) RGB, or None if there is none. Raise InputError if it can't be read.
         """
         return None
 
@@ -66,17 +65,17 @@ class FileSource(ABC):
                 error.problem, where=error.where, remedy=error.remedy
             ) from error
         except MemoryError as error:
-            raise UnreadableFrameError("needs more memory than there is") from error
+            raise UnreadableFrameError("needs more memory than is available") from error
 
 
 def tum_poses(source: FileSource, path: Path) -> Float64:
-    """Poses (N, 4, 4) of a TUM file at the source's timestamps, NaN where none is within 0.02 s."""
+    """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN if none is near."""
     times, poses = read_tum(path)
     out = associated_poses(source.timestamps, times, poses)
-    found = int(np.isfinite(out[:, 0, 0]).sum())
-    if found < len(out):
+    posed = int(np.isfinite(out[:, 0, 0]).sum())
+    if posed < len(out):
         source.warnings.append(
-            f"{path}: {found} of {len(out)} frames have a pose within 0.02 s of their timestamp"
+            f"{path}: {posed} of {len(out)} frames have a pose within 0.02 s of their timestamp"
         )
     return out
 
@@ -84,7 +83,7 @@ def tum_poses(source: FileSource, path: Path) -> Float64:
 def poses_beside(
     source: FileSource, files: Sequence[Path], read: Callable[[Path], Float64]
 ) -> Float64:
-    """Poses (N, 4, 4) from one file for each frame; NaN, and a warning, where one can't be read."""
+    """Return (N, 4, 4) poses from one file per frame; NaN, and a warning, if one can't be read."""
     poses = np.full((len(files), 4, 4), np.nan)
     errors = []
     for k, path in enumerate(files):
@@ -99,9 +98,9 @@ def poses_beside(
 
 
 def read_matrix_pose(table: Float64, where: str) -> Float64:
-    """Check a (4, 4) pose read from a file, and make its rotation one to machine precision.
+    """Check a (4, 4) pose of a file, and orthonormalise its rotation.
 
-    Not-a-number or infinite entries, which trackers write where they were lost, give NaN.
+    Non-finite entries, which trackers write where they are lost, give NaN.
     """
     if table.shape != (4, 4):
         raise InputError(
@@ -115,7 +114,7 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
 
 
 def read_timestamps(path: Path, count: int, things: str, warnings: list[str]) -> Float64:
-    """Read timestamps.txt: a time in seconds for each of so many images or clouds."""
+    """Read a timestamps.txt: (N,) seconds for `count` images or clouds (`things`)."""
     table = read_numbers(path)
     if table.shape != (count, 1):
         raise InputError(
@@ -129,7 +128,7 @@ def read_timestamps(path: Path, count: int, things: str, warnings: list[str]) ->
 
 
 def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
-    """Refuse timestamps that are not finite; warn of those that repeat or go back."""
+    """Raise InputError if timestamps are not finite; warn if they repeat or decrease."""
     if not np.isfinite(times).all():
         k = int(np.argmin(np.isfinite(times)))
         raise InputError(
@@ -138,17 +137,14 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
     steps = np.diff(times)
     if (steps < 0).any():
         k = int(np.argmax(steps < 0)) + 1
-        warnings.append(f"{path}: time goes back at frame {k}; frames stay in the order of files")
+        warnings.append(f"{path}: time decreases at frame {k}; frames stay in the order of files")
     elif (steps == 0).any():
         k = int(np.argmax(steps == 0)) + 1
-        warnings.append(f"{path}: frames {k - 1} and {k} have the same time")
+        warnings.append(f"{path}: frames {k - 1} and {k} have the same timestamp")
 
 
 def ply_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
-    """Read a PLY cloud as a view; points that are not finite are dropped.
-
-    `shift` (3,) is taken off the coordinates, m.
-    """
+    """Read a PLY cloud; non-finite points are dropped, and `shift` (3,) in m is subtracted."""
     ply = read_ply(path)
     dtype: type[np.floating] = np.float32 if shift is None else np.float64
     return cloud_frame(
@@ -173,21 +169,21 @@ def cloud_frame(
     origin: Float64 | None = None,
     shift: Float64 | None = None,
 ) -> CloudFrame:
-    """Make a view of (N, 3) points and what is known of each, dropping what is no measurement.
+    """Return a cloud of (N, 3) points in m with columns (N, ...), without invalid points.
 
-    `shift` (3,) is taken off the points, in their own precision, and off the `origin`.
+    `shift` (3,) is subtracted from the points, in their own precision, and from the `origin` (3,).
     """
-    # Not-a-number compares false; what is left has squares that float32 can hold.
+    # False for NaN; the squares of the remaining coordinates fit into float32.
     measured = np.asarray((np.abs(points) < FARTHEST_M).all(1))
     if shift is not None:
         points = points - shift
         origin = None if origin is None else origin - shift
     with np.errstate(over="ignore", invalid="ignore"):
-        near = points.astype(np.float32, copy=False)
+        shifted = points.astype(np.float32, copy=False)
     frame = CloudFrame(
         index,
         timestamp,
-        near,
+        shifted,
         normals,
         amplitude=amplitude,
         color=color,
@@ -197,7 +193,7 @@ def cloud_frame(
 
 
 class JoinedSource:
-    """Several sources one after the other."""
+    """Several sources in sequence."""
 
     def __init__(self, parts: Sequence[Source], names: Sequence[str]) -> None:
         self.parts = list(parts)
@@ -211,7 +207,7 @@ class JoinedSource:
         self.gravity = _joined([p.gravity for p in self.parts], counts, (4,))
         self.metadata: dict[str, Any] = dict(self.parts[0].metadata)
         for part in self.parts[1:]:
-            # Only what holds for all of them.
+            # Only facts that are common to all of them.
             self.metadata = {
                 key: value
                 for key, value in self.metadata.items()
@@ -231,7 +227,7 @@ class JoinedSource:
                 step = float(np.median(steps)) if len(steps) else 1.0
                 shift = last + max(step, 1e-3) - float(own.min())
                 own = own + shift
-                self.warnings.append(f"{name}: starts anew in time, moved on by {shift:.6g} s")
+                self.warnings.append(f"{name}: timestamps start again, shifted by {shift:.6g} s")
             times.append(own)
         return np.concatenate(times)
 
@@ -243,7 +239,7 @@ class JoinedSource:
 
 
 def _joined_warnings(parts: Sequence[Source], names: Sequence[str]) -> list[str]:
-    """Return the parts' warnings, each once, naming the part where they differ."""
+    """The parts' warnings, each once, naming the part where they differ."""
     lines: dict[str, list[str]] = {}
     for part, name in zip(parts, names, strict=True):
         for line in part.warnings:
@@ -264,7 +260,7 @@ def _joined(
 
 
 class LimitedSource:
-    """A source with only the points between two depths: z of images, distance in clouds."""
+    """A source restricted to points between two depths in m: z of images, distance in clouds."""
 
     def __init__(self, source: Source, nearest: float, farthest: float) -> None:
         self.source, self.nearest, self.farthest = source, nearest, farthest

@@ -1,9 +1,9 @@
-"""Where the camera stood still, and one better frame of each such stretch.
+"""Detection of stationary intervals, and one averaged frame for each.
 
-Noise is independent from pixel to pixel, or nearly so; motion moves neighbouring pixels alike.
-Both are told apart by averaging frame differences over blocks of two sizes: the variance of block
-means falls with the block's area for noise, and not at all for motion. No threshold in metres is
-needed, so the test holds for a camera of any noise.
+Noise is nearly independent between pixels; motion changes neighbouring pixels alike. They are
+distinguished by averaging frame differences over blocks of two sizes: the variance of block means
+is inversely proportional to the block's area for noise, and does not depend on it for motion. No
+threshold in metres is needed, so the test applies to cameras of any noise.
 """
 
 from __future__ import annotations
@@ -22,83 +22,83 @@ from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.noise import NoiseModel
 
-# Motion below these shares of the noise of a pixel is no motion.
+# Below these fractions of a pixel's noise, and of the blocks, nothing has moved.
 _COHERENT = 0.15
-_MOVED_BLOCK, _MOVED_SHARE = 0.6, 0.03
-_LEAST_PIXELS = 100
-_RATIO = 3  # side of a large block in small ones
-_OUTLIER = 3.0
-_MOST_FRAMES = 48
+_MOVED_BLOCK, _MOVED_FRACTION = 0.6, 0.03
+_MIN_PIXELS = 100
+_RATIO = 3  # of the side of a large block to that of a small one
+_OUTLIER_SIGMAS = 3.0
+_MAX_FRAMES = 48
 _NORMAL_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What changed between two images, as shares of the noise of the difference of a pixel.
+class ImageChange:
+    """The change between two images, relative to the noise of a pixel's difference.
 
     Attributes
     ----------
     coherent
-        Standard deviation of what whole blocks have in common: motion of the camera.
-    moved_share
-        Share of the blocks that changed clearly: motion of things.
+        Standard deviation of the change that whole blocks have in common: camera motion.
+    moved_fraction
+        Fraction of the blocks that changed significantly: object motion.
     identical
-        Whether nothing at all changed: a copy.
+        Whether the images are equal: a repeated frame.
     """
 
     coherent: float
-    moved_share: float
+    moved_fraction: float
     identical: bool = False
 
     @property
     def still(self) -> bool:
-        """Whether neither camera nor things moved by more than the noise hides."""
-        return self.coherent < _COHERENT and self.moved_share < _MOVED_SHARE
+        """Whether neither camera nor objects moved by more than the noise."""
+        return self.coherent < _COHERENT and self.moved_fraction < _MOVED_FRACTION
 
 
-def motion_between(a: RangeFrame, b: RangeFrame, model: NoiseModel) -> Motion:
-    """Measure what changed from one frame of a camera to another.
+def change_between(a: RangeFrame, b: RangeFrame, model: NoiseModel) -> ImageChange:
+    """Measure the change from one frame of a camera to another.
 
     Parameters
     ----------
     a, b
-        Frames of one size.
+        Frames of the same size.
     model
-        Only says which pixels are noisier than others.
+        Used only for the relative noise of the pixels.
     """
     if a.depth.shape != b.depth.shape:
-        return Motion(1.0, 1.0)
+        return ImageChange(1.0, 1.0)
     both = a.valid & b.valid
-    if both.sum() < _LEAST_PIXELS:
-        return Motion(1.0, 1.0)
+    if both.sum() < _MIN_PIXELS:
+        return ImageChange(1.0, 1.0)
     sigma = np.where(both, model.sigma(a), 1)
     change = np.where(both, b.radial_range - a.radial_range, 0)
-    found = [_coherence(change / sigma, both)]
+    changes = [_coherence(change / sigma, both)]
     if a.amplitude_image is not None and b.amplitude_image is not None:
-        lit = both & _lit(a.amplitude_image) & _lit(b.amplitude_image)
-        if lit.sum() >= _LEAST_PIXELS:
-            ratio = np.where(lit, b.amplitude_image, 1) / np.where(lit, a.amplitude_image, 1)
+        usable = both & _usable(a.amplitude_image) & _usable(b.amplitude_image)
+        if usable.sum() >= _MIN_PIXELS:
+            ratio = np.where(usable, b.amplitude_image, 1) / np.where(usable, a.amplitude_image, 1)
             change = np.log(ratio)
             # Exposure changes all pixels alike.
-            change -= np.median(change[lit])
-            # The phasor's noise is as large across as along: range and log of amplitude alike.
-            found.append(_coherence(change / sigma, lit))
-    return Motion(
-        max(m.coherent for m in found),
-        max(m.moved_share for m in found),
-        all(m.identical for m in found),
+            change -= np.median(change[usable])
+            # The noise of the phasor is isotropic: equal for range and log amplitude.
+            changes.append(_coherence(change / sigma, usable))
+    return ImageChange(
+        max(m.coherent for m in changes),
+        max(m.moved_fraction for m in changes),
+        all(m.identical for m in changes),
     )
 
 
-def _lit(amplitude: Float32) -> Bool:
+def _usable(amplitude: Float32) -> Bool:
     return np.asarray((amplitude > 0) & (amplitude < SATURATED_AMPLITUDE))
 
 
-def _coherence(change: NDArray[Any], ok: Bool) -> Motion:
-    """Measure what blocks of a difference image (H, W), in units of its noise, have in common."""
+def _coherence(change: NDArray[Any], ok: Bool) -> ImageChange:
+    """The coherent part of a difference image (H, W) in units of its noise."""
     values = np.abs(change[ok])
     if not values.any():
-        return Motion(0.0, 0.0, identical=True)
+        return ImageChange(0.0, 0.0, identical=True)
     typical = float(np.median(values)) / _NORMAL_MEDIAN
     limit = 2.5 * typical if typical > 0 else float(values.max())
     clipped = np.where(ok, np.clip(change, -limit, limit), 0).astype(float)
@@ -107,18 +107,18 @@ def _coherence(change: NDArray[Any], ok: Bool) -> Motion:
     fine = _block_means(clipped, ok, small)
     coarse = _block_means(clipped, ok, small * _RATIO)
     if len(coarse) < 4:
-        return Motion(1.0, 1.0)
+        return ImageChange(1.0, 1.0)
     of_fine, of_coarse = (float((x**2).mean()) for x in (fine, coarse))
     area = _RATIO * _RATIO
     common = max(area * of_coarse - of_fine, 0.0) / (area - 1)
-    # A block at an edge that flickers is noisier than others, and its mean with it.
+    # Blocks at flickering edges are noisier, and so are their means.
     own = np.maximum(_block_means(clipped**2, ok, small * _RATIO), noise**2)
     moved = float((coarse**2 > _MOVED_BLOCK**2 * own).mean())
-    return Motion(float(np.sqrt(common)) / noise, moved)
+    return ImageChange(float(np.sqrt(common)) / noise, moved)
 
 
 def _block_means(values: Float64, ok: Bool, size: int) -> Float64:
-    """Return the means of the square blocks that are at least half valid."""
+    """Means of the square blocks that are at least half valid."""
     rows, columns = values.shape[0] // size, values.shape[1] // size
 
     def sums(x: NDArray[Any]) -> Float64:
@@ -130,22 +130,24 @@ def _block_means(values: Float64, ok: Bool, size: int) -> Float64:
     return sums(values)[full] / count[full]
 
 
-def still_stretches(recording: Recording, model: NoiseModel | None = None) -> list[tuple[int, int]]:
-    """Cut a recording into stretches in which nothing moves.
+def stationary_intervals(
+    recording: Recording, model: NoiseModel | None = None
+) -> list[tuple[int, int]]:
+    """Split a recording into intervals in which nothing moves.
 
-    A stretch lasts as long as no frame differs from its first one, so that slow motion can't add
-    up. Frames that can't be read, clouds, and frames in motion are stretches of their own.
+    An interval lasts while no frame differs from its first one, so that slow motion can't
+    accumulate. Unreadable frames, clouds, and frames in motion are intervals of one frame.
 
     Parameters
     ----------
     recording
-        Is read once.
+        Read once.
     model
-        Its noise; chosen by `noise_model_for` if not given.
+        Its noise; by `noise_model_for` unless given.
 
     Returns
     -------
-    (start, stop) positions in the recording, in order, without gaps.
+    (start, stop) positions in the recording, contiguous.
     """
     model = model or noise_model_for(recording)
     out: list[tuple[int, int]] = []
@@ -153,7 +155,7 @@ def still_stretches(recording: Recording, model: NoiseModel | None = None) -> li
     for k, item in enumerate(recording.read_all()):
         frame = item if isinstance(item, RangeFrame) else None
         if k > 0 and not (
-            first is not None and frame is not None and motion_between(first, frame, model).still
+            first is not None and frame is not None and change_between(first, frame, model).still
         ):
             out.append((start, k))
             start, first = k, None
@@ -163,32 +165,31 @@ def still_stretches(recording: Recording, model: NoiseModel | None = None) -> li
 
 
 def average_still(recording: Recording, model: NoiseModel | None = None) -> Recording:
-    """Replace each still stretch by one frame with less noise.
+    """Replace each stationary interval by one averaged frame.
 
-    A frame of the result has the timestamp and reference poses of the middle of its stretch, and
-    a sigma that fell with the root of the number of measurements. Frames in motion stay as they
-    are.
+    It has the timestamp and reference pose of the middle of the interval, and a sigma that is
+    divided by the square root of the number of measurements. Frames in motion are unchanged.
 
     Parameters
     ----------
     recording
-        Is read once now, and each stretch again when its frame is read.
+        Read once now, and each interval again when its frame is read.
     model
-        Its noise; chosen by `noise_model_for` if not given.
+        Its noise; by `noise_model_for` unless given.
     """
     model = model or noise_model_for(recording)
-    source = _AveragedSource(recording, still_stretches(recording, model), model)
+    source = _AveragedSource(recording, stationary_intervals(recording, model), model)
     return Recording.of(source, recording.path, recording.format)
 
 
 class _AveragedSource:
-    """A source with one frame for each stretch of another."""
+    """A source with one frame for each interval of another."""
 
     def __init__(
-        self, recording: Recording, stretches: Sequence[tuple[int, int]], model: NoiseModel
+        self, recording: Recording, intervals: Sequence[tuple[int, int]], model: NoiseModel
     ) -> None:
-        self._recording, self._stretches, self._model = recording, list(stretches), model
-        middle = np.array([(a + b - 1) // 2 for a, b in stretches], np.intp)
+        self._recording, self._intervals, self._model = recording, list(intervals), model
+        middle = np.array([(a + b - 1) // 2 for a, b in intervals], np.intp)
         self.timestamps: Float64 = recording.timestamps[middle]
         reference, odometry = recording.reference, recording.odometry
         gravity = recording.gravity
@@ -197,17 +198,17 @@ class _AveragedSource:
         self.gravity = None if gravity is None else gravity[middle]
         self.metadata: dict[str, Any] = {
             **recording.metadata,
-            "averaged": [b - a for a, b in stretches],
+            "averaged": [b - a for a, b in intervals],
         }
         self.warnings = list(recording.warnings)
-        if len(stretches) < len(recording):
+        if len(intervals) < len(recording):
             self.warnings.append(
-                f"{len(recording)} frames averaged to {len(stretches)}, where nothing moved"
+                f"{len(recording)} frames averaged to {len(intervals)} in stationary intervals"
             )
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
-        start, stop = self._stretches[index]
+        start, stop = self._intervals[index]
         time = float(self.timestamps[index])
         if stop - start == 1:
             return replace(self._recording[start], index=index, timestamp=time)
@@ -215,26 +216,26 @@ class _AveragedSource:
         return replace(average_of(frames, self._model), index=index, timestamp=time)
 
     def _frames(self, start: int, stop: int) -> Iterator[RangeFrame]:
-        """Read a stretch, or as many frames of it, evenly spread, as are worth their memory."""
-        for k in np.unique(np.linspace(start, stop - 1, _MOST_FRAMES).round().astype(int)):
+        """Read up to `_MAX_FRAMES` evenly spaced frames of an interval."""
+        for k in np.unique(np.linspace(start, stop - 1, _MAX_FRAMES).round().astype(int)):
             frame = self._recording[int(k)]
             if isinstance(frame, RangeFrame):
                 yield frame
 
 
 def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
-    """Make one frame of several that show the same.
+    """Average frames of a static view.
 
     Depth is the mean of the measurements within three sigmas of the pixel's median, where at least
-    half of the frames have one; amplitude and colour are means, confidence is the highest. Copies
-    of the frame before add nothing, and are left out.
+    half of the frames have one; amplitude and colour are means, confidence is the maximum. Repeated
+    frames are ignored.
 
     Parameters
     ----------
     frames
-        At least one, of one size, in order.
+        At least one, of the same size, in order.
     model
-        Gives the sigma of each frame, and so of the mean.
+        Noise model, for the sigma of each frame and so of the mean.
     """
     frames = [
         f
@@ -250,9 +251,9 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
     count = valid.sum(0)
     centre = _median(depth, valid, count)
     off = np.abs(depth - centre)
-    # How much noisier than the model these frames are, that no good value is called an outlier.
-    wrong = float(np.median(off[valid] / sigma[valid])) / _NORMAL_MEDIAN if valid.any() else 1.0
-    near = valid & (off <= _OUTLIER * max(wrong, 1.0) * sigma)
+    # Scale of the actual noise relative to the model, so that inliers are not rejected.
+    scale = float(np.median(off[valid] / sigma[valid])) / _NORMAL_MEDIAN if valid.any() else 1.0
+    near = valid & (off <= _OUTLIER_SIGMAS * max(scale, 1.0) * sigma)
     kept = near.sum(0)
     enough = (2 * count >= len(frames)) & (kept > 0)
     number = np.maximum(kept, 1)
@@ -272,7 +273,7 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
 
 
 def _median(depth: Float32, valid: Bool, count: Intp) -> Float32:
-    """Return the median (H, W) over the valid values of each pixel of (N, H, W); 0 without any."""
+    """The median (H, W) of the valid values of each pixel of (N, H, W); 0 without any."""
     ordered = np.sort(np.where(valid, depth, np.inf), axis=0)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]
     high = np.take_along_axis(ordered, np.minimum(count // 2, len(depth) - 1)[None], axis=0)[0]
@@ -280,7 +281,7 @@ def _median(depth: Float32, valid: Bool, count: Intp) -> Float32:
 
 
 def _mean_camera(frames: Sequence[RangeFrame]) -> Camera:
-    """Return the camera of all frames, or the mean of their ray tables where each has its own."""
+    """The common camera of all frames, or the mean of their ray tables."""
     if all(f.camera is frames[0].camera for f in frames):
         return frames[0].camera
     rays = np.stack([f.camera.rays() for f in frames]).astype(float)
@@ -291,7 +292,7 @@ def _mean_camera(frames: Sequence[RangeFrame]) -> Camera:
 
 
 def _mean_amplitude(frames: Sequence[RangeFrame], near: Bool) -> Float32 | None:
-    """Return the mean over the frames whose depth was used; saturated where most of them are."""
+    """The mean over the frames whose depth was used; saturated where most of them are."""
     images = [f.amplitude_image for f in frames if f.amplitude_image is not None]
     if len(images) < len(frames):
         return None

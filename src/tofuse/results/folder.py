@@ -24,9 +24,9 @@ from tofuse.files.locking import Claim
 from tofuse.files.moving import (
     Names,
     check_error,
-    check_stopped,
+    check_interrupted,
     clear,
-    is_stopped,
+    is_interrupted,
     move_all,
     places,
     recover,
@@ -162,8 +162,8 @@ class OutputFolder:
         if self.path.exists() and not self.path.is_dir():
             raise OutputError("is a file", where=self.path, remedy="pass a folder as --out")
         contract = self._contract
-        if is_stopped(self._staging):
-            check_stopped(self._staging, self._names, contract.marker)
+        if is_interrupted(self._staging):
+            check_interrupted(self._staging, self._names, contract.marker)
             if any(contract.is_ours(place) for place in places(self._staging, self.path)):
                 return
         entries = {p.name for p in self.path.iterdir()} if self.path.exists() else set()
@@ -216,7 +216,7 @@ class OutputFolder:
         return path if path.is_relative_to(self.path) else self.path / path.name
 
     def _clear(self) -> None:
-        if self._claim is not None and not is_stopped(self._staging):
+        if self._claim is not None and not is_interrupted(self._staging):
             clear(self._staging, self._names)
 
     def discard(self) -> None:
@@ -273,9 +273,9 @@ def claimed(folder: Path) -> Iterator[None]:
 def _recover(folder: Path, contract: Contract) -> None:
     """Finish the moves of an interrupted process."""
     staging = folder / STAGING
-    if not is_stopped(staging):
+    if not is_interrupted(staging):
         return
-    check_stopped(staging, contract.names, contract.marker)
+    check_interrupted(staging, contract.names, contract.marker)
     if not any(contract.is_ours(place) for place in places(staging, folder)):
         raise check_error(folder)
     recover(staging, folder, contract.names, contract.marker)
@@ -298,7 +298,7 @@ def finish_interrupted(folder: Path, contract: Contract | None = None) -> None:
         If another process is moving a result into place, or interrupted moves can't be finished.
     """
     staging = folder / STAGING
-    if not is_stopped(staging):
+    if not is_interrupted(staging):
         return
     contract = contract or RESULT
     try:

@@ -19,7 +19,7 @@ from tofuse.posegraph.views import KeptView
 from tofuse.recordings.background import FarSurface, far_surface
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
-from tofuse.recordings.still import average_of, motion_between
+from tofuse.recordings.still import average_of, change_between
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.rigs.clocks import lag_between
 from tofuse.rigs.inputs import Camera
@@ -75,7 +75,7 @@ def stands_still(camera: Camera) -> bool:
     frames = camera.images(_LOOKED_AT)
     if len(frames) < 3:
         model = noise_model_for(camera.recording)
-        return len(frames) < 2 or motion_between(frames[0], frames[1], model).still
+        return len(frames) < 2 or change_between(frames[0], frames[1], model).still
     return bool(_unchanged(frames) >= _STILL_PIXELS)
 
 
@@ -85,7 +85,7 @@ def _unchanged(frames: Sequence[RangeFrame]) -> float:
     seen = np.isfinite(far.z) & (far.z > 0)
     valid = np.mean([f.valid for f in frames], axis=0) > 0.5
     asked = valid | seen
-    return float((far.share[asked] >= _STILL_FRAMES).mean()) if asked.any() else 1.0
+    return float((far.static_fraction[asked] >= _STILL_FRAMES).mean()) if asked.any() else 1.0
 
 
 def calibrate_still(cameras: Sequence[Camera], progress: Progress) -> StillRig:
@@ -254,7 +254,7 @@ def _something_moves(camera: Camera) -> bool:
     """Whether what a camera sees changes by more than noise."""
     frames = camera.images(_LOOKED_AT)
     model = noise_model_for(camera.recording)
-    return any(not motion_between(frames[0], f, model).still for f in frames[1:])
+    return any(not change_between(frames[0], f, model).still for f in frames[1:])
 
 
 def _average(camera: Camera) -> RangeFrame:

@@ -26,7 +26,7 @@ from tofuse.recordings.camera_file import ColorCamera, load_camera
 from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource
 
 DEPTH_UNIT_M = 0.001
@@ -126,7 +126,7 @@ class AzureKinect:
 
     def open(self, path: Path, options: ReaderOptions) -> AzureKinectSource:
         """See `Reader.open`."""
-        return AzureKinectSource(needed_file(path, ".mkv"), options)
+        return AzureKinectSource(required_file(path, ".mkv"), options)
 
 
 class AzureKinectSource(FileSource):

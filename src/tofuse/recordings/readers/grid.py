@@ -18,7 +18,7 @@ from tofuse.files.reading import is_file, is_folder, read_text
 from tofuse.files.tables import parse_numbers
 from tofuse.geometry.cameras import Camera
 from tofuse.parts import part
-from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, needed_files
+from tofuse.recordings.cloud_files import CloudFileSource, cloud_files, required_files
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.organised import (
     SAMPLES,
@@ -64,7 +64,7 @@ class Grid:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "grid")
-        files = needed_files(path, *_SUFFIXES)
+        files = required_files(path, *_SUFFIXES)
         step = max(1, len(files) // SAMPLES)
         images: list[Float32] = []
         raster: Raster | None = None

@@ -20,7 +20,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.ifm_lens import HeadInfo, checked_info, head_camera
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.readers.ifm_o3r import INVALID
-from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -55,7 +55,7 @@ class IfmH5:
     def open(self, path: Path, options: ReaderOptions) -> IfmH5Source:
         """See `Reader.open`."""
         refuse_camera(options, "ifm-h5")
-        return IfmH5Source(needed_file(path, ".h5", ".hdf5"), options.topic)
+        return IfmH5Source(required_file(path, ".h5", ".hdf5"), options.topic)
 
 
 class IfmH5Source(FileSource):

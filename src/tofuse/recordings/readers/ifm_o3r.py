@@ -17,7 +17,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.ifm_lens import HeadInfo, head_camera, read_info
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
@@ -46,7 +46,7 @@ class IfmO3r:
     def open(self, path: Path, options: ReaderOptions) -> IfmO3rSource:
         """See `Reader.open`."""
         refuse_camera(options, "ifm-o3r")
-        return IfmO3rSource(needed_file(path, ".data", ".pcic", ".bin"))
+        return IfmO3rSource(required_file(path, ".data", ".pcic", ".bin"))
 
 
 class IfmO3rSource(FileSource):

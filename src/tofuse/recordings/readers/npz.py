@@ -24,7 +24,7 @@ from tofuse.recordings.camera_file import (
 )
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FARTHEST_M, FileSource, check_timestamps, read_matrix_pose
 
 MAX_BYTES = 1 << 30
@@ -58,7 +58,7 @@ class Npz:
 
     def open(self, path: Path, options: ReaderOptions) -> NpzSource:
         """See `Reader.open`."""
-        return NpzSource(needed_file(path, ".npz"), options)
+        return NpzSource(required_file(path, ".npz"), options)
 
 
 class NpzSource(FileSource):

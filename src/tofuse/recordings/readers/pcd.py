@@ -13,7 +13,7 @@ from tofuse.errors import InputError
 from tofuse.files.pcd import Pcd, read_pcd
 from tofuse.geometry.cameras import Camera
 from tofuse.parts import part
-from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_clouds
+from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.recordings.organised import SAMPLES, common_camera, organised_frame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
@@ -34,7 +34,7 @@ class PcdClouds:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "pcd")
-        files = needed_files(path, ".pcd")
+        files = required_files(path, ".pcd")
         camera = _camera(files)
         if camera is None:
             return CloudFileSource(path, files, pcd_cloud, pcd_cloud)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from tofuse.parts import part
-from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_clouds
+from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import ply_frame
 
@@ -26,4 +26,4 @@ class PlyClouds:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "ply")
-        return CloudFileSource(path, needed_files(path, ".ply"), ply_frame, ply_frame)
+        return CloudFileSource(path, required_files(path, ".ply"), ply_frame, ply_frame)

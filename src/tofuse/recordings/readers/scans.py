@@ -19,13 +19,13 @@ from tofuse.recordings.cloud_files import (
     CloudFileSource,
     find_shift,
     map_shift,
-    needed_files,
     note_shift,
+    required_files,
     sniff_clouds,
 )
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, cloud_frame, read_matrix_pose
 
 MAX_POINTS = 100_000_000
@@ -46,7 +46,7 @@ class LasScans:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "las")
-        files = needed_files(path, ".las", ".laz")
+        files = required_files(path, ".las", ".laz")
         shift = _shift(files[0])
         source = CloudFileSource(path, files, lambda f, k, t: _las_frame(f, k, t, shift))
         note_shift(source, path, shift)
@@ -133,7 +133,7 @@ class E57Scans:
     def open(self, path: Path, options: ReaderOptions) -> E57Source:
         """See `Reader.open`."""
         refuse_camera(options, "e57")
-        return E57Source(needed_file(path, ".e57"))
+        return E57Source(required_file(path, ".e57"))
 
 
 class E57Source(FileSource):

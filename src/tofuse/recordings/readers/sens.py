@@ -23,7 +23,7 @@ from tofuse.recordings.color import sampled_color
 from tofuse.recordings.frames import DepthKind, RangeFrame
 from tofuse.recordings.native import depth_from_counts
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.single_files import file_of, needed_file
+from tofuse.recordings.single_files import file_of, required_file
 from tofuse.recordings.sources import FileSource, check_timestamps, read_matrix_pose
 
 VERSION = 4
@@ -56,7 +56,7 @@ class Sens:
 
     def open(self, path: Path, options: ReaderOptions) -> SensSource:
         """See `Reader.open`."""
-        return SensSource(needed_file(path, ".sens"), options)
+        return SensSource(required_file(path, ".sens"), options)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from tofuse.errors import InputError
 from tofuse.files.reading import read_text
 from tofuse.files.tables import parse_numbers, read_numbers
 from tofuse.parts import part
-from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_clouds
+from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame, poses_beside
@@ -37,7 +37,7 @@ class Slam6d:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "slam6d")
-        files = needed_files(path, ".3d")
+        files = required_files(path, ".3d")
         source = CloudFileSource(path, files, scan_frame)
         poses = poses_beside(source, [file.with_suffix(".pose") for file in files], read_pose)
         if np.isfinite(poses).any():

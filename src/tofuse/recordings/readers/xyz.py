@@ -12,7 +12,7 @@ from tofuse.arrays import Float32, Float64
 from tofuse.errors import InputError
 from tofuse.files.tables import read_numbers
 from tofuse.parts import part
-from tofuse.recordings.cloud_files import CloudFileSource, needed_files, sniff_clouds
+from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
 from tofuse.recordings.sources import cloud_frame
@@ -39,7 +39,7 @@ class XyzClouds:
     def open(self, path: Path, options: ReaderOptions) -> CloudFileSource:
         """See `Reader.open`."""
         refuse_camera(options, "xyz")
-        return CloudFileSource(path, needed_files(path, *_SUFFIXES), xyz_frame, xyz_frame)
+        return CloudFileSource(path, required_files(path, *_SUFFIXES), xyz_frame, xyz_frame)
 
 
 def xyz_frame(path: Path, index: int, timestamp: float, shift: Float64 | None = None) -> CloudFrame:
