@@ -72,7 +72,7 @@ def called(recordings: list[Path]) -> list[str]:
                 kernel = event.data["dispatcher"].py_func
                 if depth == 0 and kernel.__module__.startswith("tofuse.kernels."):
                     name = f"{kernel.__module__.rsplit('.', 1)[1]}.{kernel.__name__}"
-                    lines.setdefault(ahead.line_of(name, event.data["args"]))
+                    lines.setdefault(ahead.signature_line(name, event.data["args"]))
                 depth += 1
 
             def on_end(self, event: Any) -> None:

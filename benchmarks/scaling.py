@@ -265,7 +265,7 @@ def _watched(function: Any, spent: dict[str, Spent]) -> Callable[..., Any]:
         found.seconds += seconds
         arrays = [a for a in _flat(arguments) if isinstance(a, np.ndarray)]
         # All iterations of a level are one call, which says last how many they were.
-        passes = result[-1] if function.__name__ == "settle" else 1
+        passes = result[-1] if function.__name__ == "iterate_level" else 1
         found.bytes += passes * _share(arguments, arrays) * sum(a.nbytes for a in arrays)
         return result
 

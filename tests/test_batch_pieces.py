@@ -16,7 +16,7 @@ from test_posegraph_revisits import ALL, pushed, turn  # noqa: F401 - a fixture
 from test_posegraph_submaps import refined
 from tofuse.batch import client
 from tofuse.cli import main
-from tofuse.kernels.spread import Here, executor, spread_over
+from tofuse.kernels.executors import LocalExecutor, executor, using_executor
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.revisits import Revisits
 
@@ -86,11 +86,11 @@ def test_submaps_on_a_cluster_are_refined_to_the_same_bits(cluster: str) -> None
     here = refined(Joint(submap=10), views, start)
     told: list[str] = []
     there = DaskExecutor(cluster, told.append)
-    with spread_over(there):
+    with using_executor(there):
         assert executor() is there
         found = refined(Joint(submap=10), views, start)
     there.close()
-    assert isinstance(executor(), Here)
+    assert isinstance(executor(), LocalExecutor)
     assert there.done_there == 3
     assert not told
     np.testing.assert_array_equal(found.poses, here.poses)
@@ -104,7 +104,7 @@ def test_loops_are_found_on_a_cluster_to_the_same_bits(cluster: str, turn) -> No
     options = Revisits(spacing=ALL, overlap=0.15)
     here = pushed(options, frames, start)
     there = DaskExecutor(cluster, lambda text: None)
-    with spread_over(there):
+    with using_executor(there):
         found = pushed(options, frames, start)
     there.close()
     assert there.done_there >= len(here) > 1

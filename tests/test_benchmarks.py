@@ -218,7 +218,7 @@ def test_scaling_runs_small(scripts, capsys, monkeypatch):
     scaling.main(["--columns", "48", "96", "--counts", "6", "9", "--length", "5", "--threads", "1"])
     text = capsys.readouterr().out
     assert text.count("100%") >= 4
-    assert "settle" in text
+    assert "iterate_level" in text
     assert "outside of kernels" in text
 
 
@@ -235,13 +235,13 @@ def test_watched_kernels_count_the_bytes_of_their_arrays(scripts):
     scaling = scripts["scaling"]
     frames = scaling.made_frames(48, 2)
     scaling.timed(scaling.tracker(48), iter(frames))
-    before = steps.settle
+    before = steps.iterate_level
     with scaling.watched_kernels() as spent:
         scaling.timed(scaling.tracker(48), iter(frames))
-        assert steps.settle is not before
-    assert steps.settle is before
+        assert steps.iterate_level is not before
+    assert steps.iterate_level is before
     # Every iteration goes over the source's rows (at most 16 floats a point) and the whole target.
-    found = spent["settle"]
+    found = spent["iterate_level"]
     assert found.calls >= 3  # levels
     source = 48 * 36 * 4 * 16
     assert source / 16 < found.bytes / found.calls < 40 * (source + 48 * 36 * 4 * 16)

@@ -198,9 +198,9 @@ def test_counts_stop_at_what_they_hold() -> None:
     volume = Volume.around([view], EYE[None], 0.05, Fusion())
     volume.add([view], EYE[None])
     near = volume.seen > 0
-    volume.seen[near] = tsdf.MOST_SEEN
+    volume.seen[near] = tsdf.MAX_SEEN
     volume.add([view], EYE[None])
-    assert (volume.seen[near] == tsdf.MOST_SEEN).all()
+    assert (volume.seen[near] == tsdf.MAX_SEEN).all()
 
 
 @pytest.mark.parametrize("memory_mb", [1, 600])

@@ -21,7 +21,7 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import LitView, baked, exposures, textured
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
-from tofuse.kernels.atlas import NOBODY, draw_triangles
+from tofuse.kernels.atlas import UNOWNED, draw_triangles
 from tofuse.pipeline import paint
 from tofuse.pipeline import run as run_module
 from tofuse.recordings.frames import RangeFrame
@@ -85,7 +85,7 @@ POSES = np.stack(
 def test_triangles_are_drawn_where_they_are() -> None:
     rng = np.random.default_rng(0)
     corners = rng.uniform(-3, 33, (12, 3, 2)).astype(np.float32)
-    owner = np.full((30, 30), NOBODY, np.int32)
+    owner = np.full((30, 30), UNOWNED, np.int32)
     places = np.zeros((30, 30, 2), np.float32)
     draw_triangles(corners, 1.4, owner, places)
     for v in range(30):
@@ -106,7 +106,7 @@ def test_triangles_are_drawn_where_they_are() -> None:
             if inside:
                 assert owner[v, u] >= max(inside)
             elif near:
-                assert owner[v, u] != NOBODY
+                assert owner[v, u] != UNOWNED
 
 
 @pytest.mark.parametrize("plain", [False, True])
@@ -131,13 +131,13 @@ def test_layouts_hold_every_triangle_once(plain: bool, monkeypatch) -> None:
     assert corners.min() >= 0
     assert corners.max() <= atlas.size - 1
     # No texel within one triangle is taken by another.
-    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
     places = np.zeros((atlas.size, atlas.size, 2), np.float32)
     for order in (slice(None), slice(None, None, -1)):
-        owner[:] = NOBODY
+        owner[:] = UNOWNED
         draw_triangles(np.ascontiguousarray(corners[order]), 0.0, owner, places)
         number = np.arange(len(corners))[order]
-        found = np.where(owner == NOBODY, -1, number[owner])
+        found = np.where(owner == UNOWNED, -1, number[owner])
         if order == slice(None):
             first = found
     shared = (places.min(-1) > 1e-3) & (places.sum(-1) < 1 - 1e-3)
@@ -158,10 +158,10 @@ def test_a_texture_shows_what_is_there_at_one_exposure() -> None:
     made = textured(mesh, views, POSES, 256)
     assert made.seen > 0.99
     atlas = made.atlas
-    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
     places = np.zeros((atlas.size, atlas.size, 2), np.float32)
     draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
-    inside = (owner != NOBODY) & (places.min(-1) >= 0) & (places.sum(-1) <= 1)
+    inside = (owner != UNOWNED) & (places.min(-1) >= 0) & (places.sum(-1) <= 1)
     p = mesh.vertices[atlas.vertices[atlas.faces[owner[inside]]]]
     b, c = places[inside].T[:, :, None]
     at = p[:, 0] * (1 - b - c) + p[:, 1] * b + p[:, 2] * c
@@ -222,12 +222,12 @@ def test_layouts_in_parts_hold_every_triangle_once(monkeypatch) -> None:
     atlas = unwrap(wall, 512)
     np.testing.assert_array_equal(atlas.vertices[atlas.faces], wall.faces)
     assert len(np.unique(atlas.vertices)) == len(wall)
-    owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+    owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
     draw_triangles(atlas.places[atlas.faces], 0.0, owner, np.zeros((*owner.shape, 2), np.float32))
     p = atlas.places[atlas.faces].astype(float)
     b, c = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = 0.5 * np.abs(b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
-    own = np.bincount(owner[owner != NOBODY], minlength=len(p))
+    own = np.bincount(owner[owner != UNOWNED], minlength=len(p))
     assert own.sum() == pytest.approx(area.sum(), rel=0.1)  # nothing lies on anything else
 
 

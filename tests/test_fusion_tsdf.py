@@ -564,7 +564,7 @@ def test_depths_drawn_to_planes_and_jumps_against_slow_twins() -> None:
     z, sigma, planes, known = (x.astype(np.float32) for x in (z, sigma, planes, known))
     smooth, variance = np.empty((2, *shape), np.float32)
     measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
-    tsdf.draw_to_planes(z, sigma, planes, known, 0.004, 2.0, smooth, variance, measured)
+    tsdf.shrink_to_planes(z, sigma, planes, known, 0.004, 2.0, smooth, variance, measured)
     tsdf.mark_jumps(z, sigma, 0.03, 4.0, jump)
     twin = np.zeros(shape, np.uint8)
     for i, j in np.ndindex(shape):

@@ -15,11 +15,11 @@ from tofuse.kernels import ahead, jit
 
 def test_every_listed_kernel_is_there_and_can_be_written_again() -> None:
     lines = []
-    for name, types in ahead.listed():
+    for name, types in ahead.signatures():
         module, function = name.rsplit(".", 1)
         __import__(f"tofuse.kernels.{module}")
         assert hasattr(sys.modules[f"tofuse.kernels.{module}"], function)
-        lines.append(ahead.line_of(name, types))
+        lines.append(ahead.signature_line(name, types))
     assert lines == Path(ahead.__file__).with_name("signatures.txt").read_text().splitlines()
     assert len(lines) == len(set(lines)) > 50
 
@@ -38,7 +38,7 @@ def test_a_run_calls_what_is_listed(room_recording: Path) -> None:
         from importlib import import_module
         from tofuse.kernels import ahead
         tofuse.reconstruct(tofuse.open(sys.argv[1]))
-        for name, types in ahead.listed():
+        for name, types in ahead.signatures():
             module, function = name.rsplit(".", 1)
             module = sys.modules.get(f"tofuse.kernels.{module}")
             if module is not None and types in getattr(module, function).overloads:
@@ -48,7 +48,7 @@ def test_a_run_calls_what_is_listed(room_recording: Path) -> None:
     words = [sys.executable, "-c", program, str(room_recording)]
     done = subprocess.run(words, check=True, capture_output=True, text=True)
     called = done.stdout.split()
-    for name in ("steps.settle", "surface.fit_planes", "refinement.pair_equations"):
+    for name in ("steps.iterate_level", "surface.fit_planes", "refinement.pair_equations"):
         assert name in called
     assert len(called) > 40
 
@@ -75,11 +75,11 @@ def test_only_a_first_run_starts_a_second_process(
         return started[-1]
 
     monkeypatch.setattr(subprocess, "Popen", start)
-    with pytest.raises(RuntimeError), ahead.compiled_beside():
+    with pytest.raises(RuntimeError), ahead.compiling_in_background():
         raise RuntimeError
     assert [p.ended for p in started] == [2]
     (tmp_path / "compiled").touch()
-    with ahead.compiled_beside():
+    with ahead.compiling_in_background():
         pass
     assert len(started) == 1
 
@@ -93,5 +93,5 @@ def test_a_machine_without_more_processes_compiles_alone(
     monkeypatch.setattr(jit, "cache_folder", lambda: str(tmp_path))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(subprocess, "Popen", refused)
-    with ahead.compiled_beside():
+    with ahead.compiling_in_background():
         pass

@@ -122,7 +122,7 @@ def twin(view, of, T=MOTION, exposure=0.0, slack=0.01):
 def test_sums_are_those_of_numpy(exposure):
     view, of = source(noise=0.015), target()
     got, want = accumulate(view, of, exposure=exposure), twin(view, of, exposure=exposure)
-    assert got[kernels.LANDED] == got[kernels.COMPARED] == 60
+    assert got[kernels.PROJECTED] == got[kernels.COMPARED] == 60
     assert got[kernels.INLIERS] == want["inliers"] > 30
     H, g, C = kernels.normal_equations(got)
     for matrix in (want["HP"], want["CP"]):
@@ -210,12 +210,12 @@ def test_what_can_not_be_compared_is_told_apart():
     view = (points, normals, np.full(n, 0.003, np.float32),
             np.full((n, 3), np.nan, np.float32))  # fmt: skip
     sums = accumulate(view, of, np.eye(4))
-    assert sums[kernels.LANDED] == 3
+    assert sums[kernels.PROJECTED] == 3
     assert sums[kernels.INLIERS] == 1
     assert sums[kernels.IN_FRONT] == 1
     of[0][8:10, 11:13] = 0  # no plane there
     sums = accumulate(view, of, np.eye(4))
-    assert (sums[kernels.LANDED], sums[kernels.COMPARED]) == (3, 0)
+    assert (sums[kernels.PROJECTED], sums[kernels.COMPARED]) == (3, 0)
 
 
 def test_points_whose_normal_turns_away_are_no_inliers():
@@ -230,7 +230,7 @@ def test_outliers_count_nothing():
     before = accumulate(view, of, stop=40)
     view[0][40:, 2] *= 1.5
     after = accumulate(view, of)
-    np.testing.assert_array_equal(before[: kernels.LANDED], after[: kernels.LANDED])
+    np.testing.assert_array_equal(before[: kernels.PROJECTED], after[: kernels.PROJECTED])
 
 
 def test_what_is_not_there_of_a_block_of_points_adds_nothing():
@@ -255,13 +255,13 @@ def test_moved_is_the_exponential_map(size):
     rng = np.random.default_rng(5)
     T = se3.exp(rng.normal(size=6))
     xi = size * rng.normal(size=6) / np.sqrt(6)
-    np.testing.assert_allclose(motion.moved(T, xi), T @ se3.exp(xi), atol=1e-9)
+    np.testing.assert_allclose(motion.retract(T, xi), T @ se3.exp(xi), atol=1e-9)
 
 
 def test_moved_takes_rounding_out_of_rotations():
     T = se3.exp([1, 2, 3, 0.5, -0.2, 0.3])
     T[:3, :3] *= 1 + 1e-5
-    out = motion.moved(T, np.zeros(6))
+    out = motion.retract(T, np.zeros(6))
     np.testing.assert_allclose(out[:3, :3].T @ out[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(out[3], [0, 0, 0, 1])
 
@@ -313,7 +313,7 @@ def test_a_step_solves_the_normal_equations(unheld):
     T = se3.exp(rng.normal(size=6))
     predicted = T @ se3.exp([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])
     weak = np.linalg.qr(rng.normal(size=(6, 6)))[0][:unheld]
-    after, step = steps.advance(total, T, predicted, weak, prior, units)
+    after, step = steps.solve_step(total, T, predicted, weak, prior, units)
     np.testing.assert_allclose(after, T @ se3.exp(step[:6]), atol=1e-9)
     if unheld:
         left = se3.log(se3.inverse(predicted) @ after) / units
@@ -329,10 +329,10 @@ def test_weak_directions_are_those_with_little_information():
     basis = np.linalg.qr(np.random.default_rng(10).normal(size=(6, 6)))[0]
     units = np.array([0.01] * 3 + [0.02] * 3)
     cross = (basis * [0.1, 0.3, 0.9, 1.1, 5.0, 20.0]) @ basis.T / np.outer(units, units)
-    found = steps.weak_directions(cross, units, 1.0)
+    found = steps.degenerate_directions(cross, units, 1.0)
     np.testing.assert_allclose(found.T @ found, basis[:, :3] @ basis[:, :3].T, atol=1e-9)
-    assert steps.weak_directions(cross, units, 0.5).shape == (4, 6)
-    assert steps.weak_directions(cross, units, 10.0).shape == (0, 6)
+    assert steps.degenerate_directions(cross, units, 0.5).shape == (4, 6)
+    assert steps.degenerate_directions(cross, units, 10.0).shape == (0, 6)
 
 
 @pytest.mark.parametrize("sigma", [0.1, 1.0, 7.0])

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from tofuse.kernels.clustering import connect, number_keys, plane_sums, settle
+from tofuse.kernels.clustering import flatten_groups, number_keys, plane_sums, union_faces
 
 
 def test_equal_keys_have_one_number_in_the_order_in_which_they_come() -> None:
@@ -51,8 +51,8 @@ def test_pieces_are_those_of_a_graph_library() -> None:
         rows = rng.integers(0, count, (faces, 3)).astype(np.int32)
         piece = np.arange(count, dtype=np.int32)
         for part in (rows[::2], rows[1::2]):
-            connect(part, piece)
-        settle(piece)
+            union_faces(part, piece)
+        flatten_groups(piece)
         ends = np.concatenate([rows[:, :2], rows[:, 1:]])
         links = coo_matrix((np.ones(len(ends)), ends.T), shape=(count, count))
         _, wanted = connected_components(links, directed=False)

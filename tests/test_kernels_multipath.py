@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.kernels import multipath as kernels
-from tofuse.kernels.multipath import AREA, COLUMNS, LIGHT, A, B, C, W, X, Y
+from tofuse.kernels.multipath import AMPLITUDE, AREA, COLUMNS, A, B, C, W, X, Y
 
 
 def grid_rays(height: int, width: int, pitch: float = 0.01) -> np.ndarray:
@@ -82,7 +82,7 @@ def test_block_means_are_those_of_the_surface_in_the_middle() -> None:
     assert nodes[0, 0, X] == pytest.approx(rays[:4, :4, 0].ravel()[chosen].mean())
     assert nodes[0, 0, Y] == pytest.approx(rays[:4, :4, 1].ravel()[chosen].mean())
     assert nodes[..., W] == pytest.approx(0.5)
-    assert nodes[..., LIGHT] == pytest.approx(10.0)
+    assert nodes[..., AMPLITUDE] == pytest.approx(10.0)
     assert nodes[0, 0, AREA] == pytest.approx(13 * 1e-4, rel=1e-4)
     assert nodes[1, 1, AREA] == pytest.approx(16 * 1e-4, rel=1e-4)
 
@@ -160,7 +160,7 @@ def test_spread_carries_a_bias_to_its_own_surface_only() -> None:
     shift, factor = np.where(near, 0.0, 0.1), np.where(near, 1.0, 1.5)
     z_out, factor_out = np.empty_like(z), np.empty_like(z)
     for a, b in ((0, 20), (20, 48)):
-        kernels.spread(nodes, shift, factor, z, rays, 4, 0.03, a, b, z_out, factor_out)
+        kernels.upsample_correction(nodes, shift, factor, z, rays, 4, 0.03, a, b, z_out, factor_out)
     wanted = z - np.where(right, 0.0, 0.1) / np.sqrt(1 + (rays**2).sum(-1))
     seen = z > 0
     np.testing.assert_allclose(z_out[seen], wanted[seen], atol=1e-3)
@@ -185,7 +185,7 @@ def lit_nodes(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
     nodes = np.zeros((rows, columns, COLUMNS))
     y, x = np.mgrid[:rows, :columns] * 0.1
     nodes[..., X], nodes[..., Y] = x - 0.4, y - 0.3
-    nodes[..., LIGHT], nodes[..., AREA] = rng.uniform(10, 90, (2, rows, columns)) * 1e-2
+    nodes[..., AMPLITUDE], nodes[..., AREA] = rng.uniform(10, 90, (2, rows, columns)) * 1e-2
     planes = rng.normal(0, 0.3, (rows, -(-columns // 4), 3)).repeat(4, 1)[:, :columns]
     nodes[..., A : C + 1] = planes + np.array([0, 0, 0.6])
     nodes[..., W] = (
@@ -200,7 +200,7 @@ def surfaces_of(nodes: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, ...]
     shape = nodes.shape[:2]
     good = np.empty(shape, bool)
     points, normals, values = np.empty((*shape, 3)), np.empty((*shape, 3)), np.empty((5, *shape))
-    kernels.light_surfaces(nodes, factor, 4.0, SLANTEST, good, points, normals, values)
+    kernels.surface_radiometry(nodes, factor, 4.0, SLANTEST, good, points, normals, values)
     return good, points, normals, values
 
 
@@ -226,7 +226,7 @@ def test_light_surfaces_are_the_planes_and_their_light() -> None:
     r = length / w
     area = nodes[..., AREA][good] / (w**2 * length * cosine)
     lit = length**-2 * cosine / r**2
-    radiosity = nodes[..., LIGHT][good] * length**2
+    radiosity = nodes[..., AMPLITUDE][good] * length**2
     albedo = radiosity / lit / factor[good]
     np.testing.assert_allclose(values[:, good], [r, area, lit, radiosity, albedo])
 
@@ -242,7 +242,7 @@ def test_seen_sources_are_means_of_four_nodes_that_are_alike_and_the_others_alon
     light = rng.normal(size=(9, 11)) + 1j * rng.normal(size=(9, 11))
     light[rng.random((9, 11)) < 0.1] = 0
     out = np.full((99, 9), np.nan, np.float32)
-    count = kernels.seen_sources(good, points, normals, area, light, out)
+    count = kernels.visible_sources(good, points, normals, area, light, out)
     assert np.isnan(out[count:]).all()
 
     wanted = []
@@ -295,7 +295,7 @@ def test_unseen_sources_are_what_is_known_and_else_the_nearest_plane_of_the_bord
     albedo = np.where(rng.random(80) < 0.5, rng.uniform(0.2, 0.9, 80), 0)
     out = np.full((80, 9), np.nan, np.float32)
     growth = np.array([0.5, 2.0])
-    count = kernels.unseen_sources(
+    count = kernels.offscreen_sources(
         rays, size, planes, albedo, border, border_albedo, growth, 4.0, SLANTEST, 2.5, out
     )
     wanted = []
@@ -322,7 +322,7 @@ def test_unseen_sources_are_what_is_known_and_else_the_nearest_plane_of_the_bord
     np.testing.assert_allclose(out[:count], wanted, rtol=1e-4, atol=1e-6)
     assert np.isnan(out[count:]).all()
     # With nothing at the border, what is known is left.
-    none = kernels.unseen_sources(
+    none = kernels.offscreen_sources(
         rays, size, planes, albedo, border[:0], border_albedo[:0], growth, 4.0, SLANTEST, 2.5, out
     )
     assert none == count - guessed
@@ -331,10 +331,10 @@ def test_unseen_sources_are_what_is_known_and_else_the_nearest_plane_of_the_bord
 def test_the_extent_is_that_of_the_known_rays() -> None:
     rays = np.random.default_rng(9).normal(size=(7, 9, 2)).astype(np.float32)
     rays[0] = rays[3, 4] = np.nan
-    found = kernels.extent(rays)
+    found = kernels.ray_bounds(rays)
     x, y = rays[..., 0], rays[..., 1]
     np.testing.assert_array_equal(found, [np.nanmin(x), np.nanmax(x), np.nanmin(y), np.nanmax(y)])
-    assert np.isnan(kernels.extent(np.full_like(rays, np.nan))).all()
+    assert np.isnan(kernels.ray_bounds(np.full_like(rays, np.nan))).all()
 
 
 def test_recall_shows_the_nearest_surfaces_that_face_the_camera_in_each_cell() -> None:
@@ -354,7 +354,7 @@ def test_recall_shows_the_nearest_surfaces_that_face_the_camera_in_each_cell() -
     R = T[:3, :3]
     patches = np.concatenate([(points - T[:3, 3]) @ R, normals @ R, light], 1).astype(np.float32)
     planes, albedo = np.zeros((len(rays), 3)), np.zeros(len(rays))
-    kernels.recall(patches, T, rays, pitch, planes, albedo)
+    kernels.project_patches(patches, T, rays, pitch, planes, albedo)
 
     filled = 0
     for m, ray in enumerate(rays):

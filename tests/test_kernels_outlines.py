@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from tofuse.kernels.outlines import carry_planes
+from tofuse.kernels.plane_extension import extend_planes
 
 STEPS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0), (2, -1), (-2, 2)], np.int32)
 GROWTH = np.array([1.5, 1.5, 1.5, 1.5, 3.5, 5.0], np.float32)
@@ -51,7 +51,7 @@ def test_planes_are_carried_as_by_the_slow_twin():
     w = (w + 1.5 * sigma * rng.normal(size=shape)).astype(np.float32)
     wanted = (planes[..., 3] == 0) & (rng.random(shape) < 0.9)
     found, varied = planes.copy(), variance.copy()
-    carry_planes(
+    extend_planes(
         w, sigma, rays, wanted, planes, variance, STEPS, GROWTH, SIGMAS, JUMP, found, varied
     )
     twin, twin_varied = carried_twin(w, sigma, rays, wanted, planes, variance)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.geometry.cameras import BrownConrady, Pinhole
-from tofuse.kernels.middle import median
+from tofuse.kernels.median import median
 from tofuse.kernels.surface import (
     albedo_image,
     fit_planes,

@@ -10,13 +10,13 @@ import pytest
 
 from tofuse.kernels.threads import (
     chunk_bounds,
+    job_pool,
     run_all,
     run_chunks,
+    serial_chunks,
     set_thread_count,
-    side_threads,
     thread_count,
     threads,
-    undivided,
 )
 
 
@@ -118,10 +118,10 @@ def test_work_beside_other_work_is_not_divided() -> None:
         return run_chunks(lambda _a, _b: threading.current_thread().name, 8, chunks=8)
 
     with threads(2):
-        with side_threads(1, "beside") as pool:
+        with job_pool(1, "beside") as pool:
             assert set(pool.submit(names).result()) == {"beside_0"}
-        with undivided():
+        with serial_chunks():
             assert set(names()) == {threading.current_thread().name}
-        with undivided(False):
+        with serial_chunks(False):
             assert threading.current_thread().name not in names()
         assert threading.current_thread().name not in names()

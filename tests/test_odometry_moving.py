@@ -10,7 +10,7 @@ import pytest
 
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole, ray_lengths
-from tofuse.kernels import moving as kernels
+from tofuse.kernels import moving_objects as kernels
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation.effects import Effects
@@ -523,7 +523,7 @@ def test_carry_and_predict_are_their_twins():
     out = [np.empty(before.shape, t) for t in (np.float32, np.float32, np.uint8, np.bool_)]
     grid = other.projection
     for start, stop in ((0, 5), (5, 18)):
-        kernels.carry(
+        kernels.propagate(
             view.rays, view.z, view.sigma, view.planes, view.plane_variance, STRIDE, before,
             odds_before, moved, tracked_before, STRIDE, other.z.shape, grid.lookup, grid.frame, T,
             tolerance, prior, *out, start, stop,

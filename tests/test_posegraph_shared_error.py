@@ -102,14 +102,14 @@ def test_the_kernel_eliminates_an_unknown_for_each_patch(pair):
     H[:6, :6] -= M.T @ np.linalg.solve(big, M)
     g[:6] -= M.T @ np.linalg.solve(big, h)
     allowed = row.copy()
-    patch_kernels.allow(sums, alike, variance, allowed)
+    patch_kernels.discount_shared_errors(sums, alike, variance, allowed)
     found_H, found_g = unpack(allowed)
     np.testing.assert_allclose(found_H, H, atol=1e-7 * np.abs(H).max())
     np.testing.assert_allclose(found_g, g, atol=1e-7 * np.abs(g).max())
     # What is counted stays, and without errors everything does.
     np.testing.assert_array_equal(allowed[kernels.COMPARED :], row[kernels.COMPARED :])
     same = row.copy()
-    patch_kernels.allow(sums, alike, 0.0, same)
+    patch_kernels.discount_shared_errors(sums, alike, 0.0, same)
     np.testing.assert_allclose(same, row, rtol=1e-9, atol=1e-9 * np.abs(row).max())
 
 

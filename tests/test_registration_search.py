@@ -224,7 +224,7 @@ def test_a_step_of_the_icp_solves_both_ways_equations():
     H += np.diag([damping] * 3 + [damping * unit**2] * 3)
     expected = T @ se3.exp(-np.linalg.solve(H, g))
     poses = np.stack([np.eye(4), T])
-    kernels.settle(
+    kernels.refine_poses(
         *source, *target, *grids[0], *grids[1], np.array([reach]), cosine, unit, poses, 1, 2
     )
     np.testing.assert_allclose(poses[1], expected, atol=2e-5)

@@ -7,7 +7,7 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels import tiles
 from tofuse.kernels.alignment import POINT_SIZE
-from tofuse.kernels.doubt import faked_information
+from tofuse.kernels.spurious_information import spurious_information
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align
@@ -282,7 +282,7 @@ def test_faked_information_is_what_random_tilts_give():
     rows = np.zeros((300, POINT_SIZE), np.float32)
     rows[:, :3], rows[:, 3:6], rows[:, 6] = points, normals, sigma / points[:, 2]
     rows[::3, 7] = np.nan  # no albedo
-    found = faked_information(rows, 1, 1.5, slack, photo_sigma**2, tilt, slope)
+    found = spurious_information(rows, 1, 1.5, slack, photo_sigma**2, tilt, slope)
     along = (points * normals).sum(1) / points[:, 2]
     variance = 2 * (along * 1.5 * sigma) ** 2 + slack**2
     lit = np.isfinite(rows[:, 7])

@@ -16,8 +16,8 @@ from threadpoolctl import threadpool_limits
 from tofuse._version import __version__
 from tofuse.batch.client import ANSWERS_S, connected, first_line, unknown_there
 from tofuse.errors import InputError
-from tofuse.kernels.spread import Arguments, Executor, Here
-from tofuse.kernels.threads import undivided
+from tofuse.kernels.executors import Arguments, Executor, LocalExecutor
+from tofuse.kernels.threads import serial_chunks
 
 R = TypeVar("R")
 
@@ -74,7 +74,7 @@ class DaskExecutor(Executor):
             self.done_there += len(found)
         left = [k for k in range(count) if k not in found]
         # An error of a piece is raised here as well.
-        here = Here().map(function, len(left), lambda k: arguments(left[k]), large=large)
+        here = LocalExecutor().map(function, len(left), lambda k: arguments(left[k]), large=large)
         found |= dict(zip(left, here, strict=True))
         return [found[k] for k in range(count)]
 
@@ -193,7 +193,7 @@ def _do(
     if program != _program():  # it came later than the check
         raise InputError("a worker has another version", where=platform.node())
     _one_blas_thread()
-    with undivided():  # other threads of the worker have pieces of their own
+    with serial_chunks():  # other threads of the worker have pieces of their own
         return [function(*arguments) for arguments in pieces]
 
 

@@ -103,11 +103,11 @@ def _run_progress(
             yield progress
             return
         from tofuse.batch.pieces import DaskExecutor
-        from tofuse.kernels.spread import spread_over
+        from tofuse.kernels.executors import using_executor
 
         with (
             closing(DaskExecutor(arguments.scheduler, progress.note)) as cluster,
-            spread_over(cluster),
+            using_executor(cluster),
         ):
             yield progress
 

@@ -188,9 +188,9 @@ def _command(
         run: Callable[[argparse.Namespace], int] = getattr(functions, function or name)
         if not reconstructs:
             return run(arguments)
-        from tofuse.kernels.ahead import compiled_beside
+        from tofuse.kernels.ahead import compiling_in_background
 
-        with compiled_beside():
+        with compiling_in_background():
             return run(arguments)
 
     parser.set_defaults(command=call, parser=parser)

@@ -10,7 +10,7 @@ from tofuse.arrays import Bool, Float32, Float64
 from tofuse.fusion.kept import Views
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.tsdf import farthest_told
+from tofuse.kernels.tsdf import max_informative_depth
 
 _CHUNKS = 16
 _ROUNDING = 1.001  # of single precision, with plenty to spare
@@ -36,7 +36,7 @@ class Frusta:
 
     @classmethod
     def of(cls, views: Views, poses: Float64, backs: Float32) -> Frusta:
-        """Look at views at their poses (N, 4, 4); `backs` as for `farthest_told`."""
+        """Look at views at their poses (N, 4, 4); `backs` as for `max_informative_depth`."""
         spans, far = np.empty((len(views), 4)), np.empty(len(views))
 
         def look(a: int, b: int) -> None:
@@ -45,7 +45,7 @@ class Frusta:
                 projection = view.projection
                 low, size = projection.frame[:2], np.array(projection.lookup.shape[1::-1]) - 1
                 spans[k] = [*low, *(low + size / projection.frame[2:])]
-                far[k] = farthest_told(
+                far[k] = max_informative_depth(
                     view.z, view.unit, view.normals, view.strength, projection.rays, backs
                 )
 

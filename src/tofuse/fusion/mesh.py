@@ -14,7 +14,7 @@ from tofuse.files.geometry_record import GeometryRecord
 from tofuse.fusion import exchange
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.colors import has_color
-from tofuse.kernels.clustering import connect, number_keys, plane_sums, settle
+from tofuse.kernels.clustering import flatten_groups, number_keys, plane_sums, union_faces
 
 # A place is held at its middle by so much of what the planes around it hold.
 _HELD = 0.02
@@ -112,8 +112,8 @@ class Mesh:
         if len(self.faces) == 0:
             return self.rows(np.zeros(0, bool))
         piece = np.arange(len(self), dtype=np.int32)
-        connect(self.faces, piece)
-        settle(piece)
+        union_faces(self.faces, piece)
+        flatten_groups(piece)
         return self.rows((np.bincount(piece)[piece] >= least)[self.faces[:, 0]])
 
     def without_holes(self, longest_m: float) -> Mesh:

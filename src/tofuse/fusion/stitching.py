@@ -15,7 +15,7 @@ from tofuse.arrays import Float32, Int32, Int64, UInt8
 from tofuse.files.spill import Spill
 from tofuse.fusion.cloud import grey_of
 from tofuse.fusion.mesh import Mesh
-from tofuse.kernels.clustering import connect, settle
+from tofuse.kernels.clustering import flatten_groups, union_faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +75,8 @@ def stitched(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
         tints[place[: len(piece)]] = piece.tints
         faces = place[piece.faces]
         used[faces] = True
-        connect(faces, group)
-    settle(group)
+        union_faces(faces, group)
+    flatten_groups(group)
     color = colored(tints)  # by those of islands as well: they tell how light the scene is
     del tints
     used &= np.bincount(group, minlength=len(names))[group] >= island

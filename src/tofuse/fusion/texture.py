@@ -16,7 +16,7 @@ from tofuse.fusion.colors import UNSEEN, has_color, seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.kernels.atlas import NOBODY, draw_triangles, see
+from tofuse.kernels.atlas import UNOWNED, add_view, draw_triangles
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -200,10 +200,10 @@ class _Sheet:
     @classmethod
     def of(cls, mesh: Mesh, size: int) -> _Sheet:
         atlas = unwrap(mesh, size)
-        owner = np.full((atlas.size, atlas.size), NOBODY, np.int32)
+        owner = np.full((atlas.size, atlas.size), UNOWNED, np.int32)
         places = np.zeros((atlas.size, atlas.size, 2), np.float32)
         draw_triangles(atlas.places[atlas.faces], MARGIN, owner, places)
-        painted = owner != NOBODY
+        painted = owner != UNOWNED
         corners = atlas.vertices[atlas.faces[owner[painted]]]
         shares = places[painted]
         points = _between(mesh.vertices, corners, shares)
@@ -297,7 +297,7 @@ def _see(
     border = max(2.0, _BORDER * view.z.shape[0])
     projection = view.projection
     run_chunks(
-        lambda a, b: see(
+        lambda a, b: add_view(
             points, normals, T, view.z, light, projection.lookup, projection.frame, _SLACK,
             _SLACK_SHARE, border, _POWER, sums, weights, a, b,
         ),

@@ -22,7 +22,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.blocks import EDGE, VOXELS, index_of, mark_eighths, neighbours_of
 from tofuse.kernels.surface_nets import make_faces, make_vertices, mark_cells
 from tofuse.kernels.threads import run_chunks
-from tofuse.kernels.tsdf import integrate, open_view, settle_free
+from tofuse.kernels.tsdf import apply_free_space, integrate, unpack_view
 
 _CHUNKS = 16
 _AT_ONCE = 16  # views
@@ -161,7 +161,7 @@ class Volume:
         def open_views(a: int, b: int) -> None:
             for s in range(a, b):
                 view = views[s]
-                open_view(
+                unpack_view(
                     view.z,
                     view.unit,
                     view.normals,
@@ -265,7 +265,9 @@ class Volume:
         """Vertices of all cells, and the triangles of the region's own blocks."""
         blocks = len(self.keys)
         run_chunks(
-            lambda a, b: settle_free(self.distance, self.weight, self.free, self.reach_m, a, b),
+            lambda a, b: apply_free_space(
+                self.distance, self.weight, self.free, self.reach_m, a, b
+            ),
             blocks,
             _CHUNKS,
         )

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from tofuse.arrays import Bool, Float32, Int8, UInt8, UInt16
 from tofuse.geometry.cameras import ray_lengths
-from tofuse.kernels.middle import median
-from tofuse.kernels.tsdf import draw_to_planes, mark_jumps, pack_view
+from tofuse.kernels.median import median
+from tofuse.kernels.tsdf import mark_jumps, pack_view, shrink_to_planes
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.registration.prepared_view import (
     PreparedView,
@@ -94,7 +94,7 @@ class RangeView:
         shape = surface.z.shape
         smoothed, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
         measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
-        draw_to_planes(
+        shrink_to_planes(
             surface.z, surface.sigma, surface.planes, surface.plane_variance, _DETAIL, _ON_PLANE,
             smoothed, variance, measured,
         )  # fmt: skip

@@ -1,9 +1,9 @@
-"""Kernels compiled ahead of their first call, by a second process beside the first run.
+"""Compilation of kernels ahead of their first call, by a second process during the first run.
 
-The first run on a machine compiles every kernel that it calls. While it compiles what it needs
-first, a process of its own goes through the same list from the end, into the same cache; where they
-meet, the rest is there. The list holds the types of arguments, as they were in runs of the default
-method: `python benchmarks/compilation.py --list` writes it anew.
+The first run on a machine compiles every kernel that it calls. Meanwhile a second process compiles
+the same kernels in reverse order into the same cache, until the two meet. The list of kernels and
+argument types was recorded in runs of the default method; `python benchmarks/compilation.py --list`
+records it again.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ _NAMES = {name: short for short, name in _DTYPES.items()} | {"bool": "b1"}
 
 
 @contextmanager
-def compiled_beside() -> Iterator[None]:
-    """Let another process compile kernels meanwhile, where none are compiled yet.
+def compiling_in_background() -> Iterator[None]:
+    """Compile kernels in another process during the block, unless they are in the cache.
 
-    It ends with the block. Nothing depends on it: what it has not compiled is compiled when called.
+    The process is terminated with the block. What it has not compiled is compiled when called.
     """
     helper = _start()
     try:
@@ -67,8 +67,8 @@ def _start() -> subprocess.Popen[bytes] | None:
         return None
 
 
-def listed() -> list[tuple[str, tuple[Any, ...]]]:
-    """Names and types of arguments of the kernels that runs call, in the order in which they do."""
+def signatures() -> list[tuple[str, tuple[Any, ...]]]:
+    """Return the kernels that runs call and their argument types, in the order of first use."""
     found = []
     for line in _LIST.read_text(encoding="ascii").splitlines():
         name, *types = line.split()
@@ -77,14 +77,14 @@ def listed() -> list[tuple[str, tuple[Any, ...]]]:
 
 
 def compile_listed() -> None:
-    """Compile what is listed, the last first, or load it from the cache."""
-    for name, types in reversed(listed()):
+    """Compile the listed kernels in reverse order, or load them from the cache."""
+    for name, types in reversed(signatures()):
         module, function = name.rsplit(".", 1)
         getattr(import_module(f"tofuse.kernels.{module}"), function).compile(types)
     (Path(jit.cache_folder()) / _DONE).touch()
 
 
-def line_of(name: str, types: tuple[Any, ...]) -> str:
+def signature_line(name: str, types: tuple[Any, ...]) -> str:
     """Return the line of the list for a kernel, "module.function", and types of arguments."""
     return " ".join([name, *(_text_of(kind) for kind in types)])
 

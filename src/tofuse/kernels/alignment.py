@@ -1,14 +1,13 @@
 """Normal equations of projective point-to-plane alignment with a photometric term.
 
-Source points p are moved into the target by T, projected, and compared with the plane and the
-albedo at the pixel they land on. With the plane n . X = d of the target the residual is its
-distance n . X - d, and its Jacobian by the right perturbation of T is (m, p x m), with m = R^T n.
-The log albedo of the target is linear in the rays near a pixel.
+Source points p are transformed into the target by T, projected, and compared with the plane and the
+albedo of the pixel they project to. For the target plane n . X = d the residual is the distance
+n . X - d; its Jacobian with respect to the right perturbation of T is (m, p x m), with m = R^T n.
+The log albedo of the target is linear in the ray coordinates near a pixel.
 
-Either residual has such a Jacobian by the target, with m from its normal or the slope of its
-albedo, and one by the source, with the source's own s in place of m. With J their mean and D half
-their difference the symmetrised product of the two is J J^T - D D^T: independent noise cancels in
-it.
+Each residual has one Jacobian from the target, with m from its normal or albedo gradient, and one
+from the source, with the source's own s in place of m. With J their mean and D half their
+difference, the symmetrised product of the two is J J^T - D D^T, in which independent noise cancels.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import landing
+from tofuse.kernels.projection import project_ray
 
-# Columns of a source point: position in m, unit normal, sigma of z as a share of z, log albedo
-# (NaN where unknown) and its slope by the position, 1/m.
+# Columns of a source point: position in m, unit normal, sigma of z relative to z, log albedo
+# (NaN where unknown) and its gradient with respect to the position, 1/m.
 POINT = 0
 NORMAL = 3
 SIGMA = 6
-LIGHT = 7
-LIGHT_SLOPE = 8
+POINT_ALBEDO = 7
+POINT_ALBEDO_SLOPE = 8
 POINT_SIZE = 11
 
-# Columns of a target's pixel: unit normal and distance of the plane (0: there is none), variance
-# of the distance, and log albedo of the ray (0, 0) with its slopes by x/z and y/z (NaN where
-# unknown), were it linear in the rays everywhere.
+# Columns of a target pixel: unit normal and distance of the plane (0: no plane), variance of the
+# distance, and the log albedo as a linear function of the ray: its value extrapolated to the ray
+# (0, 0), and its slopes by x/z and y/z (NaN where unknown).
 PLANE = 0
 DISTANCE = 3
 VARIANCE = 4
@@ -38,10 +37,10 @@ ALBEDO = 5
 ALBEDO_SLOPE = 6
 PIXEL_SIZE = 8
 
-# Layout of what `accumulate` returns.
+# Layout of the sums that `accumulate` returns.
 H = 0  # 36: upper triangle of the 8x8 sum of w (J, r) (J, r)^T; J[6] is that of the exposure
 D = 36  # 21: upper triangle of the 6x6 sum of w D D^T
-LANDED = 57  # points that land on a pixel of the target
+PROJECTED = 57  # points that project to a pixel of the target
 COMPARED = 58  # of those, points at which the target has a plane
 INLIERS = 59  # of those, points within the reach and with a compatible normal
 IN_FRONT = 60  # points in free space of the target
@@ -50,20 +49,20 @@ SQUARES_G = 62
 WEIGHT_P = 63
 SQUARES_P = 64
 COUNT_P = 65
-SQUARES_M = 66  # of the inliers' distances, m^2
-# Of all compared points' squared distances in unscaled variances: bins of a quarter of an octave
-# (between two powers of 2 all are equally wide), the first from 0 to 2^-8.
+SQUARES_M = 66  # of the inliers' compare_planes, m^2
+# Histogram of the squared distances of all compared points, in unscaled variances: four equally
+# wide bins per octave, the first from 0 to 2^-8.
 HISTOGRAM = 67
 BINS = 96
 SIZE = HISTOGRAM + BINS
 
-# Points that are compared wait in blocks, the numbers of each in a column, so that the processor
-# works on several at a time. Rows of a block: the point, where it came to be (x/z, y/z and z in
-# the target), the target's pixel, whether there is a plane and whether it is an inlier; then the
-# residual's derivatives J (7), r, and D (6), each weighted by the root of its w; what is summed of
-# each column; its squared distance in unscaled variances; and the root of the distance's w.
+# Points are compared in structure-of-arrays blocks, one point per column, so that loops over a row
+# are vectorised. Rows of a block: the point, its projection (x/z, y/z and z in the target), the
+# target pixel, whether it has a plane, and whether the point is an inlier; then J (7), r, and D
+# (6), each weighted by the root of w; the statistics to be summed; the squared distance in unscaled
+# variances; and the root of w of the distance.
 LANES = 128
-_NEAREST = 0.02  # m; what comes nearer to the target's camera is not compared
+_MIN_DEPTH = 0.02  # m; points nearer to the target's camera are not compared
 _XN, _YN, _Z, _PIXEL = POINT_SIZE, POINT_SIZE + 1, POINT_SIZE + 2, POINT_SIZE + 3
 SEEN = _PIXEL + PIXEL_SIZE
 FITS = SEEN + 1
@@ -86,47 +85,51 @@ def accumulate(
     exposure: float,
     scale_g: float,
     scale_p: float,
-    slack: float,
+    inflation: float,
     robust: float,
     min_cosine: float,
 ) -> Float64:
-    """Sum the normal equations over points.
+    """Sum the normal equations over all points.
 
     Parameters
     ----------
     points, target
-        (N, POINT_SIZE) and (H, W, PIXEL_SIZE), see above.
+        (N, POINT_SIZE) source points and (H, W, PIXEL_SIZE) target image, see above.
     lookup, lookup_frame
-        As in `landing`.
+        Projection of the target's camera, as in `project_ray`.
     T
         (4, 4) T_target_source.
     exposure
-        Target log albedo minus the source's.
+        Log albedo of the target minus that of the source.
     scale_g, scale_p
-        Sigmas are multiplied by the first; the second is the sigma of the log albedo, 0 if it takes
-        no part.
-    slack
-        Added in quadrature to the sigma of a distance, m: forgives what is still misaligned.
+        Factor of the sigmas of distances, and sigma of the log albedo (0 leaves it out).
+    inflation
+        Noise inflation in m, added in quadrature to the sigma of a distance while views are still
+        misaligned.
     robust
-        Residuals beyond so many sigmas count nothing (Tukey's biweight).
+        Cut-off of Tukey's biweight, in sigmas.
     min_cosine
-        Smallest cosine between the normals.
+        Smallest cosine between corresponding normals.
+
+    Returns
+    -------
+    (SIZE,) sums, laid out as above.
     """
     out = np.zeros(SIZE)
     block = np.zeros(ROWS * LANES, np.float32)
-    sums = np.zeros((LANDED + _STATS, LANES))
+    sums = np.zeros((PROJECTED + _STATS, LANES))
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
-        load(block, points[first : first + count])
-        move(block, T)
-        out[LANDED] += land(block, count, target, lookup, lookup_frame)
-        distances(block, T, scale_g, slack, robust, min_cosine)
+        load_block(block, points[first : first + count])
+        transform_block(block, T)
+        out[PROJECTED] += project_block(block, count, target, lookup, lookup_frame)
+        compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         _add_products(sums, block)
         if scale_p > 0:
-            albedos(block, T, exposure, scale_p, robust)
+            compare_albedos(block, T, exposure, scale_p, robust)
             _add_products(sums, block)
         for c in range(_STATS):
-            total, row = sums[LANDED + c], block[(STAT + c) * LANES : (STAT + c + 1) * LANES]
+            total, row = sums[PROJECTED + c], block[(STAT + c) * LANES : (STAT + c + 1) * LANES]
             for k in range(LANES):
                 total[k] += row[k]
         for k in range(count):
@@ -140,22 +143,22 @@ def accumulate(
             low, high = sums[q, :width], sums[q, width:]
             for k in range(width):
                 low[k] += high[k]
-    out[:LANDED] = sums[:LANDED, 0]
-    out[INLIERS : INLIERS + _STATS] = sums[LANDED:, 0]
+    out[:PROJECTED] = sums[:PROJECTED, 0]
+    out[INLIERS : INLIERS + _STATS] = sums[PROJECTED:, 0]
     return out
 
 
 @kernel
-def load(block: Float32, points: Float32) -> None:
-    """Put up to `LANES` points into the columns of a block."""
+def load_block(block: Float32, points: Float32) -> None:
+    """Copy up to `LANES` points (n, POINT_SIZE) into the columns of a block."""
     for k in range(len(points)):
         for c in range(POINT_SIZE):
             block[c * LANES + k] = points[k, c]
 
 
 @kernel
-def move(block: Float32, T: Float64) -> None:
-    """Say where the points of a block come to be in the target."""
+def transform_block(block: Float32, T: Float64) -> None:
+    """Transform the points of a block by T (4, 4) into the target."""
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
@@ -164,24 +167,26 @@ def move(block: Float32, T: Float64) -> None:
         py = block[(POINT + 1) * LANES + k]
         pz = block[(POINT + 2) * LANES + k]
         z = r20 * px + r21 * py + r22 * pz + t2
-        per_z = 1 / z if z > _NEAREST else 0.0
+        per_z = 1 / z if z > _MIN_DEPTH else 0.0
         block[_XN * LANES + k] = (r00 * px + r01 * py + r02 * pz + t0) * per_z
         block[_YN * LANES + k] = (r10 * px + r11 * py + r12 * pz + t1) * per_z
         block[_Z * LANES + k] = z
 
 
 @kernel
-def land(
+def project_block(
     block: Float32, count: int, target: Float32, lookup: Float32, lookup_frame: Float64
 ) -> int:
-    """Find the target's pixels of the points of a block; returns how many land on one."""
+    """Fetch the target pixels that the points of a block project to; returns how many have one."""
     rows, columns = target.shape[0], target.shape[1]
     landed = 0
     for k in range(LANES):
         block[SEEN * LANES + k] = 0
-        if k >= count or not block[_Z * LANES + k] > _NEAREST:
+        if k >= count or not block[_Z * LANES + k] > _MIN_DEPTH:
             continue
-        u, v, iu, _ = landing(block[_XN * LANES + k], block[_YN * LANES + k], lookup, lookup_frame)
+        u, v, iu, _ = project_ray(
+            block[_XN * LANES + k], block[_YN * LANES + k], lookup, lookup_frame
+        )
         if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
         landed += 1
@@ -194,19 +199,19 @@ def land(
 
 
 @kernel
-def distances(
+def compare_planes(
     block: Float32,
     T: Float64,
     scale_g: float,
-    slack: float,
+    inflation: float,
     robust: float,
     min_cosine: float,
 ) -> None:
-    """Compare the points of a block with the planes that they fell on."""
+    """Compare the points of a block with the target planes; parameters as in `accumulate`."""
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
-    scale_g2, slack2 = np.float32(scale_g * scale_g), np.float32(slack * slack)
+    scale_g2, slack2 = np.float32(scale_g * scale_g), np.float32(inflation * inflation)
     per_limit2, least = np.float32(1 / (robust * robust)), np.float32(min_cosine)
     one, none = np.float32(1), np.float32(0)
     for k in range(LANES):
@@ -226,7 +231,7 @@ def distances(
         m0 = r00 * n0 + r10 * n1 + r20 * n2
         m1 = r01 * n0 + r11 * n1 + r21 * n2
         m2 = r02 * n0 + r12 * n1 + r22 * n2
-        # How an error along the source's ray, relative to z, moves the point across the plane.
+        # An error along the source's ray, relative to z, moves the point this far off the plane.
         along = (m0 * px + m1 * py + m2 * pz) * block[SIGMA * LANES + k]
         own = along * along + block[(_PIXEL + VARIANCE) * LANES + k]
         r2 = r * r
@@ -235,7 +240,7 @@ def distances(
         e2 = r2 * per_variance * per_limit2
         seen = block[SEEN * LANES + k] > none
         fits = seen & (e2 < one) & (s0 * m0 + s1 * m1 + s2 * m2 >= least)
-        # Nearer than what the target saw there: it looked through this point.
+        # Nearer than the target's surface: in its free space.
         in_front = seen & (r < none) & (e2 > np.float32(4))
         weight = (one - e2) * (one - e2) if fits else none
         root = (one - e2) * np.sqrt(per_variance) if fits else none
@@ -252,8 +257,10 @@ def distances(
 
 
 @kernel
-def albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust: float) -> None:
-    """Compare the albedo of the points of a block that fit with that of where they fell."""
+def compare_albedos(
+    block: Float32, T: Float64, exposure: float, scale_p: float, robust: float
+) -> None:
+    """Compare the albedo of a block's inliers with the target; parameters as in `accumulate`."""
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
@@ -268,8 +275,8 @@ def albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust:
         tx = block[(_PIXEL + ALBEDO_SLOPE) * LANES + k]
         ty = block[(_PIXEL + ALBEDO_SLOPE + 1) * LANES + k]
         r = block[(_PIXEL + ALBEDO) * LANES + k] + tx * xn + ty * yn
-        r -= block[LIGHT * LANES + k] + change
-        # Where either is unknown, so is r, and no comparison holds.
+        r -= block[POINT_ALBEDO * LANES + k] + change
+        # If either is unknown, r is NaN, and the comparison is false.
         known = (block[FITS * LANES + k] > none) & (r * r < np.float32(np.inf))
         e2 = r * r * per_limit2
         fits = known & (e2 < one)
@@ -277,13 +284,13 @@ def albedos(block: Float32, T: Float64, exposure: float, scale_p: float, robust:
         root = (one - e2) * per_p if fits else none
         r = r if fits else none
         tx, ty = tx if fits else none, ty if fits else none
-        s0 = block[LIGHT_SLOPE * LANES + k] if fits else none
-        s1 = block[(LIGHT_SLOPE + 1) * LANES + k] if fits else none
-        s2 = block[(LIGHT_SLOPE + 2) * LANES + k] if fits else none
+        s0 = block[POINT_ALBEDO_SLOPE * LANES + k] if fits else none
+        s1 = block[(POINT_ALBEDO_SLOPE + 1) * LANES + k] if fits else none
+        s2 = block[(POINT_ALBEDO_SLOPE + 2) * LANES + k] if fits else none
         block[(STAT + COUNT_P - INLIERS) * LANES + k] = one if known else none
         block[(STAT + WEIGHT_P - INLIERS) * LANES + k] = weight
         block[(STAT + SQUARES_P - INLIERS) * LANES + k] = weight * r * r
-        # d(x/z, y/z) by the moved point, then back into the source frame.
+        # Derivative of (x/z, y/z) by the transformed point, rotated back into the source frame.
         per_z = one / block[_Z * LANES + k] if fits else none
         d0, d1, d2 = tx * per_z, ty * per_z, -(tx * xn + ty * yn) * per_z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
@@ -309,7 +316,7 @@ def _put(
     s1: np.float32,
     s2: np.float32,
 ) -> None:
-    """Write J by the pose and D into column k, weighted; m and s are the sides' directions."""
+    """Write J and D, weighted by `root`, into column k; m and s are the target's and source's."""
     half = np.float32(0.5) * root
     a0, a1, a2 = half * (m0 + s0), half * (m1 + s1), half * (m2 + s2)
     block[JACOBIAN * LANES + k] = a0
@@ -343,7 +350,7 @@ def _add_products(sums: Float64, block: Float32) -> None:
 
 @kernel
 def histogram_bin(ratio: float) -> int:
-    """Bin of a squared distance: the exponent of the number and two bits of its mantissa."""
+    """Return the bin of a squared distance: its exponent and two bits of its mantissa."""
     bits = np.float32(ratio).view(np.int32)
     place = int(bits >> 21) - ((127 - 8) << 2)
     return min(max(place, 0), BINS - 1)
@@ -351,16 +358,16 @@ def histogram_bin(ratio: float) -> int:
 
 @kernel
 def bin_edge(place: int) -> float:
-    """Squared distance, in unscaled variances, at which a bin of the histogram begins."""
+    """Return the lower edge of a histogram bin: a squared distance in unscaled variances."""
     return 2.0 ** ((place >> 2) - 8) * (1 + (place & 3) / 4) if place > 0 else 0.0
 
 
 @kernel
 def normal_equations(total: Float64) -> tuple[Float64, Float64, Float64]:
-    """Unpack what `accumulate` summed: H (7, 7), g (7,) and the cross-information (7, 7).
+    """Unpack the sums of `accumulate`: H (7, 7), g (7,) and the cross-information (7, 7).
 
-    The seventh unknown is the exposure; without the photometric term its row is that of the unit
-    matrix in H and 0 in the cross-information.
+    The seventh unknown is the exposure. Without the photometric term its row is that of the
+    identity in H and 0 in the cross-information.
     """
     A = np.zeros((7, 7))
     C = np.zeros((7, 7))
@@ -392,12 +399,17 @@ def gather(
     rays: Float32,
     planes: Float32,
     plane_variance: Float32,
-    photo: Float32,
+    albedo: Float32,
     stride: int,
 ) -> Float32:
-    """Take every `stride`-th pixel of every `stride`-th row that has a plane, row by row.
+    """Return source points (N, POINT_SIZE) on the fitted planes of every `stride`-th pixel.
 
-    Returns (N, POINT_SIZE) points on the fitted surface.
+    Parameters
+    ----------
+    rays, planes, plane_variance, albedo
+        (H, W, 2), (H, W, 4), (H, W) and (H, W, 3) of a `PreparedView`.
+    stride
+        Pixels between samples, in both directions.
     """
     rows, columns = planes.shape[0], planes.shape[1]
     most = ((rows + stride - 1) // stride) * ((columns + stride - 1) // stride)
@@ -407,7 +419,7 @@ def gather(
         for j in range(stride // 2, columns, stride):
             if planes[i, j, 3] <= 0:
                 continue
-            put_point(out[n], rays[i, j], planes[i, j], plane_variance[i, j], photo[i, j])
+            put_point(out[n], rays[i, j], planes[i, j], plane_variance[i, j], albedo[i, j])
             n += 1
     return out[:n]
 
@@ -416,7 +428,7 @@ def gather(
 def put_point(
     point: Float32, ray: Float32, plane: Float32, variance: np.float32, light: Float32
 ) -> None:
-    """Write a pixel that has a plane as a source point (POINT_SIZE,)."""
+    """Write the source point (POINT_SIZE,) of a pixel that has a plane."""
     v = plane[3]
     x, y = ray[0], ray[1]
     a, b, c = plane[0], plane[1], plane[2]
@@ -425,14 +437,16 @@ def put_point(
     point[POINT], point[POINT + 1], point[POINT + 2] = x / v, y / v, 1 / v
     point[NORMAL], point[NORMAL + 1], point[NORMAL + 2] = a / length, b / length, c / length
     point[SIGMA] = np.sqrt(variance) / v
-    point[LIGHT] = light[0]
-    point[LIGHT_SLOPE], point[LIGHT_SLOPE + 1] = gx * v, gy * v
-    point[LIGHT_SLOPE + 2] = -(gx * x + gy * y) * v
+    point[POINT_ALBEDO] = light[0]
+    point[POINT_ALBEDO_SLOPE], point[POINT_ALBEDO_SLOPE + 1] = gx * v, gy * v
+    point[POINT_ALBEDO_SLOPE + 2] = -(gx * x + gy * y) * v
 
 
 @kernel
-def make_target(rays: Float32, planes: Float32, plane_variance: Float32, photo: Float32) -> Float32:
-    """Return a view as (H, W, PIXEL_SIZE), as a target is compared with."""
+def make_target(
+    rays: Float32, planes: Float32, plane_variance: Float32, albedo: Float32
+) -> Float32:
+    """Return the target image (H, W, PIXEL_SIZE) of a view; parameters as in `gather`."""
     rows, columns = planes.shape[0], planes.shape[1]
     out = np.zeros((rows, columns, PIXEL_SIZE), np.float32)
     for i in range(rows):
@@ -442,12 +456,12 @@ def make_target(rays: Float32, planes: Float32, plane_variance: Float32, photo: 
             a, b, c = planes[i, j, 0], planes[i, j, 1], planes[i, j, 2]
             length2 = a * a + b * b + c * c
             length = np.sqrt(length2)
-            gx, gy = photo[i, j, 1], photo[i, j, 2]
+            gx, gy = albedo[i, j, 1], albedo[i, j, 2]
             pixel = out[i, j]
             pixel[PLANE], pixel[PLANE + 1], pixel[PLANE + 2] = a / length, b / length, c / length
             pixel[DISTANCE] = 1 / length
             pixel[VARIANCE] = plane_variance[i, j] / length2
-            pixel[ALBEDO] = photo[i, j, 0] - gx * rays[i, j, 0] - gy * rays[i, j, 1]
+            pixel[ALBEDO] = albedo[i, j, 0] - gx * rays[i, j, 0] - gy * rays[i, j, 1]
             pixel[ALBEDO_SLOPE], pixel[ALBEDO_SLOPE + 1] = gx, gy
     return out
 
@@ -456,7 +470,10 @@ def make_target(rays: Float32, planes: Float32, plane_variance: Float32, photo: 
 def exposure_differences(
     points: Float32, every: int, target: Float32, lookup: Float32, lookup_frame: Float64, T: Float64
 ) -> Float64:
-    """Log albedo of the target minus the source's, where every so manieth point lands."""
+    """Return log albedo differences, target minus source, at every `every`-th point's projection.
+
+    The other parameters are those of `accumulate`. Returns (n,), without unknown ones.
+    """
     out = np.empty(points.shape[0] // every + 1)
     n = 0
     for k in range(0, points.shape[0], every):
@@ -466,7 +483,7 @@ def exposure_differences(
             continue
         x = (T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / z
         y = (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z
-        u, v, iu, _ = landing(x, y, lookup, lookup_frame)
+        u, v, iu, _ = project_ray(x, y, lookup, lookup_frame)
         if iu < 0 or not (
             u > -0.5 and v > -0.5 and u < target.shape[1] - 0.5 and v < target.shape[0] - 0.5
         ):
@@ -475,7 +492,7 @@ def exposure_differences(
         if pixel[DISTANCE] == 0:
             continue
         light = pixel[ALBEDO] + x * pixel[ALBEDO_SLOPE] + y * pixel[ALBEDO_SLOPE + 1]
-        difference = light - points[k, LIGHT]
+        difference = light - points[k, POINT_ALBEDO]
         if not np.isnan(difference):
             out[n] = difference
             n += 1

@@ -1,4 +1,4 @@
-"""Textures: which triangle each texel lies in, and what views see there."""
+"""Texture atlases: rasterising triangles, and blending the views' colours."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import landing
+from tofuse.kernels.projection import project_ray
 
-NOBODY = -1
+UNOWNED = -1
 
 
 @kernel
 def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float32) -> None:
-    """Say of each texel whose it is, and where in its triangle.
+    """Rasterise triangles: write the triangle and barycentric coordinates of each texel.
 
     Parameters
     ----------
     corners
-        (M, 3, 2) column and row of the corners, centres of texels at whole numbers.
+        (M, 3, 2) column and row of the corners; texel centres are at integers.
     margin
-        Texels so far outside of an edge belong to the triangle too, if to no other.
+        Distance in texels up to which texels outside a triangle belong to it, if to no other.
     owner
-        (H, W), filled in: the triangle; what was `NOBODY` before.
+        (H, W) of `UNOWNED`; the triangle of each texel is written.
     places
-        (H, W, 2), filled in: the shares of the second and the third corner, below 0 or above 1
-        outside of the triangle.
+        (H, W, 2) written: barycentric coordinates of the second and third corner, below 0 or above
+        1 outside the triangle.
     """
     height, width = owner.shape
     for m in range(len(corners)):
@@ -35,7 +35,7 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
         area = bx * cy - by * cx
         if abs(area) < 1e-9:
             continue
-        # Distance of a point from an edge is its share times the height over that edge.
+        # Distance of a point from an edge: its barycentric coordinate times the height over it.
         over_b = abs(area) / max(np.sqrt(cx * cx + cy * cy), 1e-9)
         over_c = abs(area) / max(np.sqrt(bx * bx + by * by), 1e-9)
         over_a = abs(area) / max(np.sqrt((bx - cx) ** 2 + (by - cy) ** 2), 1e-9)
@@ -49,7 +49,7 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
                 b = (x * cy - y * cx) / area
                 c = (y * bx - x * by) / area
                 out = max(-b * over_b, -c * over_c, -(1 - b - c) * over_a)
-                if out > margin or (out > 1e-6 and owner[v, u] != NOBODY):
+                if out > margin or (out > 1e-6 and owner[v, u] != UNOWNED):
                     continue
                 owner[v, u] = m
                 places[v, u, 0] = b
@@ -57,7 +57,7 @@ def draw_triangles(corners: Float32, margin: float, owner: Int32, places: Float3
 
 
 @kernel
-def see(
+def add_view(
     points: Float32,
     normals: Float32,
     T_camera_world: Float64,
@@ -65,8 +65,8 @@ def see(
     image: Float32,
     lookup: Float32,
     frame: Float64,
-    slack: float,
-    slack_share: float,
+    tolerance: float,
+    tolerance_ratio: float,
     border: float,
     power: float,
     sums: Float32,
@@ -74,28 +74,29 @@ def see(
     start: int,
     end: int,
 ) -> None:
-    """Add what a view sees at points, where it sees them and nothing else is near.
+    """Add a view's colours at the points that are visible in it.
 
     Parameters
     ----------
     points, normals
         (N, 3) in the world.
     z
-        (H, W) z of what the view sees, m; 0 where unknown.
+        (H, W) z depth of the view, m; 0 where unknown.
     image
         (H, W, C), negative where unknown.
     lookup, frame
-        See `landing`.
-    slack, slack_share
-        How far a point may be from what is seen there and beside: m, and as a share of its z.
+        Projection of the view's camera, see `project_ray`.
+    tolerance, tolerance_ratio
+        Largest difference between a point's z and the depth around its projection: m, and relative
+        to z.
     border
-        Pixels from the border of the image on which it counts less.
+        Width in pixels of the image border in which the weight decreases.
     power
-        How much the nearest and straightest view counts more than others.
+        Exponent by which near and perpendicular views are preferred.
     sums, weights
         (N, C) and (N,), added to.
     start, end
-        The points to do.
+        Range of points.
     """
     height, width = z.shape
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
@@ -105,7 +106,7 @@ def see(
         d = R[2, 0] * points[n, 0] + R[2, 1] * points[n, 1] + R[2, 2] * points[n, 2] + t[2]
         if d <= 0.01:
             continue
-        u, v, i, _ = landing(x / d, y / d, lookup, frame)
+        u, v, i, _ = project_ray(x / d, y / d, lookup, frame)
         if i < 0 or not (u >= 1 and v >= 1 and u < width - 2 and v < height - 2):
             continue
         length = np.sqrt(x * x + y * y + d * d)
@@ -115,9 +116,9 @@ def see(
             facing += toward * normals[n, k]
         if facing < 0.15:
             continue
-        # What is seen around must be this surface: light mixes at edges, and poses err.
+        # All pixels around must show this surface: colours mix at edges, and poses have errors.
         iu, iv = int(u), int(v)
-        allowed = slack + slack_share * d
+        allowed = tolerance + tolerance_ratio * d
         clear = True
         for dv in range(-1, 3):
             for du in range(-1, 3):

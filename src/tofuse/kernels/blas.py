@@ -14,9 +14,9 @@ from threadpoolctl import ThreadpoolController
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Let BLAS use one thread inside the block.
+    """Limit BLAS to one thread inside the block.
 
-    The number is one of the whole process: where several threads ask, the first decides.
+    The limit is global to the process.
     """
     limit: AbstractContextManager[object] = _controller().limit(limits=1, user_api="blas")
     return limit
@@ -24,5 +24,5 @@ def one_blas_thread() -> AbstractContextManager[object]:
 
 @cache
 def _controller() -> ThreadpoolController:
-    """Of the libraries that are loaded: looking for them takes milliseconds."""
+    """Return the controller of the loaded libraries, whose detection takes milliseconds."""
     return ThreadpoolController()

@@ -1,8 +1,8 @@
-"""Sparse blocks of voxels, known by keys in open-addressed tables (Nießner et al. 2013).
+"""Sparse blocks of voxels, identified by keys in open-addressed hash tables (Nießner et al. 2013).
 
-Space is cut into blocks of 8 x 8 x 8 voxels, of which only those near surfaces are kept. A block is
-known by a 63-bit key; tables of keys are probed linearly. A block's voxels are numbered by eighths:
-those of each 4 x 4 x 4 are neighbours in memory.
+Space is divided into blocks of 8 x 8 x 8 voxels, of which only those near surfaces are stored. A
+block has a 63-bit key; tables use linear probing. The voxels of each eighth (4 x 4 x 4) of a block
+are contiguous in memory.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from tofuse.kernels.jit import kernel
 
 EDGE = 8  # voxels along the edge of a block
 VOXELS = EDGE**3
-EMPTY = -1  # of a table of keys
-HALF = 1 << 20  # blocks reach from minus this to below it along each axis
+EMPTY = -1  # empty slot of a table
+HALF = 1 << 20  # block indices are from -HALF to HALF - 1
 _MASK = (1 << 21) - 1
 
 
 @kernel
 def block_key(i: int, j: int, k: int) -> int:
-    """Key of the block (i, j, k), each from -2^20 to 2^20 - 1."""
+    """Return the key of the block (i, j, k), each from -2^20 to 2^20 - 1."""
     return ((i + HALF) << 42) | ((j + HALF) << 21) | (k + HALF)
 
 
 @kernel
 def block_of(key: int) -> tuple[int, int, int]:
-    """Block (i, j, k) of a key."""
+    """Return the block (i, j, k) of a key."""
     return (key >> 42) - HALF, ((key >> 21) & _MASK) - HALF, (key & _MASK) - HALF
 
 
 @kernel
 def slot_of(table: Int64, key: int) -> int:
-    """Where `key` is in the table (a power of two long), or the empty place where it belongs."""
+    """Return the slot of `key` in the table (2^n,), or the empty slot where it belongs."""
     # Fibonacci hashing: the upper bits of the product depend on all bits of the key.
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     mask = len(table) - 1
@@ -54,14 +54,14 @@ def _grown(table: Int64) -> Int64:
 
 @kernel
 def voxel_at(i: int, j: int, k: int) -> int:
-    """Number of the voxel (i, j, k), each from 0 to 7, within its block."""
+    """Return the number within its block of the voxel (i, j, k), each from 0 to 7."""
     eighth = (i & 4) << 6 | (j & 4) << 5 | (k & 4) << 4
     return int(eighth | (i & 3) << 4 | (j & 3) << 2 | (k & 3))
 
 
 @kernel
 def voxel_of(number: int) -> tuple[int, int, int]:
-    """Voxel (i, j, k) of a number."""
+    """Return the voxel (i, j, k) of a number within its block."""
     i = (number >> 6) & 4 | (number >> 4) & 3
     j = (number >> 5) & 4 | (number >> 2) & 3
     k = (number >> 4) & 4 | number & 3
@@ -70,7 +70,7 @@ def voxel_of(number: int) -> tuple[int, int, int]:
 
 @kernel
 def enter(table: Int64, count: int, keys: Int64) -> tuple[Int64, int]:
-    """Enter keys: the table, a larger one if it had to grow, and how many it holds now."""
+    """Insert keys; returns the table, replaced by a larger one if necessary, and its new count."""
     for key in keys:
         slot = slot_of(table, key)
         if table[slot] == EMPTY:
@@ -83,14 +83,14 @@ def enter(table: Int64, count: int, keys: Int64) -> tuple[Int64, int]:
 
 @kernel
 def parent_of(key: int) -> tuple[int, int]:
-    """Key of the block that holds a cube half as large, and which eighth of it that is."""
+    """Return the key of the block that contains a cube of half its size, and its eighth."""
     i, j, k = block_of(key)
     return block_key(i >> 1, j >> 1, k >> 1), (i & 1) << 2 | (j & 1) << 1 | (k & 1)
 
 
 @kernel
 def index_of(keys: Int64) -> tuple[Int64, Int32]:
-    """Table of distinct keys, and the row of each."""
+    """Return a hash table of distinct keys (B,), and the row of the key in each of its slots."""
     size = 16
     while size < 2 * len(keys):
         size *= 2
@@ -105,9 +105,9 @@ def index_of(keys: Int64) -> tuple[Int64, Int32]:
 
 @kernel
 def mark_eighths(cubes: Int64, table: Int64, rows: Int32, marks: UInt8) -> None:
-    """Set the bits of eighths of blocks, in `marks` (B,), given the keys of cubes of their size.
+    """Set the bits in `marks` (B,) of the eighths of blocks that are among the given cubes.
 
-    `table` and `rows` are those of `index_of`; blocks that are not in there are passed over.
+    `table` and `rows` are those of `index_of`; cubes of other blocks are ignored.
     """
     for cube in cubes:
         key, eighth = parent_of(cube)
@@ -118,7 +118,7 @@ def mark_eighths(cubes: Int64, table: Int64, rows: Int32, marks: UInt8) -> None:
 
 @kernel
 def neighbours_of(keys: Int64, out: Int32) -> None:
-    """Rows of the 27 blocks around each block, itself in the middle; -1 where there is none.
+    """Write the rows of the 3 x 3 x 3 blocks around each block, itself included; -1 if missing.
 
     `keys` (B,) are distinct. Column 9 a + 3 b + c of `out` (B, 27) is the block at the offset
     (a - 1, b - 1, c - 1).

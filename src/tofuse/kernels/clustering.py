@@ -1,4 +1,4 @@
-"""Groups of vertices: connected or put together, and sums over the triangles around them."""
+"""Vertex clustering: connected components, unique keys, and quadrics of the adjacent triangles."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tofuse.kernels.jit import kernel
 
 @kernel
 def number_keys(keys: Int64, number: Int64) -> Int64:
-    """Number keys (N,), none below 0, in the order in which they first come, into `number` (N,).
+    """Number non-negative keys (N,) in the order of first occurrence, into `number` (N,).
 
-    Returns the row in which each comes first.
+    Returns the index of each key's first occurrence.
     """
     size = 1 << 10
     table = np.full(size, EMPTY, np.int64)
@@ -44,12 +44,16 @@ def number_keys(keys: Int64, number: Int64) -> Int64:
 
 
 @kernel
-def connect(faces: Int32, group: Int32) -> None:
-    """Join the vertices of each triangle in `group` (N,), which is 0 to N - 1 before the first.
+def union_faces(faces: Int32, group: Int32) -> None:
+    """Unite the vertices of each triangle in a union-find forest.
 
-    `faces` (M, 3) are rows of the vertices. Of each vertex `group` has one that comes before it in
-    its connected piece, or itself: the first one when all are joined and `settle` is called.
-    Paths are halved on the way (Tarjan and van Leeuwen 1984).
+    Parameters
+    ----------
+    faces
+        (M, 3) vertex indices.
+    group
+        (N,) parent of each vertex, initially itself; updated. Roots are the lowest index of a
+        component. Paths are halved on the way (Tarjan and van Leeuwen 1984).
     """
     for m in range(len(faces)):
         for k in range(1, 3):
@@ -68,10 +72,10 @@ def connect(faces: Int32, group: Int32) -> None:
 
 
 @kernel
-def settle(group: Int32) -> None:
-    """Let each vertex know the first one of its piece; see `connect`."""
+def flatten_groups(group: Int32) -> None:
+    """Replace the parent of each vertex (N,) by the root of its component; see `union_faces`."""
     for n in range(len(group)):
-        group[n] = group[group[n]]  # what comes before is settled already
+        group[n] = group[group[n]]  # parents have lower indices and are final
 
 
 @kernel
@@ -83,10 +87,10 @@ def plane_sums(
     A: Float64,
     b: Float64,
 ) -> None:
-    """Add up what the planes of the triangles say of each group's place.
+    """Sum the quadrics of the triangles around each group of vertices (Lindstrom 2000).
 
-    Each corner of a triangle adds its plane to its group, weighed by twice the triangle's area:
-    n n^T to the upper triangle of A, and n times the height of the group's middle below the plane
+    Each corner of a triangle adds its plane to its group, weighted by twice the triangle's area:
+    n n^T to the upper triangle of A, and n times the distance of the group's centre below the plane
     to b.
 
     Parameters
@@ -94,11 +98,11 @@ def plane_sums(
     vertices, faces
         (N, 3) m, and (M, 3) rows of them.
     group
-        (N,) which group a vertex is in.
+        (N,) group of each vertex.
     middles
-        (G, 3) m.
+        (G, 3) centres of the groups, m.
     A, b
-        (G, 3, 3) and (G, 3), zeros at first.
+        (G, 3, 3) and (G, 3), added to.
     """
     p, n = np.empty((3, 3)), np.empty(3)
     for m in range(len(faces)):

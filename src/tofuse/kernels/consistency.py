@@ -24,15 +24,14 @@ def move_points(points: Float64, T: Float64, out: Float64) -> None:
 
 @kernel
 def project_by_lens(points: Float64, lens: Float64, out: Float64) -> None:
-    """Write the pixels (N, 2) that points (N, 3) in the camera frame land on; NaN if z <= 0.
+    """Write the pixels (N, 2) that points (N, 3) in the camera frame project to; NaN if z <= 0.
 
     Parameters
     ----------
     lens
         0 fx, 1 fy, 2 cx, 3 cy, 4 k1, 5 k2, 6 p1, 7 p2, 8 k3, 9 k4, 10 k5, 11 k6, 12 model (0
         pinhole; 1 rational, with the order of distortion of OpenCV; 2 fisheye, k1 to k4 in 4, 5,
-        8, 9), 13 the largest x^2 + y^2 at z = 1 that the lens sees: further out its polynomials
-        mean nothing.
+        8, 9), 13 the largest x^2 + y^2 at z = 1 for which the distortion model is valid.
     """
     for k in range(len(points)):
         z = points[k, 2]
@@ -41,7 +40,7 @@ def project_by_lens(points: Float64, lens: Float64, out: Float64) -> None:
         if not z > 0:
             continue
         if lens[12] == 0:
-            # Multiplied before it is divided, as the definition has it.
+            # Multiply before dividing, as in the definition.
             out[k, 0] = lens[0] * points[k, 0] / z + lens[2]
             out[k, 1] = lens[1] * points[k, 1] / z + lens[3]
             continue
@@ -75,12 +74,12 @@ def agreement_sums(
     same_surface: float,
     inlier: float,
 ) -> tuple[int, int, int, float]:
-    """Compare points with the image that they land on.
+    """Compare points with the image they project to.
 
     Parameters
     ----------
     points, pixels
-        (N, 3) in the frame of the target's camera, m, and (N, 2) where they land; NaN is outside.
+        (N, 3) in the frame of the target's camera, m, and (N, 2) their projections, NaN outside.
     target, normals
         (H, W, 3) points of the target, z = 0 where invalid; its normals, 0 where unknown.
     same_surface
@@ -90,8 +89,8 @@ def agreement_sums(
 
     Returns
     -------
-    How many points overlap, how many land on a pixel with a normal, how many of these are
-    inliers, and the sum of the inliers' squared distances from the plane there, m^2.
+    Numbers of overlapping points, of points that project to a pixel with a normal, and of inliers
+    among these; and the sum of the inliers' squared distances from the plane, m^2.
     """
     height, width = target.shape[:2]
     overlapping, planes, inliers, squares = 0, 0, 0, 0.0

@@ -1,4 +1,4 @@
-"""How many cores this process may use: what it is bound to, and what its container is allowed."""
+"""Number of cores that this process may use, by CPU affinity and control-group quota."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from pathlib import Path
 
 @cache
 def usable_cores() -> int:
-    """Return how many threads can work at once: cores it may run on, and no more than its quota."""
+    """Return the number of threads that can run at once: by affinity, limited by the quota."""
     allowed = quota()
     return max(1, _bound() if allowed is None else min(_bound(), math.ceil(allowed)))
 
 
 def _bound() -> int:
-    """Cores that this process is bound to, or all."""
+    """Return the number of cores that this process may be scheduled on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def quota(root: Path = Path("/")) -> float | None:
-    """Cores' worth of time that the control groups of this process leave it; None where all.
+    """Return the CPU quota of this process's control groups, in cores; None without a limit.
 
     Parameters
     ----------
     root
-        Of the file system.
+        Root of the file system.
     """
     limits = [limit for folder in _groups(root) if (limit := _limit(folder)) is not None]
     return min(limits, default=None)
 
 
 def _groups(root: Path) -> list[Path]:
-    """Folders of the control groups of this process, of both versions, with those above them."""
+    """Return the folders of this process's control groups (v1 and v2) and of their parents."""
     mounted = root / "sys/fs/cgroup"
     found: list[Path] = []
     for line in _read(root / "proc/self/cgroup").splitlines():

@@ -9,8 +9,8 @@ from tofuse.kernels.jit import kernel
 
 
 @kernel
-def moved(T: Float64, xi: Float64) -> Float64:
-    """T * exp(xi), (4, 4), with the rotation brought back to orthogonality to first order."""
+def retract(T: Float64, xi: Float64) -> Float64:
+    """Return T exp(xi), (4, 4), its rotation re-orthogonalised by one Newton step."""
     w0, w1, w2 = xi[3], xi[4], xi[5]
     angle2 = w0 * w0 + w1 * w1 + w2 * w2
     angle = np.sqrt(angle2)
@@ -65,8 +65,8 @@ def moved(T: Float64, xi: Float64) -> Float64:
 
 
 @kernel
-def composed(A: Float64, B: Float64) -> Float64:
-    """A B, (4, 4), of two rigid motions."""
+def compose(A: Float64, B: Float64) -> Float64:
+    """Return A B, (4, 4), of two rigid motions."""
     out = np.zeros((4, 4))
     for i in range(3):
         out[i, 3] = A[i, 3]
@@ -80,7 +80,7 @@ def composed(A: Float64, B: Float64) -> Float64:
 
 @kernel
 def twist_between(A: Float64, B: Float64) -> Float64:
-    """Logarithm (6,) of A^-1 B, for rotations below half a turn."""
+    """Return log(A^-1 B), (6,), for rotations by less than pi."""
     R = np.zeros((3, 3))
     t = np.zeros(3)
     for i in range(3):
@@ -111,7 +111,7 @@ def twist_between(A: Float64, B: Float64) -> Float64:
 
 @kernel
 def distance_and_angle(A: Float64, B: Float64) -> tuple[float, float]:
-    """Length of the translation of A^-1 B, and angle of its rotation, 0 to pi rad."""
+    """Return length of translation (m) and angle of rotation (0 to pi rad) of A^-1 B."""
     R = np.zeros((3, 3))
     square = 0.0
     for i in range(3):

@@ -1,8 +1,8 @@
-"""Light that visible surfaces reflect onto each other, on a coarse grid of an image.
+"""Light that surfaces reflect onto each other (multipath), on a coarse grid of an image.
 
-A grid node stands for a block of pixels. Nodes are rows of `nodes` (N, 8): x and y of the mean
-ray, mean inverse depth w, light per pixel, area of the block in the plane z = 1, and the slopes a,
-b, c of the plane 1/z = a x + b y + c through it (all 0 where no plane fits).
+A grid node stands for a block of pixels. The columns of `nodes` are x and y of the mean ray, mean
+inverse depth w, mean amplitude per pixel, area of the block in the plane z = 1, and the
+coefficients a, b, c of the plane 1/z = a x + b y + c through it (all 0 where no plane fits).
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import numpy as np
 from tofuse.arrays import Bool, Complex128, Float32, Float64
 from tofuse.kernels.jit import kernel
 
-X, Y, W, LIGHT, AREA, A, B, C, COLUMNS = range(9)
+X, Y, W, AMPLITUDE, AREA, A, B, C, COLUMNS = range(9)
 
-# Of a remembered surface: point, unit normal, albedo in counts, and its weight.
+# Columns of a mapped surface patch: point, unit normal, albedo in counts, and weight.
 PATCH = 8
 
-# Of cos(2 pi t) in powers of t^2 and of sin(2 pi t) in odd powers of t, for |t| <= 1/2; good to
-# 1e-6.
+# Polynomial coefficients of cos(2 pi t) in t^2, and of sin(2 pi t) in odd powers of t, for
+# |t| <= 1/2; accurate to 1e-6.
 _C0, _C1, _C2, _C3, _C4, _C5 = (
     np.float32(c)
     for c in (0.99999921, -19.73898031, 64.92865571, -85.27159959, 58.79037925, -21.07090497)
@@ -30,8 +30,8 @@ _S0, _S1, _S2, _S3, _S4, _S5 = (
 
 
 @kernel
-def extent(rays: Float32) -> Float64:
-    """Least and largest x, and least and largest y, of the known rays (H, W, 2); nan if none is."""
+def ray_bounds(rays: Float32) -> Float64:
+    """Return min x, max x, min y, max y of the known rays (H, W, 2); NaN if there are none."""
     out = np.full(4, np.nan)
     for i in range(rays.shape[0]):
         for j in range(rays.shape[1]):
@@ -48,10 +48,17 @@ def extent(rays: Float32) -> Float64:
 def block_means(
     z: Float32, rays: Float32, light: Float32, step: int, jump: float, nodes: Float64
 ) -> None:
-    """Means over blocks of step x step pixels, of those pixels that lie on one surface.
+    """Average blocks of step x step pixels over the pixels of the block's dominant surface.
 
-    That is, of those whose depth is within `jump` (share of the depth) of the block's median. Sets
-    the first five columns of nodes (Hn, Wn, COLUMNS); w is 0 where less than a quarter is valid.
+    Parameters
+    ----------
+    z, rays, light
+        (H, W) depth in m, (H, W, 2) x/z and y/z, and (H, W) raw amplitude; 0 where unknown.
+    jump
+        Pixels within this fraction of the block's median depth are averaged.
+    nodes
+        (Hn, Wn, COLUMNS), of which the first five columns are written; w is 0 where less than a
+        quarter of the block is valid.
     """
     rows, columns = z.shape
     d = np.empty(step * step)
@@ -63,7 +70,7 @@ def block_means(
             for i in range(top, bottom):
                 for j in range(left, right):
                     if z[i, j] > 0:
-                        # Insertion into ascending order: quicker than sorting so few.
+                        # Insertion sort: faster for so few values.
                         m = n
                         while m > 0 and d[m - 1] > z[i, j]:
                             d[m] = d[m - 1]
@@ -104,16 +111,16 @@ def block_means(
             nodes[bi, bj, X] = x / count
             nodes[bi, bj, Y] = y / count
             nodes[bi, bj, W] = w / count
-            nodes[bi, bj, LIGHT] = amount / lit if lit > 0 else 0.0
+            nodes[bi, bj, AMPLITUDE] = amount / lit if lit > 0 else 0.0
             nodes[bi, bj, AREA] = area / mapped * count
 
 
 @kernel
 def window_planes(nodes: Float64, radius: int, planes: Float64) -> None:
-    """Fit 1/z = a x + b y + c to each window of nodes; planes (Hn, Wn, 4) with the relative misfit.
+    """Fit 1/z = a x + b y + c to each window of (2 radius + 1)^2 nodes.
 
-    The misfit (root mean square over 1/z) is infinite where the window has less than two thirds of
-    its nodes.
+    Writes `planes` (Hn, Wn, 4): a, b, c and the rms residual relative to 1/z, which is infinite
+    where less than two thirds of the window are valid.
     """
     rows, columns = nodes.shape[:2]
     for i in range(rows):
@@ -161,18 +168,24 @@ def window_planes(nodes: Float64, radius: int, planes: Float64) -> None:
 def choose_planes(
     nodes: Float64, planes: Float64, radius: int, limit: float, measured: Float64, shift: Float64
 ) -> None:
-    """Give each node without a plane the best of the windows around it (Kuwahara 1976).
+    """Assign to each node without a plane the best-fitting plane of the windows around it.
 
-    So that planes reach up to an edge and do not cut it off. Only planes that fit their window and
-    the node to within `limit` (relative) are taken; of equal ones, that of the nearest window.
-
-    Next to an edge a node's own bias depends on the plane that it is given to, so it is compared
-    with each plane after the correction by that window's.
+    As in the filter of Kuwahara (1976), planes then extend up to an edge without smoothing it.
+    Next to an edge the bias of a node depends on the surface it belongs to, so the node is compared
+    with each plane after correction by that window's bias.
 
     Parameters
     ----------
+    nodes
+        (Hn, Wn, COLUMNS), updated.
+    planes
+        (Hn, Wn, 4) of `window_planes`.
+    radius
+        In nodes.
+    limit
+        Largest relative misfit of a plane; that of the node itself may be twice as large.
     measured, shift
-        (Hn, Wn) radial range in m without correction, and the bias of each node's as far as known.
+        (Hn, Wn) uncorrected radial range in m, and current estimate of its bias.
     """
     rows, columns = nodes.shape[:2]
     for i in range(rows):
@@ -205,32 +218,32 @@ def choose_planes(
 
 
 @kernel
-def light_surfaces(
+def surface_radiometry(
     nodes: Float64,
     factor: Float64,
     falloff: float,
-    least_cosine: float,
+    min_cosine: float,
     good: Bool,
     points: Float64,
     normals: Float64,
     values: Float64,
 ) -> None:
-    """Geometry and light of nodes (Hn, Wn, COLUMNS) with planes; 0 where there is none.
+    """Compute geometry and radiometry of the nodes (Hn, Wn, COLUMNS) that have a plane.
 
     Parameters
     ----------
     factor
         (Hn, Wn) by which indirect light has raised the amplitude.
     falloff
-        Light falls as the cosine to the axis to this power, half of it in the lens and half of it
-        from the lamp.
-    least_cosine
-        Incidence is taken to be no slanter.
+        Exponent of the cosine to the optical axis with which amplitude falls off, half of it due to
+        the lens and half of it due to the light source.
+    min_cosine
+        Lower limit of the cosine of incidence.
     good, points, normals
-        (Hn, Wn) whether a plane fits; (Hn, Wn, 3) in m; unit, towards the camera.
+        Written: (Hn, Wn) whether a plane fits; (Hn, Wn, 3) in m; unit, towards the camera.
     values
-        (5, Hn, Wn): radial range in m, area in m^2, light of the lamp, light sent out, and albedo
-        in counts, see `Surfaces`.
+        Written: (5, Hn, Wn) radial range in m, area in m^2, direct irradiance, radiosity, and
+        albedo in counts, see `Surfaces`; 0 without a plane.
     """
     for i in range(nodes.shape[0]):
         for j in range(nodes.shape[1]):
@@ -247,7 +260,7 @@ def light_surfaces(
                     values[n, i, j] = 0.0
                 continue
             length = np.sqrt(1.0 + x * x + y * y)
-            cosine = min(max(w / (slope * length), least_cosine), 1.0)
+            cosine = min(max(w / (slope * length), min_cosine), 1.0)
             r = length / w
             half = length ** (-falloff / 2)
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = x / w, y / w, 1.0 / w
@@ -256,12 +269,12 @@ def light_surfaces(
             values[0, i, j] = r
             values[1, i, j] = nodes[i, j, AREA] / (w * w * length * cosine)
             values[2, i, j] = half * cosine / (r * r)
-            values[3, i, j] = nodes[i, j, LIGHT] / half
+            values[3, i, j] = nodes[i, j, AMPLITUDE] / half
             values[4, i, j] = values[3, i, j] / values[2, i, j] / factor[i, j]
 
 
 @kernel
-def seen_sources(
+def visible_sources(
     good: Bool,
     points: Float64,
     normals: Float64,
@@ -269,21 +282,23 @@ def seen_sources(
     radiosity: Complex128,
     out: Float32,
 ) -> int:
-    """Make sources of nodes (Hn, Wn): one of every 2 x 2 that are alike, else one of each.
+    """Make light sources of the nodes (Hn, Wn), merging similar ones of each 2 x 2 into one.
 
-    Alike are nodes whose normal is within 14 degrees of that of the strongest, and that lie off its
-    plane by less than a fiftieth of its range.
+    Nodes are merged with the strongest of the four if their normal is within 14 degrees of its
+    normal, and they lie off its plane by less than 2 % of its range.
 
     Parameters
     ----------
+    good, points, normals, area
+        (Hn, Wn), (Hn, Wn, 3), (Hn, Wn, 3) and (Hn, Wn) of `surface_radiometry`.
     radiosity
-        Light that the nodes send out, with its phase on leaving.
+        (Hn, Wn) complex, with the phase of the modulation on leaving.
     out
-        (S, 9), as `exchange` takes them; S is at least the number of nodes.
+        (S, 9) written, as in `exchange`; S is at least the number of nodes.
 
     Returns
     -------
-    How many there are.
+    The number of sources.
     """
     rows, columns = good.shape
     count = 0
@@ -343,7 +358,7 @@ def seen_sources(
 
 
 @kernel
-def unseen_sources(
+def offscreen_sources(
     rays: Float64,
     size: Float64,
     planes: Float64,
@@ -352,31 +367,33 @@ def unseen_sources(
     border_albedo: Float64,
     growth: Float64,
     falloff: float,
-    least_cosine: float,
+    min_cosine: float,
     wave_number: float,
     out: Float32,
 ) -> int:
-    """Make sources of the cells around an image that the lamp lights.
+    """Make light sources of illuminated surfaces outside the image.
 
     Parameters
     ----------
     rays, size
-        (M, 2) centres of the cells; (M,) the area that is lit, in the plane z = 1.
+        (M, 2) centres of cells around the image in the plane z = 1, and (M,) their lit area there.
     planes, albedo
-        (M, 3) of the surface that is known to be there, and (M,) relative to a white wall; where it
-        is 0, the nearest of the border's nodes goes on there.
+        (M, 3) planes of mapped surfaces in the cells, and (M,) their albedo relative to white;
+        where it is 0, the plane of the nearest border node is extrapolated.
     border, border_albedo
-        (N, COLUMNS) nodes with planes, and (N,).
+        (N, COLUMNS) nodes at the image's border that have planes, and (N,) their albedo.
     growth
-        Least and largest ratio of the inverse depth to the node's at which its plane is followed.
+        (2,) smallest and largest ratio of extrapolated to the border node's inverse depth.
+    falloff, min_cosine
+        As in `surface_radiometry`.
     wave_number
         Phase in rad per m of path.
     out
-        (S, 9), as `exchange` takes them; S is at least M.
+        (S, 9) written, as in `exchange`; S is at least M.
 
     Returns
     -------
-    How many there are.
+    The number of sources.
     """
     count = 0
     for m in range(len(rays)):
@@ -403,7 +420,7 @@ def unseen_sources(
         slope = np.sqrt(a * a + b * b + c * c)
         length = np.sqrt(1.0 + x * x + y * y)
         r = length / w
-        cosine = min(max(w / (slope * length), least_cosine), 1.0)
+        cosine = min(max(w / (slope * length), min_cosine), 1.0)
         radiosity = light * length ** (-falloff / 2) * cosine / (r * r)
         out[count, 0], out[count, 1], out[count, 2] = x / w, y / w, 1.0 / w
         out[count, 3], out[count, 4], out[count, 5] = -a / slope, -b / slope, -c / slope
@@ -415,7 +432,7 @@ def unseen_sources(
 
 
 @kernel
-def recall(
+def project_patches(
     patches: Float32,
     T_camera_world: Float64,
     rays: Float64,
@@ -423,10 +440,10 @@ def recall(
     planes: Float64,
     albedo: Float64,
 ) -> None:
-    """Find what remembered surfaces show in given cells of the plane z = 1.
+    """Project mapped surface patches into cells of the plane z = 1.
 
-    A cell takes the weighted mean over the patches in it that face the camera; only of the nearest
-    ones, as surfaces hide what is behind them.
+    A cell gets the weighted mean of the patches in it that face the camera and are not occluded by
+    nearer ones.
 
     Parameters
     ----------
@@ -435,9 +452,9 @@ def recall(
     T_camera_world
         (4, 4).
     rays, pitch
-        (M, 2) centres of the cells, which lie on a lattice of this pitch (2,).
+        (M, 2) centres of the cells, on a lattice of this pitch (2,).
     planes, albedo
-        (M, 3) a, b, c of 1/z = a x + b y + c, and (M,) in counts; set where a patch is.
+        (M, 3) a, b, c of 1/z = a x + b y + c, and (M,) in counts; written where there is a patch.
     """
     T = T_camera_world
     left, top = rays[0, 0], rays[0, 1]
@@ -493,7 +510,7 @@ def recall(
         if weight == 0.0:
             continue
         a, b, c = sums[m, 0], sums[m, 1], sums[m, 2]
-        # The plane with the mean normal that has the mean inverse depth in the cell's middle.
+        # Plane with the mean normal, and the mean inverse depth at the cell's centre.
         along = a * rays[m, 0] + b * rays[m, 1] + c
         if along >= 0.0:
             planes[m, 0] = 0.0
@@ -507,24 +524,24 @@ def recall(
 def exchange(
     sources: Float32, start: int, stop: int, receivers: Float32, wavelength: float, out: Float32
 ) -> None:
-    """Light of sources start to stop that reaches receivers, added to out (2, R).
+    """Add the irradiance of the receivers by the sources start..stop to `out`.
 
     Parameters
     ----------
     sources
-        (S, 9): point, unit normal, area in m^2, and real and imaginary part of its radiosity.
+        (S, 9): point, unit normal, area in m^2, real and imaginary part of the radiosity.
     receivers
         (6, R): point and unit normal.
     wavelength
-        Of the modulation in m: path over which the phase goes through one turn.
+        Of the modulation, m.
     out
-        Real and imaginary part of the irradiance, with the phase of the path up to the receiver.
+        (2, R) real and imaginary part of the irradiance, with the phase on arrival.
 
     Notes
     -----
-    Form factor of a disc to a point, cos cos area / (pi d^2 + area), which stays below 1 however
-    near they are. Shadows are ignored. The inner loop runs over independent receivers, so it
-    is vectorised without reordering a sum.
+    The form factor of a disc to a point, cos cos area / (pi d^2 + area), stays below 1 at any
+    distance. Occlusion is ignored. The inner loop runs over independent receivers, so it is
+    vectorised without reordering a sum.
     """
     per_turn = np.float32(1.0 / wavelength)
     pi = np.float32(np.pi)
@@ -558,7 +575,7 @@ def exchange(
 
 
 @kernel
-def spread(
+def upsample_correction(
     nodes: Float64,
     shift: Float64,
     factor: Float64,
@@ -571,19 +588,24 @@ def spread(
     z_out: Float32,
     factor_out: Float32,
 ) -> None:
-    """Carry the nodes' correction to the pixels of rows start to stop.
+    """Upsample the nodes' correction to the pixels of rows start..stop, edge-preserving.
 
-    A pixel takes the mean of the four nodes around it, by their distance in the image and by how
-    far the pixel, corrected as the node is, lies off the node's plane (relative to `tolerance`, a
-    share of the depth): so nothing leaks over edges.
+    A pixel gets the mean of the four surrounding nodes, weighted by their distance in the image and
+    by the distance of the pixel, if corrected like the node, from the node's plane.
 
     Parameters
     ----------
     nodes, shift, factor
-        (Hn, Wn, COLUMNS); (Hn, Wn) bias of the radial range in m; factor by which light is too
-        strong. Nodes without a plane count little.
+        (Hn, Wn, COLUMNS); (Hn, Wn) bias of the radial range in m; (Hn, Wn) factor by which indirect
+        light has raised the amplitude.
+    z, rays
+        (H, W) measured depth in m, (H, W, 2) x/z and y/z.
+    step
+        Pixels between nodes.
+    tolerance
+        Scale of the distance from a plane, as a fraction of the depth.
     z_out, factor_out
-        (H, W) z less the bias along the ray, 0 stays 0; and factor.
+        (H, W) written: corrected z in m (0 where invalid), and factor.
     """
     rows, columns = nodes.shape[:2]
     for i in range(start, stop):
@@ -605,7 +627,7 @@ def spread(
                 for q in range(max(j0, 0), min(j0 + 2, columns)):
                     if nodes[p, q, W] <= 0:
                         continue
-                    # Its depth, if it is on this node's surface, is this.
+                    # Depth of the pixel if it belongs to this node's surface.
                     own = d - shift[p, q] / length
                     off = (nodes[p, q, A] * x + nodes[p, q, B] * y + nodes[p, q, C]) * own - 1.0
                     off = off / tolerance
@@ -622,11 +644,12 @@ def spread(
 
 @kernel
 def flat_nodes(nodes: Float64, radius: int, limit: float, tolerance: float) -> float:
-    """Count the nodes that lie on the plane of the surface around every other node.
+    """Return a robust count of the nodes that lie on a common plane with their surroundings.
 
-    The surface around a node are the nodes in the window whose normal is within 25 degrees of its
-    own, and that lie off its plane by less than `limit` of the depth. A node off the plane through
-    all of them by x counts ``1 / (1 + x^2)``, x in `tolerance`s (shares of the depth).
+    The surroundings of every other node are the nodes of the window whose normal is within 25
+    degrees of its own, and whose distance from its plane is below `limit` times the depth. A node
+    whose distance from the plane fitted to all of them is x, in units of `tolerance` times the
+    depth, counts ``1 / (1 + x^2)``.
     """
     rows, columns = nodes.shape[:2]
     size = (2 * radius + 1) ** 2

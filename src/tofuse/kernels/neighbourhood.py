@@ -1,4 +1,4 @@
-"""What a pixel's neighbours say about it: kernels of the spatial filters, by rows."""
+"""Neighbourhood operations of the spatial filters, by rows."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tofuse.kernels.jit import kernel
 
 @kernel
 def window_median(z: Float32, half: int, start: int, stop: int, out: Float32) -> None:
-    """Write the median of the positive values around each pixel of some rows; 0 without any.
+    """Write the median of the positive values in the window around each pixel; 0 without any.
 
     Parameters
     ----------
     z
-        (H, W) values; those not above 0 don't count.
+        (H, W) values; 0 is invalid.
     half
-        The window reaches so many pixels to each side, less at the border.
+        Half width of the window in pixels; it is clipped at the border.
     start, stop
         Rows of `out` (H, W) to write.
     """
@@ -32,7 +32,7 @@ def window_median(z: Float32, half: int, start: int, stop: int, out: Float32) ->
                 for u in range(max(0, j - half), min(width, j + half + 1)):
                     value = z[v, u]
                     if value > 0:
-                        # Insertion keeps the few values sorted as they come.
+                        # Insertion sort.
                         k = n
                         while k > 0 and values[k - 1] > value:
                             values[k] = values[k - 1]
@@ -55,7 +55,7 @@ def largest_angle(
     stop: int,
     out: Float32,
 ) -> None:
-    """Write the largest angle, over the 8 neighbours, between camera and neighbour at each point.
+    """Write the largest angle at each point between the camera and one of its 8 neighbours.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def largest_angle(
                 np.float64(points[i, j, 1]),
                 np.float64(points[i, j, 2]),
             )
-            # The smallest cosine, squared with its sign: one root for all neighbours.
+            # Smallest cosine, squared with its sign, so that one root is enough.
             least = 2.0
             square = x * x + y * y + z * z
             for v in range(max(0, i - 1), min(height, i + 2)):
@@ -106,10 +106,9 @@ def is_steeper(
     stop: int,
     out: Bool,
 ) -> None:
-    """Write where an angle as in `largest_angle` is obtuse and above a threshold.
+    """Write where the angle of `largest_angle` exceeds an obtuse threshold.
 
-    Without a root, a quotient or a branch for each neighbour, so that several pixels are worked on
-    at once.
+    Without roots, quotients or branches in the inner loop, so that it is vectorised.
 
     Parameters
     ----------
@@ -118,13 +117,13 @@ def is_steeper(
     rays
         (H, W, 2) x/z and y/z.
     cosine2
-        Squared cosine of the threshold, which is obtuse.
+        Squared cosine of the obtuse threshold.
     start, stop
         Rows of `out` (H, W) to write: False where the point or all neighbours are invalid.
     """
     height, width = z.shape
-    # The points of these rows and of those beside them, with a border at the camera: like points
-    # that are invalid, it lies before all others, and no angle there is obtuse.
+    # Points of these rows and of the adjacent ones, padded by the origin, as are invalid points: it
+    # is in front of all others, so that no angle there is obtuse.
     points = np.zeros((3, stop - start + 2, width + 2), np.float32)
     for i in range(max(0, start - 1), min(height, stop + 1)):
         for j in range(width):

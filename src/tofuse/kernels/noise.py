@@ -115,7 +115,7 @@ def _by_range(
     stop: int,
     out: Float32,
 ) -> None:
-    """Do the same by the range alone, without a branch, so that several pixels are done at once."""
+    """Do the same for `BY_RANGE`, branch-free so that the loop is vectorised."""
     for i in range(start, stop):
         for j in range(depth.shape[1]):
             x, y = float(rays[i, j, 0]), float(rays[i, j, 1])

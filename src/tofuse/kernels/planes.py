@@ -1,11 +1,10 @@
-"""Planes that many views share, and the normal equations of all poses without them.
+"""Plane bundle adjustment: normal equations of all poses, with the shared planes eliminated.
 
-All points lie in cells, and each cell has one plane. With x a point of the world, c the mean of
-its cell and n, u, v the axes of the cell's points (n across), the residual of a point is
-``r = n . (x - c)``. It moves with the pose of its view by J, and with the plane by
-``b = (1, u . (x - c), v . (x - c))``: its offset and its two slopes. The planes are eliminated
-from the normal equations (Schur complement), so that what a view says of a plane that no other
-view sees says nothing of its pose.
+All points lie in cells, and each cell has one plane. With x a world point, c the mean of its cell,
+and n, u, v the principal axes of the cell's points (n the normal), the residual of a point is
+``r = n . (x - c)``. Its derivative by the pose of its view is J, and by the plane's offset and two
+slopes ``b = (1, u . (x - c), v . (x - c))``. The planes are eliminated from the normal equations
+(Schur complement), so that a plane seen by one view only does not constrain its pose.
 """
 
 from __future__ import annotations
@@ -30,17 +29,17 @@ def fit_cells(
     spread: Float64,
     views: Int64,
 ) -> None:
-    """Mean, axes and spread of the points of each cell, and how many views see it.
+    """Compute mean, principal axes and variances of the points of each cell, and count its views.
 
     Parameters
     ----------
     x, view
-        (M, 3) points of the world and (M,) their views, by cell and within it by view.
+        (M, 3) world points and (M,) their views, sorted by cell and then by view.
     start
-        (S + 1,) where the points of each cell begin.
+        (S + 1,) first point of each cell.
     mean, axes, spread, views
-        (S, 3), (S, 3, 3), (S, 3) and (S,), to write to. Axes are in rows, and the variances along
-        them rise; they are 0 where there are fewer than four points.
+        (S, 3), (S, 3, 3), (S, 3) and (S,), written. Axes are in rows, with ascending variances
+        `spread`; 0 for cells of fewer than four points.
     """
     C = np.empty((3, 3))
     vectors = np.empty((3, 3))
@@ -89,24 +88,25 @@ def plane_equations(
     gradient: Float64,
     mixed: Float64,
 ) -> None:
-    """Add the normal equations of the cells to those of the poses, without the planes.
+    """Add the normal equations of the cells, with the planes eliminated, to those of the poses.
 
     Parameters
     ----------
     p, x, view, start
-        Points (M, 3) as the views gave them and in the world, as in `fit_cells`.
+        Points (M, 3) in their camera's frame and in the world, as in `fit_cells`.
     mean, axes
         As from `fit_cells`.
     variance
-        (S,) of the residuals of each cell; 0 where it takes no part.
+        (S,) of the residuals of each cell; 0 leaves the cell out.
     rotations
         (N, 3, 3) of the poses T_world_camera.
     number
         (N, N) row in `mixed` of each pair of views i < j.
     robust
-        Residuals beyond so many standard deviations count nothing (Tukey's biweight).
+        Cut-off of Tukey's biweight, in standard deviations.
     own, gradient, mixed
-        (N, 6, 6), (N, 6) and (pairs, 6, 6), to add to: of right perturbations of the poses.
+        (N, 6, 6), (N, 6) and (pairs, 6, 6), added to: diagonal blocks, gradient and off-diagonal
+        blocks with respect to right perturbations of the poses.
     """
     J = np.empty(6)
     b = np.empty(3)

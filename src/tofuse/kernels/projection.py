@@ -1,4 +1,4 @@
-"""What kernels that move points into another view share: where they land, and how they move."""
+"""Projection of a point into a view, and the Jacobian of a point under a perturbation."""
 
 from __future__ import annotations
 
@@ -7,13 +7,23 @@ from tofuse.kernels.jit import kernel
 
 
 @kernel
-def landing(
+def project_ray(
     x: float, y: float, lookup: Float32, lookup_frame: Float64
 ) -> tuple[float, float, int, int]:
-    """Pixel (u, v) that ray coordinates (x, y) land on, and the node (column, row) before it.
+    """Return the pixel (u, v) of a ray, interpolated in a lookup table, and its lookup cell.
 
-    `lookup` is (A, B, 2), the pixel of each node of a grid over ray coordinates; `lookup_frame`
-    is (x0, y0, 1/dx, 1/dy). The node is (-1, -1) for rays outside the grid.
+    Parameters
+    ----------
+    x, y
+        Ray coordinates x/z and y/z.
+    lookup
+        (A, B, 2) pixel (u, v) of each node of a regular grid over ray coordinates.
+    lookup_frame
+        (4,) origin and inverse spacing of the grid: x0, y0, 1/dx, 1/dy.
+
+    Returns
+    -------
+    u, v, and column and row of the lookup cell: -1 for rays outside the grid.
     """
     fu = (x - lookup_frame[0]) * lookup_frame[2]
     fv = (y - lookup_frame[1]) * lookup_frame[3]
@@ -36,7 +46,7 @@ def landing(
 def jacobian_row(
     J: Float64, m0: float, m1: float, m2: float, px: float, py: float, pz: float
 ) -> None:
-    """Derivative of m . p by the right perturbation, (m, p x m), into J[:6]."""
+    """Write (m, p x m), the derivative of m . p by a right perturbation, to J[:6]."""
     J[0] = m0
     J[1] = m1
     J[2] = m2

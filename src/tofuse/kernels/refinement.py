@@ -1,10 +1,9 @@
-"""Normal equations of one pair of views, in their relative pose, exposure and the camera's errors.
+"""Normal equations of a pair of views: relative pose, exposure, and systematic camera errors.
 
-As in `alignment`, source points are compared with the plane and the log albedo of the target where
-they land. Here every pair has its own system, and besides the pose it is told how the residuals
-move with errors that all views of a camera share. With p a point of the source, q = T p where it
-lands, m = R^T n the target's normal in the source's frame, and b(p) what an error of size 1 moves
-the point p by, the distance moves by m . b(p) - n . b(q).
+As in `alignment`, source points are compared with plane and log albedo of the target pixel they
+project to. Every pair has its own system, whose unknowns also include errors that all views of a
+camera share. With p a source point, q = T p, m = R^T n the target's normal in the source's frame,
+and b(p) the displacement of p by an error of size 1, the distance changes by m . b(p) - n . b(q).
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from tofuse.kernels.alignment import (
     INLIERS,
     JACOBIAN,
     LANES,
-    LIGHT,
-    LIGHT_SLOPE,
     NORMAL,
     PLANE,
     POINT,
+    POINT_ALBEDO,
+    POINT_ALBEDO_SLOPE,
     RATIO,
     ROWS,
     SEEN,
@@ -34,23 +33,23 @@ from tofuse.kernels.alignment import (
     STAT,
     VARIANCE,
     WEIGHT_G,
-    albedos,
-    distances,
+    compare_albedos,
+    compare_planes,
     histogram_bin,
-    land,
-    load,
-    move,
+    load_block,
+    project_block,
+    transform_block,
 )
 from tofuse.kernels.alignment import IN_FRONT as FRONT
 from tofuse.kernels.alignment import SQUARES_P as ALBEDO_SQUARES
 from tofuse.kernels.alignment import WEIGHT_P as ALBEDO_WEIGHT
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import jacobian_row, landing
+from tofuse.kernels.projection import jacobian_row, project_ray
 
 # Errors of the camera, in the order of their unknowns.
-OFFSET = 0  # missing from the range, m
-SCALE = 1  # missing from the depth, a share
-FOCAL = 2  # by which rays are wider than thought, a share
+OFFSET = 0  # to be added to the range, m
+SCALE = 1  # relative, to be added to the depth
+FOCAL = 2  # relative, to be added to the ray coordinates
 ERRORS = 3
 
 EXPOSURE = 6  # index of the exposure among the unknowns
@@ -59,21 +58,21 @@ UNKNOWNS = 7 + ERRORS
 # Layout of the row of a pair.
 H = 0  # upper triangle over the unknowns
 G = UNKNOWNS * (UNKNOWNS + 1) // 2
-COMPARED = G + UNKNOWNS  # points that land where the target has a plane
+COMPARED = G + UNKNOWNS  # points that project to a target pixel with a plane
 IN_FRONT = COMPARED + 1  # points in free space of the target
-WEIGHT_P = IN_FRONT + 1  # sums of the robust weights and squares of the log albedo's residuals
+WEIGHT_P = IN_FRONT + 1  # sums of robust weights and weighted squares of log albedo residuals
 SQUARES_P = WEIGHT_P + 1
-TERMS = SQUARES_P + 1  # residuals of both terms
-SUPPORT = TERMS + 1  # their robust costs (Tukey's biweight), from 1 for none to 0 for the largest
+TERMS = SQUARES_P + 1  # number of residuals of both terms
+SUPPORT = TERMS + 1  # sum of (1 - robust cost) of the residuals (Tukey's biweight)
 HISTOGRAM = SUPPORT + 1  # as in `alignment`
 SIZE = HISTOGRAM + BINS
 
 
 @kernel
 def displacement(B: Float64, x: float, y: float, z: float, known: Int64) -> None:
-    """What errors of size 1 move the point (x, y, z) of a camera's frame by, into B (ERRORS, 3).
+    """Write to B (ERRORS, 3) the displacements of the point (x, y, z) by camera errors of size 1.
 
-    `known` (ERRORS,) says which errors are taken to be 0.
+    Errors that are flagged in `known` (ERRORS,) get 0.
     """
     for k in range(ERRORS):
         B[k, 0] = B[k, 1] = B[k, 2] = 0.0
@@ -101,7 +100,7 @@ def pair_equations(
     exposure: float,
     scale_g: float,
     scale_p: float,
-    slack: float,
+    inflation: float,
     robust: float,
     min_cosine: float,
     errors: Float64,
@@ -112,12 +111,14 @@ def pair_equations(
 
     Parameters
     ----------
-    points, target, lookup, lookup_frame, T, exposure, scale_g, scale_p, slack, robust, min_cosine
+    points, target, lookup, lookup_frame, T
+        As in `alignment.accumulate`.
+    exposure, scale_g, scale_p, inflation, robust, min_cosine
         As in `alignment.accumulate`.
     errors
-        (ERRORS,) of the camera as estimated so far: points and planes are moved by them.
+        (ERRORS,) current estimate of the camera's errors, by which points and planes are displaced.
     known
-        (ERRORS,) not 0 for errors of the camera that are not asked for.
+        (ERRORS,) non-zero for errors that are not estimated.
     """
     out[:] = 0.0
     rows, columns = target.shape[0], target.shape[1]
@@ -127,7 +128,7 @@ def pair_equations(
     asked = unknowns - 7
     if asked == 0:
         _pose_equations(
-            points, target, lookup, lookup_frame, T, exposure, scale_g, scale_p, slack, robust,
+            points, target, lookup, lookup_frame, T, exposure, scale_g, scale_p, inflation, robust,
             min_cosine, out,
         )  # fmt: skip
         return
@@ -157,10 +158,10 @@ def pair_equations(
             continue
         x = r00 * px + r01 * py + r02 * pz + t0
         y = r10 * px + r11 * py + r12 * pz + t1
-        # Where the target looks for it: its rays are wider than it thinks.
+        # Project with the corrected focal length of the target.
         xn = x / (z * wider)
         yn = y / (z * wider)
-        u, v, iu, _ = landing(xn, yn, lookup, lookup_frame)
+        u, v, iu, _ = project_ray(xn, yn, lookup, lookup_frame)
         if iu < 0:
             continue
         if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
@@ -182,12 +183,12 @@ def pair_equations(
                 r -= errors[p] * (n0 * Bq[p, 0] + n1 * Bq[p, 1] + n2 * Bq[p, 2])
         along = (across - (n0 * t0 + n1 * t1 + n2 * t2)) * np.float64(point[SIGMA])
         own = along * along + np.float64(pixel[VARIANCE])
-        variance = own * scale_g * scale_g + slack * slack
+        variance = own * scale_g * scale_g + inflation * inflation
         r2 = r * r
         out[HISTOGRAM + histogram_bin(r2 / own)] += 1
         e2 = r2 / variance / limit2
         if e2 >= 1:
-            # Nearer than what the target saw there: it looked through this point.
+            # Nearer than the target's surface: in its free space.
             if r < 0 and e2 > 4:
                 out[IN_FRONT] += 1
             continue
@@ -201,12 +202,12 @@ def pair_equations(
             continue
         f = 1 - e2
         out[SUPPORT] += f * f * f
-        # The mean of both views' normals: noise in one of them then counts half.
+        # Mean of both views' normals, which halves the noise of either.
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = 0.0
-        # In the errors the same mean: else the difference of both views' normals, which no motion
-        # explains, would seem to tell of them.
+        # The same mean for the camera errors: otherwise the difference between the normals, which
+        # no motion explains, would be attributed to them.
         n0 = r00 * m0 + r01 * m1 + r02 * m2
         n1 = r10 * m0 + r11 * m1 + r12 * m2
         n2 = r20 * m0 + r21 * m1 + r22 * m2
@@ -217,7 +218,7 @@ def pair_equations(
         _add(A, g, J, r, f * f / variance, unknowns)
 
         tx = np.float64(pixel[ALBEDO_SLOPE])
-        level = np.float64(point[LIGHT])
+        level = np.float64(point[POINT_ALBEDO])
         if scale_p <= 0 or np.isnan(tx) or np.isnan(level):
             continue
         ty = np.float64(pixel[ALBEDO_SLOPE + 1])
@@ -231,23 +232,23 @@ def pair_equations(
         out[WEIGHT_P] += f * f
         out[SQUARES_P] += f * f * r2
         out[SUPPORT] += f * f * f
-        # d(x/z, y/z) by the moved point, then back into the source frame.
+        # Derivative of (x/z, y/z) by the transformed point, rotated back into the source frame.
         d0 = tx / (z * wider)
         d1 = ty / (z * wider)
         d2 = -(tx * xn + ty * yn) / z
         m0 = r00 * d0 + r10 * d1 + r20 * d2
         m1 = r01 * d0 + r11 * d1 + r21 * d2
         m2 = r02 * d0 + r12 * d1 + r22 * d2
-        s0 = np.float64(point[LIGHT_SLOPE])
-        s1 = np.float64(point[LIGHT_SLOPE + 1])
-        s2 = np.float64(point[LIGHT_SLOPE + 2])
+        s0 = np.float64(point[POINT_ALBEDO_SLOPE])
+        s1 = np.float64(point[POINT_ALBEDO_SLOPE + 1])
+        s2 = np.float64(point[POINT_ALBEDO_SLOPE + 2])
         m0, m1, m2 = 0.5 * (m0 + s0), 0.5 * (m1 + s1), 0.5 * (m2 + s2)
         jacobian_row(J, m0, m1, m2, px, py, pz)
         J[EXPOSURE] = -1.0
         for p in range(asked):
             J[7 + p] = m0 * Bp[p, 0] + m1 * Bp[p, 1] + m2 * Bp[p, 2]
         if asked > FOCAL:
-            # Where the target's own pixels look is moved by its focal length alone.
+            # Of the camera errors only the focal length changes the rays of the target's pixels.
             J[7 + FOCAL] -= (r00 * m0 + r01 * m1 + r02 * m2) * x
             J[7 + FOCAL] -= (r10 * m0 + r11 * m1 + r12 * m2) * y
         _add(A, g, J, r, f * f / (scale_p * scale_p), unknowns)
@@ -269,22 +270,22 @@ def _pose_equations(
     exposure: float,
     scale_g: float,
     scale_p: float,
-    slack: float,
+    inflation: float,
     robust: float,
     min_cosine: float,
     out: Float64,
 ) -> None:
-    """Do the same where no error of the camera is asked for: in blocks, as `alignment` does."""
+    """Do the same without camera errors, vectorised in blocks as in `alignment`."""
     block = np.zeros(ROWS * LANES, np.float32)
-    # Products of the rows of J and r, then what is counted or summed of each column.
+    # Products of the rows of J and r, followed by counts and sums over columns.
     products, support = 36, 36 + SQUARES_G - INLIERS
     sums = np.zeros((36 + COUNT_P + 1 - INLIERS, LANES))
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
-        load(block, points[first : first + count])
-        move(block, T)
-        land(block, count, target, lookup, lookup_frame)
-        distances(block, T, scale_g, slack, robust, min_cosine)
+        load_block(block, points[first : first + count])
+        transform_block(block, T)
+        project_block(block, count, target, lookup, lookup_frame)
+        compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
             if block[SEEN * LANES + k] > 0:
                 out[COMPARED] += 1
@@ -292,7 +293,7 @@ def _pose_equations(
         _add_block(sums, block)
         _add_cubes(sums[support], block, WEIGHT_G)
         if scale_p > 0:
-            albedos(block, T, exposure, scale_p, robust)
+            compare_albedos(block, T, exposure, scale_p, robust)
             _add_block(sums, block)
             _add_cubes(sums[support], block, ALBEDO_WEIGHT)
         for which in (FRONT, ALBEDO_WEIGHT, ALBEDO_SQUARES, COUNT_P):
@@ -317,7 +318,7 @@ def _pose_equations(
             elif p < 7:
                 out[G + p] = sums[q, 0]
             q += 1
-        place += ERRORS  # with which nothing was asked
+        place += ERRORS  # products with the camera errors, which stay 0
     out[IN_FRONT] = sums[products + FRONT - INLIERS, 0]
     out[WEIGHT_P] = sums[products + ALBEDO_WEIGHT - INLIERS, 0]
     out[SQUARES_P] = sums[products + ALBEDO_SQUARES - INLIERS, 0]
@@ -341,7 +342,7 @@ def _add_block(sums: Float64, block: Float32) -> None:
 
 @kernel
 def _add_cubes(total: Float64, block: Float32, which: int) -> None:
-    """Add the cubes of the roots of robust weights: 1 where the residual is 0."""
+    """Add w^(3/2) of the robust weights w, which is 1 minus the robust cost."""
     place = STAT + which - INLIERS
     row = block[place * LANES : (place + 1) * LANES]
     for k in range(LANES):
@@ -370,24 +371,26 @@ def overlaps(
     T_world_source: Float64,
     tolerance: float,
     min_cosine: float,
-    least: float,
+    min_overlap: float,
     out: Float64,
 ) -> None:
-    """Share of other views' points that a target sees too, into `out` (S,); 0 if below `least`.
-
-    Such points land where the target has a surface, lie within a share `tolerance` of its
-    distance from it, and face the same way.
+    """Write to `out` (S,) the fraction of each source view's points that the target also sees.
 
     Parameters
     ----------
     points, starts
         (M, POINT_SIZE) points of all views, those of view k from starts[k] to starts[k + 1].
     sources
-        (S,) the views to look at.
+        (S,) indices of the source views.
     target, lookup, lookup_frame
         As in `pair_equations`.
     T_target_world, T_world_source
         (4, 4) of the target, and (N, 4, 4) of all views.
+    tolerance, min_cosine
+        Both see a point if its distance from the target's plane is below this fraction of the
+        plane's distance, and the normals' cosine is above `min_cosine`.
+    min_overlap
+        Smaller fractions are reported as 0.
     """
     rows, columns = target.shape[0], target.shape[1]
     T = np.empty((3, 4))
@@ -399,8 +402,8 @@ def overlaps(
                 for c in range(3):
                     T[a, b] += T_target_world[a, c] * pose[c, b]
         start, stop = starts[sources[s]], starts[sources[s] + 1]
-        # So many that are not seen, and it is too few, whatever follows.
-        spare = (stop - start) - least * (stop - start) + 1e-9
+        # With more unseen points than this, the overlap can only be too small.
+        spare = (stop - start) - min_overlap * (stop - start) + 1e-9
         seen = 0
         for k in range(start, stop):
             if k - start - seen > spare:
@@ -411,7 +414,7 @@ def overlaps(
                 continue
             x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
             y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
+            u, v, iu, _ = project_ray(x / z, y / z, lookup, lookup_frame)
             if iu < 0:
                 continue
             if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
@@ -429,4 +432,4 @@ def overlaps(
             if cosine >= min_cosine:
                 seen += 1
         share = seen / max(stop - start, 1)
-        out[s] = share if share >= least else 0.0
+        out[s] = share if share >= min_overlap else 0.0

@@ -1,7 +1,7 @@
-"""Residuals of one view against another one, for cameras that err in depth each by itself.
+"""Point-to-plane residuals between views of two cameras of a rig, each with its own range offset.
 
-As in `refinement`, source points are compared with the plane of the target where they land. Every
-point gives a row of its own, as the cameras of a rig share unknowns over many pairs of views.
+As in `refinement`, source points are compared with the plane of the target pixel they project to.
+Every point gives a row of its own, as the cameras' unknowns are shared by many pairs of views.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels.alignment import DISTANCE, NORMAL, PLANE, POINT, SIGMA, VARIANCE
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import landing
+from tofuse.kernels.projection import project_ray
 
-# Columns of a row: signed distance to the target's plane in m and its variance (0: the point has no
-# partner), the target's normal in the source's frame, the source's own normal, the moved point,
-# and how the residual moves with missing range of the source and of the target.
+# Columns of a row: signed distance to the target's plane in m and its variance (0: no
+# correspondence), the target's normal in the source's frame, the source's own normal, the displaced
+# source point, and the derivatives of the residual by the range offsets of source and target.
 RESIDUAL = 0
 OWN = 1
 TARGET_NORMAL = 2
@@ -45,7 +45,7 @@ def residuals(
     points, target, lookup, lookup_frame, T, min_cosine
         As in `alignment.accumulate`.
     source_offset, target_offset
-        By how much the ranges of the two cameras are too short, m.
+        To be added to the ranges of the two cameras, m.
     """
     rows, columns = target.shape[0], target.shape[1]
     for k in range(points.shape[0]):
@@ -64,7 +64,7 @@ def residuals(
         q2 = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
         if q2 <= 0.02:
             continue
-        u, v, iu, _ = landing(q0 / q2, q1 / q2, lookup, lookup_frame)
+        u, v, iu, _ = project_ray(q0 / q2, q1 / q2, lookup, lookup_frame)
         if iu < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
         pixel = target[int(v + 0.5), int(u + 0.5)]
@@ -82,7 +82,7 @@ def residuals(
         s2 = np.float64(points[k, NORMAL + 2])
         if s0 * m0 + s1 * m1 + s2 * m2 < min_cosine:
             continue
-        # Missing range moves the plane along the ray that the point fell on.
+        # The target's offset moves its plane along the ray of the pixel.
         by_target = (n0 * q0 + n1 * q1 + n2 * q2) / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
         along = (m0 * x + m1 * y + m2 * z) * np.float64(points[k, SIGMA])
         row = out[k]

@@ -1,9 +1,9 @@
-"""Exhaustive search for the pose between two range images, and what both images say of a pose.
+"""Exhaustive search for the relative pose of two range images, and their agreement under a pose.
 
-Images are pinhole grids here: (H, W, 5) holds the unit normal away from the camera and the
-distance n . p of the plane seen along each node's ray; where only a depth is known, 0, 0, 0 and
-its negative; all 0 where nothing is known; and the log albedo around the node, NaN where unknown.
-The frame (x0, y0, 1/dx, 1/dy) tells the ray coordinates of the nodes.
+Images are resampled to pinhole grids (H, W, 5): the unit normal (away from the camera) and the
+distance n . p of the plane on the node's ray; 0, 0, 0 and the negative depth where only a depth is
+known; all 0 where nothing is known; and the log albedo, NaN where unknown. The frame
+(x0, y0, 1/dx, 1/dy) gives the ray coordinates of the nodes.
 """
 
 from __future__ import annotations
@@ -12,36 +12,35 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64, Int32, Int64
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.motion import moved
-from tofuse.kernels.projection import jacobian_row, landing
+from tofuse.kernels.motion import retract
+from tofuse.kernels.projection import jacobian_row, project_ray
 
-# Nearer than this, a point has no place in an image, m.
-_NEAREST = 0.05
-# Points whose albedo disagrees speak against a pose for at most so many that support it.
-_MOST_AGAINST = 2.0
-# A pose that moves by less than this share of the reach is settled.
-_STILL = 0.001
-# Layout of what `agree` returns.
-LANDED = 0
+# m; points nearer to the camera are not projected.
+_MIN_DEPTH = 0.05
+# Largest penalty of albedo differences, relative to the weight of the supporting points.
+_MAX_ALBEDO_PENALTY = 2.0
+# A pose has converged when its step is smaller than this fraction of the reach.
+_CONVERGED = 0.001
+# Layout of the counts that `measure_agreement` returns.
+PROJECTED = 0
 COMPARED = 1
 SUPPORT = 2
 VIOLATION = 3
 SQUARES_M = 4
-AGREE_SIZE = 5
+AGREEMENT_SIZE = 5
 
 
-# Poses are scored so many at a time, the numbers of each in a column of a block, so that the
-# processor works on several at once. Rows of a block: the pose (rotation, then translation), a
-# point where the pose moves it to, what the other image holds there, and the sums: support less
-# violations, the weights of the points whose albedo is compared, and their differences in log
-# albedo, once and squared.
+# Poses are scored in structure-of-arrays blocks, one pose per column, so that loops over poses are
+# vectorised. Rows of a block: the pose (rotation, then translation), the transformed point, the
+# target node it projects to, and the sums: support minus violations, the weights of the points
+# whose albedo is compared, and the weighted sums of their log albedo differences and squares.
 _LANES = 128
-_TURN, _MOVE, _AT, _SEEN, _TOTAL, _LIT = 0, 9, 12, 15, 20, 21
+_ROTATION, _TRANSLATION, _POSITION, _PIXEL, _TOTAL, _ALBEDO = 0, 9, 12, 15, 20, 21
 _ROWS = 24
 
 
 @kernel
-def _judge(
+def _score_points(
     points: Float32,
     normals: Float32,
     light: Float32,
@@ -51,18 +50,29 @@ def _judge(
     block: Float32,
     node: Int32,
 ) -> None:
-    """Add to the sums of each pose what one image's points say of it, landing in the other's.
+    """Add the scores of one image's points, projected into the other image, for a block of poses.
 
-    A point supports a pose by up to 1, and counts twice against it where the other camera saw
-    through. `node` (LANES,) is where the point's places in the image, row by row, are kept
-    meanwhile.
+    A point supports a pose by up to 1, and counts -2 if it lies in the other camera's free space.
+
+    Parameters
+    ----------
+    points, normals, light
+        (N, 3) m, (N, 3) unit, and (N,) log albedo.
+    grid, frame
+        The other image.
+    reach
+        See `score_grid`.
+    block
+        (_ROWS * _LANES,) poses and their sums, updated.
+    node
+        (_LANES,) scratch: flat index of the node that the point projects to.
     """
     rows, columns = np.int32(grid.shape[0]), np.int32(grid.shape[1])
     planes = grid.reshape(grid.size)
     su, sv = np.float32(frame[2]), np.float32(frame[3])
     u0, v0 = np.float32(0.5 - frame[0] * frame[2]), np.float32(0.5 - frame[1] * frame[3])
-    nearest, none, one, two = np.float32(_NEAREST), np.float32(0), np.float32(1), np.float32(2)
-    # What is beyond is cut here, so that it has a place in an integer.
+    nearest, none, one, two = np.float32(_MIN_DEPTH), np.float32(0), np.float32(1), np.float32(2)
+    # Upper limits, so that coordinates fit into an integer.
     far_u, far_v = np.float32(columns), np.float32(rows)
     reach32, per2 = np.float32(reach), np.float32(1.0 / (reach * reach))
     for k in range(len(points)):
@@ -72,9 +82,9 @@ def _judge(
             x = block[b] * px + block[_LANES + b] * py + block[2 * _LANES + b] * pz
             y = block[3 * _LANES + b] * px + block[4 * _LANES + b] * py + block[5 * _LANES + b] * pz
             z = block[6 * _LANES + b] * px + block[7 * _LANES + b] * py + block[8 * _LANES + b] * pz
-            x += block[_MOVE * _LANES + b]
-            y += block[(_MOVE + 1) * _LANES + b]
-            z += block[(_MOVE + 2) * _LANES + b]
+            x += block[_TRANSLATION * _LANES + b]
+            y += block[(_TRANSLATION + 1) * _LANES + b]
+            z += block[(_TRANSLATION + 2) * _LANES + b]
             before = z > nearest
             inverse = one / z if before else none
             u = x * inverse * su + u0
@@ -84,25 +94,30 @@ def _judge(
             i = np.int32(v if inside else none)
             node[b] = i * columns + j if inside else np.int32(-1)
             landed += inside
-            block[_AT * _LANES + b] = x
-            block[(_AT + 1) * _LANES + b] = y
-            block[(_AT + 2) * _LANES + b] = z
+            block[_POSITION * _LANES + b] = x
+            block[(_POSITION + 1) * _LANES + b] = y
+            block[(_POSITION + 2) * _LANES + b] = z
         if landed == 0:
             continue
         for b in range(_LANES):
             at = 5 * max(node[b], np.int32(0))
-            block[_SEEN * _LANES + b] = planes[at]
-            block[(_SEEN + 1) * _LANES + b] = planes[at + 1]
-            block[(_SEEN + 2) * _LANES + b] = planes[at + 2]
-            block[(_SEEN + 3) * _LANES + b] = planes[at + 3] if node[b] >= 0 else none
-            block[(_SEEN + 4) * _LANES + b] = planes[at + 4]
+            block[_PIXEL * _LANES + b] = planes[at]
+            block[(_PIXEL + 1) * _LANES + b] = planes[at + 1]
+            block[(_PIXEL + 2) * _LANES + b] = planes[at + 2]
+            block[(_PIXEL + 3) * _LANES + b] = planes[at + 3] if node[b] >= 0 else none
+            block[(_PIXEL + 4) * _LANES + b] = planes[at + 4]
         nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
         level = light[k]
         for b in range(_LANES):
-            m0, m1 = block[_SEEN * _LANES + b], block[(_SEEN + 1) * _LANES + b]
-            m2, d = block[(_SEEN + 2) * _LANES + b], block[(_SEEN + 3) * _LANES + b]
-            z = block[(_AT + 2) * _LANES + b]
-            r = m0 * block[_AT * _LANES + b] + m1 * block[(_AT + 1) * _LANES + b] + m2 * z - d
+            m0, m1 = block[_PIXEL * _LANES + b], block[(_PIXEL + 1) * _LANES + b]
+            m2, d = block[(_PIXEL + 2) * _LANES + b], block[(_PIXEL + 3) * _LANES + b]
+            z = block[(_POSITION + 2) * _LANES + b]
+            r = (
+                m0 * block[_POSITION * _LANES + b]
+                + m1 * block[(_POSITION + 1) * _LANES + b]
+                + m2 * z
+                - d
+            )
             c = (
                 m0 * (block[b] * nx + block[_LANES + b] * ny + block[2 * _LANES + b] * nz)
                 + m1
@@ -122,23 +137,29 @@ def _judge(
             fits = (d > none) & (r >= -reach32) & (r < reach32) & (c > none)
             w = c * (one - r * r * per2) if fits else none
             block[_TOTAL * _LANES + b] += w - (two if through else none)
-            lighter = block[(_SEEN + 4) * _LANES + b] - level
+            lighter = block[(_PIXEL + 4) * _LANES + b] - level
             known = lighter == lighter
             w = w if known else none
             lighter = lighter if known else none
-            block[_LIT * _LANES + b] += w
-            block[(_LIT + 1) * _LANES + b] += w * lighter
-            block[(_LIT + 2) * _LANES + b] += w * lighter * lighter
+            block[_ALBEDO * _LANES + b] += w
+            block[(_ALBEDO + 1) * _LANES + b] += w * lighter
+            block[(_ALBEDO + 2) * _LANES + b] += w * lighter * lighter
 
 
 @kernel
-def thinned(
+def select_distinct(
     rotations: Float64, translations: Float64, depth: float, apart: float, count: int
 ) -> Int64:
-    """Choose the first `count` poses, leaving out those near an earlier one that was chosen.
+    """Return the indices of the first `count` poses that differ from all those selected before.
 
-    Poses (N, 3, 3) and (N, 3) are near each other if they move points at `depth` by less than
-    `apart`, both m.
+    Parameters
+    ----------
+    rotations, translations
+        (N, 3, 3) and (N, 3), best first.
+    depth, apart
+        Poses differ if they move a point at `depth` m by more than `apart` m.
+    count
+        Maximum number of poses.
     """
     chosen = np.empty(min(count, len(rotations)), np.int64)
     size = 0
@@ -183,27 +204,27 @@ def score_grid(
     start: int,
     stop: int,
 ) -> None:
-    """Score the translations that go with the rotations start..stop, two-way.
+    """Score the candidate poses of the rotations start..stop, in both directions.
 
     Parameters
     ----------
     source_points, source_normals, target_points, target_normals
         (N, 3) and (M, 3), each in the frame of its own camera.
     source_light, target_light
-        (N,) and (M,) log albedo around the points, NaN where unknown.
+        (N,) and (M,) log albedo at the points, NaN where unknown.
     source_grid, source_frame, target_grid, target_frame
-        The images.
+        The images, as described above.
     rotations, translations
-        (A, 3, 3), and (A, B, 3) those that go with each or (1, B, 3) with all: T_target_source.
+        (A, 3, 3) and (A, B, 3), or (1, B, 3) for all rotations, of T_target_source.
     reach
-        Distance of a plane within which a point supports the pose, m; nearer than the surface by
-        more than that, it stands where the camera saw through.
+        Distance from a plane within which a point supports the pose, m; a point nearer than the
+        surface by more than that violates free space.
     albedo
-        Standard deviation of the differences in log albedo, exposure apart, with which points
-        that support the pose speak against it as much as for it.
+        Standard deviation of log albedo differences (without exposure) at which the penalty cancels
+        the support.
     scores
-        (A, B), written: support less twice the violations and what albedo says against it, as a
-        share of all points.
+        (A, B), written: support minus twice the violations minus the albedo penalty, divided by
+        the number of points.
     """
     share = 1.0 / max(len(source_points) + len(target_points), 1)
     per2 = 1.0 / (albedo * albedo)
@@ -218,35 +239,40 @@ def score_grid(
             for i in range(3):
                 moved_back = 0.0
                 for j in range(3):
-                    there[(_TURN + 3 * i + j) * _LANES + b] = R[i, j]
-                    back[(_TURN + 3 * i + j) * _LANES + b] = R[j, i]
+                    there[(_ROTATION + 3 * i + j) * _LANES + b] = R[i, j]
+                    back[(_ROTATION + 3 * i + j) * _LANES + b] = R[j, i]
                     moved_back -= R[j, i] * t[j]
-                there[(_MOVE + i) * _LANES + b] = t[i]
-                back[(_MOVE + i) * _LANES + b] = moved_back
+                there[(_TRANSLATION + i) * _LANES + b] = t[i]
+                back[(_TRANSLATION + i) * _LANES + b] = moved_back
         there[_TOTAL * _LANES :] = np.float32(0)
         back[_TOTAL * _LANES :] = np.float32(0)
-        _judge(
+        _score_points(
             source_points, source_normals, source_light, target_grid, target_frame, reach, there,
             node,
         )  # fmt: skip
-        _judge(
+        _score_points(
             target_points, target_normals, target_light, source_grid, source_frame, reach, back,
             node,
         )  # fmt: skip
         for b in range(count):
             total = np.float64(there[_TOTAL * _LANES + b]) + back[_TOTAL * _LANES + b]
-            weight = np.float64(there[_LIT * _LANES + b]) + back[_LIT * _LANES + b]
+            weight = np.float64(there[_ALBEDO * _LANES + b]) + back[_ALBEDO * _LANES + b]
             if weight > 0:
-                # What all differ by is the exposure; the way back sees its negative.
-                mean = np.float64(there[(_LIT + 1) * _LANES + b]) - back[(_LIT + 1) * _LANES + b]
-                square = np.float64(there[(_LIT + 2) * _LANES + b]) + back[(_LIT + 2) * _LANES + b]
-                total -= min((square - mean * mean / weight) * per2, _MOST_AGAINST * weight)
+                # The mean difference is the exposure, which has opposite signs in the two
+                # directions.
+                mean = (
+                    np.float64(there[(_ALBEDO + 1) * _LANES + b]) - back[(_ALBEDO + 1) * _LANES + b]
+                )
+                square = (
+                    np.float64(there[(_ALBEDO + 2) * _LANES + b]) + back[(_ALBEDO + 2) * _LANES + b]
+                )
+                total -= min((square - mean * mean / weight) * per2, _MAX_ALBEDO_PENALTY * weight)
             a, c = divmod(first + b, many)
             scores[a, c] = total * share
 
 
 @kernel
-def _pull(
+def _add_equations(
     points: Float32,
     normals: Float32,
     grid: Float32,
@@ -258,10 +284,10 @@ def _pull(
     H: Float64,
     g: Float64,
 ) -> None:
-    """Add one way of the point-to-plane equations of the right perturbation of T_target_source.
+    """Add the point-to-plane equations of one direction to H (6, 6) and g (6,).
 
-    Forward, the points are the source's; else they are the target's, and T is still
-    T_target_source.
+    They are those of the right perturbation of T = T_target_source in either case: if `forward`,
+    the points are the source's and the grid is the target's, else the other way round.
     """
     rows, columns = grid.shape[0], grid.shape[1]
     x0, y0, sx, sy = frame[0], frame[1], frame[2], frame[3]
@@ -283,7 +309,7 @@ def _pull(
         py = np.float64(points[k, 1])
         pz = np.float64(points[k, 2])
         z = A[2, 0] * px + A[2, 1] * py + A[2, 2] * pz + t[2]
-        if z <= _NEAREST:
+        if z <= _MIN_DEPTH:
             continue
         x = A[0, 0] * px + A[0, 1] * py + A[0, 2] * pz + t[0]
         y = A[1, 0] * px + A[1, 1] * py + A[1, 2] * pz + t[1]
@@ -303,7 +329,7 @@ def _pull(
         e2 = r * r * per2
         if e2 >= 1:
             continue
-        # The plane's normal where the point came from.
+        # The plane's normal in the frame of the points.
         m0 = A[0, 0] * n0 + A[1, 0] * n1 + A[2, 0] * n2
         m1 = A[0, 1] * n0 + A[1, 1] * n1 + A[2, 1] * n2
         m2 = A[0, 2] * n0 + A[1, 2] * n1 + A[2, 2] * n2
@@ -313,7 +339,7 @@ def _pull(
         if forward:
             jacobian_row(J, m0, m1, m2, px, py, pz)
         else:
-            # T exp(xi) moves a target's point by exp(-xi) in the source frame.
+            # T exp(xi) moves a target point by exp(-xi) in the source frame.
             jacobian_row(J, -n0, -n1, -n2, x, y, z)
         for p in range(6):
             g[p] += w * J[p] * r
@@ -349,7 +375,7 @@ def _solve(H: Float64, g: Float64) -> Float64:
 
 
 @kernel
-def settle(
+def refine_poses(
     source_points: Float32,
     source_normals: Float32,
     target_points: Float32,
@@ -365,16 +391,20 @@ def settle(
     start: int,
     stop: int,
 ) -> None:
-    """Two-way projective point-to-plane ICP from the poses start..stop, which it overwrites.
+    """Refine the poses start..stop in place by symmetric projective point-to-plane ICP.
 
     Parameters
     ----------
+    source_points, source_normals, target_points, target_normals
+        As in `score_grid`.
+    source_grid, source_frame, target_grid, target_frame
+        As in `score_grid`.
     reaches
-        (I,) for each iteration the distance beyond which a point counts nothing (Tukey), m.
+        (I,) cut-off of Tukey's biweight in each iteration, m.
     min_cosine
-        Smallest cosine between normals.
+        Smallest cosine between corresponding normals.
     unit_m
-        Metres that go with one radian, so that what the data leaves open is damped evenly.
+        Length in m that corresponds to one radian, for isotropic damping.
     poses
         (N, 4, 4) T_target_source.
     """
@@ -386,7 +416,7 @@ def settle(
             reach = reaches[k]
             H[:] = 0
             g[:] = 0
-            _pull(
+            _add_equations(
                 source_points,
                 source_normals,
                 target_grid,
@@ -398,7 +428,7 @@ def settle(
                 H,
                 g,
             )
-            _pull(
+            _add_equations(
                 target_points,
                 target_normals,
                 source_grid,
@@ -415,24 +445,27 @@ def settle(
                 H[p, p] += damping
                 H[p + 3, p + 3] += damping * unit_m * unit_m
             step = _solve(H, g)
-            T = moved(T, step)
+            T = retract(T, step)
             along = step[0] ** 2 + step[1] ** 2 + step[2] ** 2
             turned = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
-            # From here on nothing changes any more.
-            if along + unit_m * unit_m * turned < (_STILL * reach) ** 2 and reach == reaches[-1]:
+            # Converged at the final reach.
+            if (
+                along + unit_m * unit_m * turned < (_CONVERGED * reach) ** 2
+                and reach == reaches[-1]
+            ):
                 break
         poses[c] = T
 
 
 @kernel
-def agree(
+def measure_agreement(
     points: Float32,
     normals: Float32,
     sigma: Float32,
     light: Float32,
     planes: Float32,
     plane_variance: Float32,
-    photo: Float32,
+    albedo: Float32,
     nearest: Float32,
     lookup: Float32,
     lookup_frame: Float64,
@@ -445,31 +478,35 @@ def agree(
     start: int,
     stop: int,
 ) -> Float64:
-    """Count what an image says of the points start..stop of another one under a pose.
+    """Count how the points start..stop of one view agree with another image under a pose.
 
     Parameters
     ----------
     points, normals, sigma
         (N, 3) m, (N, 3) unit, (N,) sigma of z in m.
     planes, plane_variance, lookup, lookup_frame
-        Of the image, as `alignment.accumulate` takes them.
+        Of the image, as in `alignment.gather` and `alignment.accumulate`.
     nearest
-        (H, W) least depth that the image may have at a pixel, m, 0 where unknown: says what was
-        seen through where no plane is known.
+        (H, W) lower bound of the depth, m, 0 where unknown: the free space of pixels without a
+        plane.
     T
         (4, 4) from the points' frame to the image's.
     sigmas, floor_m, floor_share
-        A point supports the pose within so many sigmas, plus metres, plus a share of its depth;
-        it violates free space if it is nearer than the surface by twice that.
+        A point supports the pose if its distance is below `sigmas` standard deviations plus
+        `floor_m` plus `floor_share` times its depth; it violates free space if it is nearer than
+        the surface by twice that.
     min_cosine
-        Smallest cosine between the normals of points that support.
-    light, photo
-        (N,) and (H, W, 3) of which the first is the log albedo, NaN where unknown.
+        Smallest cosine between the normals of a supporting point and the plane.
+    light, albedo
+        (N,) log albedo of the points and (H, W, 3) of the image (first channel), NaN where unknown.
     differences
-        (N,) written: log albedo of the image less the point's, for points that support; NaN where
-        one is unknown, and for the others.
+        (N,) written: log albedo of the image minus the point's for supporting points, else NaN.
+
+    Returns
+    -------
+    (AGREEMENT_SIZE,) counts, and the supporting points' sum of squared distances.
     """
-    out = np.zeros(AGREE_SIZE)
+    out = np.zeros(AGREEMENT_SIZE)
     rows, columns = planes.shape[0], planes.shape[1]
     for k in range(start, stop):
         differences[k] = np.nan
@@ -477,16 +514,16 @@ def agree(
         py = np.float64(points[k, 1])
         pz = np.float64(points[k, 2])
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        if z <= _NEAREST:
+        if z <= _MIN_DEPTH:
             continue
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        u, v, iu, _ = landing(x / z, y / z, lookup, lookup_frame)
+        u, v, iu, _ = project_ray(x / z, y / z, lookup, lookup_frame)
         if iu < 0:
             continue
         if not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
-        out[LANDED] += 1
+        out[PROJECTED] += 1
         i = int(v + 0.5)
         j = int(u + 0.5)
         if planes[i, j, 3] <= 0:
@@ -514,7 +551,7 @@ def agree(
         ):
             out[SUPPORT] += 1
             out[SQUARES_M] += r * r
-            differences[k] = photo[i, j, 0] - light[k]
+            differences[k] = albedo[i, j, 0] - light[k]
     return out
 
 
@@ -523,27 +560,31 @@ def lowest_plane(
     points: Float64,
     normals: Float64,
     band: Float64,
-    tried: Int64,
+    candidates: Int64,
     cosine: float,
-    most_below: float,
+    max_below: float,
     far: float,
 ) -> int:
-    """Return which of the points `tried` has most points on its plane, of those with few below.
+    """Return the candidate whose plane contains most points, among planes with few points below.
 
     Parameters
     ----------
     points, normals
         (n, 3) m, unit.
     band
-        (n,) how near to a plane a point on it is, m; so many times `far` is below it.
+        (n,) tolerance of a point's distance to a plane, m.
+    candidates
+        Indices of the points whose tangent planes are tried.
     cosine
-        Least cosine between the normals of a plane and of a point on it.
-    most_below
-        Planes with more points below them are out; without any other the first is returned.
+        Smallest cosine between the normals of a plane and of a point on it.
+    max_below
+        Planes with more points below are rejected; if all are, the first candidate is returned.
+    far
+        A point is below a plane by more than `far` times its band.
     """
-    best = tried[0]
+    best = candidates[0]
     most = 0
-    for k in tried:
+    for k in candidates:
         nx, ny, nz = normals[k]
         height = points[k, 0] * nx + points[k, 1] * ny + points[k, 2] * nz
         on = 0
@@ -552,12 +593,12 @@ def lowest_plane(
             r = points[i, 0] * nx + points[i, 1] * ny + points[i, 2] * nz - height
             if r > far * band[i]:
                 below += 1
-                if below > most_below:
+                if below > max_below:
                     break
             elif abs(r) < band[i]:
                 turned = normals[i, 0] * nx + normals[i, 1] * ny + normals[i, 2] * nz
                 on += turned > cosine
-        if below <= most_below and on > most:
+        if below <= max_below and on > most:
             most = on
             best = k
     return best

@@ -1,8 +1,8 @@
-"""Entries of the inverse of a sparse symmetric matrix of 6 x 6 blocks, where its factor has any.
+"""Selected inversion of a sparse symmetric matrix of 6 x 6 blocks, on the pattern of its factor.
 
-Cholesky's factor and the recursion of Takahashi et al. (1973), block by block. A matrix is given
-by its lower triangle in compressed columns: the rows of column k are
-``rows[start[k] : start[k + 1]]``, in ascending order, the diagonal first.
+Cholesky factorisation and the recursion of Takahashi et al. (1973), block by block. A matrix is
+given by its lower triangle in compressed columns: the rows of column k are ``rows[start[k] :
+start[k + 1]]``, in ascending order, the diagonal first.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ B = 6
 
 @kernel
 def fill_in(start: Int64, rows: Int64) -> tuple[Int64, Int64]:
-    """Pattern of the factor of a matrix with the given pattern: (n + 1,) starts, and rows."""
+    """Return the factor's pattern, (n + 1,) starts and rows, given that of the matrix."""
     n = len(start) - 1
-    # Column k takes over the rows of those columns whose first row below the diagonal is k.
+    # Column k inherits the rows of the columns whose first row below the diagonal is k.
     first_child = np.full(n, -1, np.int64)
     next_sibling = np.full(n, -1, np.int64)
     mark = np.full(n, -1, np.int64)
@@ -60,7 +60,7 @@ def fill_in(start: Int64, rows: Int64) -> tuple[Int64, Int64]:
 
 @kernel
 def _subtract_outer(target: Float64, a: Float64, b: Float64) -> None:
-    """Take a @ b^T off the target, (6, 6) all."""
+    """Subtract a @ b^T from the target, all (6, 6)."""
     for r in range(B):
         for c in range(B):
             total = 0.0

@@ -1,9 +1,9 @@
-"""What patches of a view say of a pair's relative pose, where the pixels of a patch share an error.
+"""Correlated errors within image patches, marginalised from the normal equations of a pair.
 
-With D the sums of the weights of the distances that fall into each patch, R the sums of weight
-times (r, J) over the root of D, and K the covariance of the patches' errors, an alignment that
-allows for these errors has the products R^T (1 + D^1/2 K D^1/2)^-1 R where one that takes all
-pixels for independent has R^T R (the normal equations with an unknown for each patch, eliminated).
+With D the sums of the weights of the distances in each patch, R the sums of weight times (r, J)
+divided by the root of D, and K the covariance of the patches' errors, the normal equations with one
+error per patch marginalised contain R^T (1 + D^1/2 K D^1/2)^-1 R, where those of independent pixels
+contain R^T R.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from tofuse.kernels.alignment import (
     MISFIT,
     ROOT,
     ROWS,
-    distances,
-    land,
-    load,
-    move,
+    compare_planes,
+    load_block,
+    project_block,
+    transform_block,
 )
 from tofuse.kernels.jit import kernel
 from tofuse.kernels.refinement import UNKNOWNS, G, H
@@ -46,23 +46,23 @@ def patch_sums(
     min_cosine: float,
     out: Float64,
 ) -> None:
-    """Sum what the distances of each patch say into `out` (patches, PATCH_SIZE), overwritten.
+    """Sum the weighted residuals and Jacobians of each patch into `out` (patches, PATCH_SIZE).
 
     Parameters
     ----------
     points, target, lookup, lookup_frame, T, scale_g, robust, min_cosine
         As in `alignment.accumulate`.
     patch
-        (N,) the patch of each point.
+        (N,) index of the patch of each point.
     """
     out[:] = 0.0
     block = np.zeros(ROWS * LANES, np.float32)
     for first in range(0, len(points), LANES):
         count = min(LANES, len(points) - first)
-        load(block, points[first : first + count])
-        move(block, T)
-        land(block, count, target, lookup, lookup_frame)
-        distances(block, T, scale_g, 0.0, robust, min_cosine)
+        load_block(block, points[first : first + count])
+        transform_block(block, T)
+        project_block(block, count, target, lookup, lookup_frame)
+        compare_planes(block, T, scale_g, 0.0, robust, min_cosine)
         for k in range(count):
             if not block[FITS * LANES + k] > 0:
                 continue
@@ -75,8 +75,8 @@ def patch_sums(
 
 
 @kernel
-def allow(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
-    """Take off a pair's normal equations what its patches can't say, as they share errors.
+def discount_shared_errors(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
+    """Marginalise the patches' shared errors in the normal equations of a pair, in place.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ def allow(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
     alike
         (K, K) correlation of the errors of patches.
     variance
-        Of these errors, m^2.
+        Variance of these errors, m^2.
     row
-        (SIZE,) of the pair, see `refinement`; changed.
+        (SIZE,) equations of the pair, see `refinement`; updated.
     """
     count = len(sums)
     R = np.zeros((count, 7))
@@ -96,7 +96,7 @@ def allow(sums: Float64, alike: Float64, variance: float, row: Float64) -> None:
         if root[k] > 0:
             for p in range(7):
                 R[k, p] = sums[k, RESIDUAL + p] / root[k]
-    # Cholesky's factor of 1 + D^1/2 K D^1/2, row by row, and Z with L Z = R.
+    # Cholesky factor L of 1 + D^1/2 K D^1/2, row by row, and Z with L Z = R.
     L = np.zeros((count, count))
     Z = np.zeros((count, 7))
     for i in range(count):

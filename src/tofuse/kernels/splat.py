@@ -1,4 +1,4 @@
-"""Drawing points: the nearest one of each pixel."""
+"""Point splatting: the nearest point of each pixel."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from tofuse.arrays import Float64, Int32
 from tofuse.kernels.jit import kernel
 
-# Of the eye's distance: what is nearer to it is not drawn.
-_NEAREST = 0.02
+# Fraction of the eye's distance; nearer points are not drawn.
+_MIN_DEPTH = 0.02
 
 
 @kernel
@@ -21,7 +21,7 @@ def nearest_points(
     depth: Float64,
     found: Int32,
 ) -> None:
-    """Find the nearest point of each pixel, of points drawn as squares; of equals the last.
+    """Find the nearest point of each pixel, with points drawn as squares; ties go to the last.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def nearest_points(
         zoom = scale
         if distance > 0:
             far += distance
-            if not far > _NEAREST * distance:
+            if not far > _MIN_DEPTH * distance:
                 continue
             zoom = scale * distance / far
         u = np.rint(0.5 * width + zoom * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]))

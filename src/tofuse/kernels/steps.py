@@ -1,4 +1,4 @@
-"""An alignment's steps: from summed normal equations to the next pose, until it settles."""
+"""Gauss-Newton iterations of an alignment: from summed normal equations to a converged pose."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as sums
 from tofuse.kernels.alignment import accumulate, bin_edge, normal_equations
-from tofuse.kernels.doubt import faked_information
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.motion import composed, moved, twist_between
+from tofuse.kernels.motion import compose, retract, twist_between
+from tofuse.kernels.spurious_information import spurious_information
 
-# Points from which it is told how much information can be faked.
+# Number of points from which the spurious information is estimated.
 SOME_POINTS = 500
-# What an alignment guesses, and goes on with: log albedo of the targets minus the source's, scale
-# of the sigmas of distances, sigma of the log albedo (0 if it takes no part).
+# Nuisance parameters that are estimated along the way: log albedo of the targets minus the
+# source's, scale of the sigmas of distances, sigma of the log albedo (0 leaves it out).
 EXPOSURE, SCALE_G, SCALE_P = 0, 1, 2
 
 
 @kernel
-def settle(
+def iterate_level(
     points: Float32,
     targets: tuple[Float32, ...],
     lookups: tuple[Float32, ...],
@@ -27,53 +27,56 @@ def settle(
     T_targets: Float64,
     T: Float64,
     T_predicted: Float64,
-    guessed: Float64,
-    most: float,
+    estimates: Float64,
+    max_scale: float,
     iterations: int,
-    slack: float,
-    photo_slack: float,
+    inflation: float,
+    albedo_inflation: float,
     robust: float,
     min_cosine: float,
-    judged: bool,
+    remap: bool,
     tilt: float,
     slope: float,
-    held: float,
+    max_sigma: float,
     prior: Float64,
     units: Float64,
     tolerance: float,
 ) -> tuple[Float64, Float64, Float64, float, int]:
-    """Go through the iterations of one level.
+    """Iterate one pyramid level of an alignment until it converges.
 
     Parameters
     ----------
     points, targets, lookups, lookup_frames
-        Of the source and of each target, as `accumulate` takes them; lookup_frames is (n, 4).
+        Source and n targets as in `accumulate`; lookup_frames is (n, 4).
     T_targets
         (n, 4, 4) T_target_world of each target.
-    T, guessed
-        (4, 4) T_world_source and (3,) what is guessed; both are written to.
+    T, estimates
+        (4, 4) T_world_source and (3,) nuisance parameters, both updated in place.
     T_predicted, prior, units
-        As `advance` takes them.
-    most
-        What the scale of the sigmas may become.
-    slack, photo_slack
-        Added to the sigmas of distances, m, and of the log albedo.
+        As in `solve_step`.
+    max_scale
+        Upper limit of the scale of the sigmas.
+    iterations
+        Maximum number of iterations.
+    inflation, albedo_inflation
+        Noise inflation of distances, m, and of the log albedo.
     robust, min_cosine
-        As `accumulate` takes them.
-    judged
-        Whether directions that the data does not hold stay at the prediction. If not, all move.
+        As in `accumulate`.
+    remap
+        Whether degenerate directions stay at the prediction (solution remapping, Zhang et al.
+        2016).
     tilt, slope
-        As `faked_information` takes them.
-    held
-        As `weak_directions` takes it.
+        As in `spurious_information`.
+    max_sigma
+        As in `degenerate_directions`.
     tolerance
-        The last step is smaller, in `units`, unless there are no more iterations.
+        Iteration stops when the step is smaller than this, in `units`.
 
     Returns
     -------
-    The last sums; (6, 6) information that can be faked; (k, 6) weak directions; the size of the
-    last step in `units`; and how many there were. Where the sums are not finite, they are 0, and
-    T stays.
+    The last sums (SIZE,), the spurious information (6, 6), the degenerate directions (k, 6), the
+    size of the last step in `units`, and the number of iterations. If the sums are not finite, the
+    returned sums are 0, all directions are degenerate, and T is unchanged.
     """
     total = np.zeros(sums.SIZE)
     weak = np.zeros((0, 6))
@@ -88,57 +91,57 @@ def settle(
                 targets[k],
                 lookups[k],
                 lookup_frames[k],
-                composed(T_targets[k], T),
-                guessed[EXPOSURE],
-                guessed[SCALE_G],
-                guessed[SCALE_P],
-                slack,
+                compose(T_targets[k], T),
+                estimates[EXPOSURE],
+                estimates[SCALE_G],
+                estimates[SCALE_P],
+                inflation,
                 robust,
                 min_cosine,
             )
-        if judged and done == 0:
-            doubt = total[sums.INLIERS] * faked_information(
+        if remap and done == 0:
+            doubt = total[sums.INLIERS] * spurious_information(
                 points,
                 max(1, len(points) // SOME_POINTS),
-                guessed[SCALE_G],
-                slack,
-                guessed[SCALE_P] ** 2,
+                estimates[SCALE_G],
+                inflation,
+                estimates[SCALE_P] ** 2,
                 tilt,
                 slope,
             )
-        told = np.isfinite(total.sum() + doubt.sum())
-        if told:
-            if judged:
-                weak = weak_directions(cross_information(total) - doubt, units, held)
-            onward, step = advance(total, T, T_predicted, weak, prior, units)
-            told = np.isfinite(step.sum())
-        if not told:  # planes beyond all bounds, as noise alone can make them: no point fits
+        finite = np.isfinite(total.sum() + doubt.sum())
+        if finite:
+            if remap:
+                weak = degenerate_directions(cross_information(total) - doubt, units, max_sigma)
+            onward, step = solve_step(total, T, T_predicted, weak, prior, units)
+            finite = np.isfinite(step.sum())
+        if not finite:  # fits to noise alone can make planes without bounds
             return np.zeros(sums.SIZE), np.zeros((6, 6)), np.eye(6), np.inf, done
         T[:] = onward
         done += 1
         size = 0.0
         for p in range(6):
             size = max(size, abs(step[p] / units[p]))
-        if guessed[SCALE_P] > 0:
-            guessed[EXPOSURE] += step[6]
-        _rescale(total, guessed, most, photo_slack)
+        if estimates[SCALE_P] > 0:
+            estimates[EXPOSURE] += step[6]
+        _rescale(total, estimates, max_scale, albedo_inflation)
     return total, doubt, weak, size, done
 
 
 @kernel
-def _rescale(total: Float64, guessed: Float64, most: float, photo_slack: float) -> None:
-    """Take the sigmas from the residuals: the views show only their own noise, not their bias."""
+def _rescale(total: Float64, estimates: Float64, max_scale: float, albedo_inflation: float) -> None:
+    """Estimate the sigmas from the residuals, which contain both views' noise and bias."""
     seen = scale_of_distances(total[sums.HISTOGRAM :])
     if not np.isnan(seen):
-        guessed[SCALE_G] = min(max(seen, 0.7), most)
-    if guessed[SCALE_P] > 0 and total[sums.WEIGHT_P] > 0:
+        estimates[SCALE_G] = min(max(seen, 0.7), max_scale)
+    if estimates[SCALE_P] > 0 and total[sums.WEIGHT_P] > 0:
         variance = total[sums.SQUARES_P] / total[sums.WEIGHT_P] / 0.72
-        guessed[SCALE_P] = min(max(np.sqrt(variance + photo_slack**2), 0.005), 0.5)
+        estimates[SCALE_P] = min(max(np.sqrt(variance + albedo_inflation**2), 0.005), 0.5)
 
 
 @kernel
 def _without_exposure(A: Float64) -> Float64:
-    """Marginalise the seventh unknown: (6, 6)."""
+    """Marginalise the seventh unknown, the exposure: (6, 6)."""
     out = np.empty((6, 6))
     for p in range(6):
         for o in range(6):
@@ -149,26 +152,26 @@ def _without_exposure(A: Float64) -> Float64:
 
 @kernel
 def information(total: Float64) -> Float64:
-    """(6, 6) of the pose, from what `accumulate` summed."""
+    """Return the information (6, 6) of the pose, from the sums of `accumulate`."""
     return _without_exposure(normal_equations(total)[0])
 
 
 @kernel
 def cross_information(total: Float64) -> Float64:
-    """(6, 6) symmetrised product of the Jacobians of target and source, over the pose."""
+    """Return the symmetrised product (6, 6) of the target's and source's pose Jacobians."""
     return _without_exposure(normal_equations(total)[2])
 
 
 @kernel
-def weak_directions(cross: Float64, units: Float64, held: float) -> Float64:
-    """(k, 6) unit directions, in `units`, whose sigma is above `held`."""
+def degenerate_directions(cross: Float64, units: Float64, max_sigma: float) -> Float64:
+    """Return the unit directions (k, 6), in `units` (6,), whose sigma exceeds `max_sigma`."""
     scaled = np.empty((6, 6))
     for p in range(6):
         for o in range(6):
             scaled[p, o] = cross[p, o] * units[p] * units[o]
     values, vectors = np.linalg.eigh(scaled)
     count = 0
-    while count < 6 and values[count] < 1 / (held * held):
+    while count < 6 and values[count] < 1 / (max_sigma * max_sigma):
         count += 1
     out = np.empty((count, 6))
     for k in range(count):
@@ -178,7 +181,7 @@ def weak_directions(cross: Float64, units: Float64, held: float) -> Float64:
 
 
 @kernel
-def advance(
+def solve_step(
     total: Float64,
     T: Float64,
     T_predicted: Float64,
@@ -186,24 +189,24 @@ def advance(
     prior: Float64,
     units: Float64,
 ) -> tuple[Float64, Float64]:
-    """Solve for a step, and go it.
+    """Solve the normal equations and apply the update.
 
     Parameters
     ----------
     total
-        From `accumulate`.
+        (SIZE,) sums of `accumulate`.
     T, T_predicted
-        (4, 4) of the source: now, and where it was expected.
+        (4, 4) current and predicted pose of the source.
     weak
-        (k, 6) unit directions, in `units`, that stay at the prediction.
+        (k, 6) unit directions, in `units`, that are fixed to the prediction.
     prior
-        (6,) sigma of the prediction.
+        (6,) sigma of the prediction, m and rad.
     units
-        (6,) in which directions are compared.
+        (6,) scale of each component, in which directions are compared.
 
     Returns
     -------
-    The next (4, 4), and the step (7,), whose last number is that of the exposure.
+    The updated pose (4, 4) and the step (7,), whose last element is the exposure's.
     """
     A, g, _ = normal_equations(total)
     away = twist_between(T_predicted, T)
@@ -218,7 +221,7 @@ def advance(
         A[p, p] += weight
         g[p] += weight * away[p]
     if weak.shape[0]:
-        # What the data does not hold is held at the prediction, far more firmly than noise can.
+        # Degenerate directions get a stiff prior, far above the information of noise.
         trace = 0.0
         for p in range(6):
             trace += A[p, p]
@@ -234,12 +237,12 @@ def advance(
     _solve(A, g)
     for p in range(7):
         g[p] *= -units[p] if p < 6 else -1.0
-    return moved(T, g), g
+    return retract(T, g), g
 
 
 @kernel
 def _solve(A: Float64, b: Float64) -> None:
-    """Solve A x = b in place, A symmetric and positive definite, by Cholesky's decomposition."""
+    """Solve A x = b in place for a symmetric positive definite A, by Cholesky decomposition."""
     n = len(b)
     for p in range(n):
         for o in range(p + 1):
@@ -258,10 +261,10 @@ def _solve(A: Float64, b: Float64) -> None:
 
 @kernel
 def scale_of_distances(histogram: Float64) -> float:
-    """Sigma of all compared points' distances, in the sigmas they claim; NaN if there are none.
+    """Return the ratio of observed to stated sigma of all compared distances; NaN without any.
 
-    Of all that was compared, not of what fitted: a scale from inliers would confirm itself. From
-    the median, as 1.48 times it is the sigma of normal deviates.
+    1.48 times the median of the absolute distances. Outliers are included, as a scale estimated
+    from inliers only would confirm itself.
     """
     count = 0.0
     for k in range(sums.BINS):

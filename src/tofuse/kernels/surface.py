@@ -1,8 +1,8 @@
-"""Smooth surfaces from noisy range images: local planes, fitted in constant time a pixel.
+"""Local plane fits and albedo of range images, in constant time per pixel.
 
-In a range image a plane is linear in inverse depth: with ray (x, y, 1) and z depth, 1/z = a x +
-b y + c on the plane with normal (a, b, c). Weighted sums over any window come from integral
-images, so windows can be as wide as the noise asks for and the surface allows.
+In a range image a plane is linear in inverse depth: on the plane with normal (a, b, c), a pixel
+with ray (x, y, 1) has 1/z = a x + b y + c. Weighted sums over any window come from integral images,
+so windows can be as wide as the noise requires and the surface permits.
 """
 
 from __future__ import annotations
@@ -27,11 +27,18 @@ def halve(
     start: int,
     stop: int,
 ) -> None:
-    """Halve an image, to rows start..stop: each pixel is the mean of one surface's in its 2x2.
+    """Downsample an image by 2 without mixing surfaces, to rows start..stop of the output.
 
-    Of four depths those within `jump` (share of the depth) of the second nearest are averaged, as
-    inverse depths; zeros don't count. `value` is averaged over the same pixels, and `variance`,
-    that of z, becomes the variance of their mean, as for noise that they don't share.
+    Of each 2 x 2 pixels, those whose depth is within `jump` (relative) of the second nearest are
+    averaged: inverse depths, and `value`. Pixels with depth 0 are invalid. `variance`, that of z,
+    becomes the variance of the mean of independent values.
+
+    Parameters
+    ----------
+    z, value, variance
+        (H, W) depth in m, any other channel, variance in m^2.
+    z_out, value_out, variance_out
+        (H // 2, W // 2), written.
     """
     columns = z_out.shape[1]
     d = np.empty(4)
@@ -42,7 +49,7 @@ def halve(
             p, q = z[2 * i, 2 * j], z[2 * i, 2 * j + 1]
             r, t = z[2 * i + 1, 2 * j], z[2 * i + 1, 2 * j + 1]
             low = min(min(p, q), min(r, t))
-            if low > 0 and max(max(p, q), max(r, t)) - low <= jump * low:  # as nearly everywhere
+            if low > 0 and max(max(p, q), max(r, t)) - low <= jump * low:  # the common case
                 u, v = 2 * i, 2 * j
                 z_out[i, j] = 4 / (1.0 / p + 1.0 / q + 1.0 / r + 1.0 / t)
                 value_out[i, j] = 0.25 * (
@@ -57,7 +64,7 @@ def halve(
             for k in range(4):
                 x = z[2 * i + (k >> 1), 2 * j + (k & 1)]
                 if x > 0:
-                    # Insertion into ascending order.
+                    # Insertion sort.
                     m = n
                     while m > 0 and d[m - 1] > x:
                         d[m] = d[m - 1]
@@ -106,23 +113,40 @@ def fit_planes(
 ) -> None:
     """Fit a plane at each `wanted` pixel of rows start..stop.
 
-    Its slope is that over the widest window that is one surface, its depth that over the smallest.
-    The slope needs many pixels, as noise in it acts like noise in the motion. The depth does not,
-    and a wide window would bend curved surfaces, more in some views than in others, which drags
-    the motion.
+    The slope is fitted over the widest window that contains one surface, the depth over the
+    smallest window. The slope needs many pixels, as its noise propagates to the motion; the depth
+    does not, and a wide window would bias it on curved surfaces, differently from view to view.
 
-    A window is one surface if its mean weighted squared residual is what noise of variance `limit`
-    can give (three standard deviations), the pixel itself is within 5 sigmas, at least the share
-    `fill` of the window is valid, and the centre of what is valid is not off the pixel by more
-    than the share `offset` of its spread (squared), as it is at an outline.
+    A window contains one surface if its mean weighted squared residual is within three standard
+    deviations of that of noise with variance `limit`, the pixel itself is within 5 sigmas, enough
+    of the window is valid, and the valid pixels surround the pixel, unlike at an occlusion edge.
 
-    planes is (H, W, 4): the coefficients a, b, c of 1/z = a x + b y + c, and 1/z at the pixel; all
-    0 where no window fits. quality is (H, W, 2): mean squared weighted residual of the smallest
-    window (NaN if it has too few pixels), and variance of the fitted 1/z at the pixel in units of
-    the noise, that is, with weights 1 / variance.
+    Parameters
+    ----------
+    w, rays, weight
+        (H, W) inverse depth in 1/m, (H, W, 2) x/z and y/z, (H, W) weight (0: invalid).
+    wanted
+        (H, W) pixels to fit.
+    radii
+        Half widths of the windows in pixels, ascending.
+    limit
+        Expected mean weighted squared residual.
+    fill
+        Smallest valid fraction of a window.
+    offset
+        Largest squared offset of the valid pixels' centroid, relative to their variance.
+    planes
+        (H, W, 4) written: coefficients a, b, c of 1/z = a x + b y + c, and 1/z at the pixel; 0
+        where no window fits.
+    quality
+        (H, W, 2) written: mean squared weighted residual of the smallest window (NaN with too few
+        pixels), and variance of the fitted 1/z at the pixel, in units in which weights are inverse
+        variances.
+    start, stop
+        Rows to fit.
     """
     rows, columns = w.shape
-    # Rows of an integral image that begins where the first window does: as many as a window needs.
+    # Ring buffer of as many rows of the integral image as a window needs.
     most = radii[-1]
     kept = 2 * most + 2
     sums = np.empty((kept, columns + 1, _SUMS))
@@ -155,8 +179,8 @@ def fit_planes(
                 continue
             x0 = np.float64(rays[i, j, 0])
             y0 = np.float64(rays[i, j, 1])
-            # From the smallest window up: a window that fails ends it, so a wide window never
-            # jumps over a gap that a smaller one has seen.
+            # From the smallest window up to the first one that fails, so that a wide window never
+            # bridges a gap that a smaller one has detected.
             for q in range(len(radii)):
                 r = radii[q]
                 high, low = sums[above[q]], sums[below[q]]
@@ -208,9 +232,9 @@ def fit_planes(
 
 @kernel
 def _by_count(radii: Int64, limit: float) -> tuple[Float64, Float64]:
-    """What a window's fit needs of the number n of its valid pixels, without a root for each.
+    """Tabulate 1 / (n - 3) and the largest mean squared residual by the number n of valid pixels.
 
-    Either is (len(radii), most pixels + 1): 1 / (n - 3), and the largest mean squared residual.
+    Each is (len(radii), largest n + 1).
     """
     most = (2 * radii[-1] + 1) ** 2
     per_free = np.zeros((len(radii), most + 1))
@@ -218,7 +242,7 @@ def _by_count(radii: Int64, limit: float) -> tuple[Float64, Float64]:
     for q in range(len(radii)):
         for n in range(4, (2 * radii[q] + 1) ** 2 + 1):
             per_free[q, n] = 1.0 / (n - 3)
-            # Of n - 3 squared normal deviates the mean has a standard deviation of
+            # The mean of n - 3 squared normal deviates has a standard deviation of
             # sqrt(2 / (n - 3)).
             allowed[q, n] = limit * (1.0 + 3.0 * np.sqrt(2.0 / (n - 3)))
     return per_free, allowed
@@ -226,10 +250,9 @@ def _by_count(radii: Int64, limit: float) -> tuple[Float64, Float64]:
 
 @kernel
 def _add_row(w: Float32, rays: Float32, weight: Float32, above: Float64, below: Float64) -> None:
-    """Write a row of the integral image of the weighted moments, from the row above it.
+    """Write a row of the integral image of the weighted moments, `below`, given the row `above`.
 
-    Both are (W + 1, _SUMS): sums over all pixels to the left. Pixels without weight count nothing,
-    whatever they hold.
+    Both are (W + 1, _SUMS). Pixels with weight 0 are ignored, whatever their values.
     """
     t = np.zeros(_SUMS)
     below[0] = above[0]
@@ -267,12 +290,21 @@ def albedo_image(
     falloff: float,
     out: Float32,
 ) -> None:
-    """Logarithm of the albedo, up to a constant: light * range^2 / cos(incidence).
+    """Write the log albedo up to a constant: log(amplitude * range^2 / cos(incidence)).
 
-    Light `falls` with the square of the range unless that has been compensated, and with the power
-    `falloff` of the cosine to the axis. Without a lamp of its own a camera sees surfaces as bright
-    from any side, and the cosine of incidence is left out. NaN where there is no plane, no light,
-    or the surface is seen too slantwise.
+    Parameters
+    ----------
+    planes, rays, light
+        (H, W, 4) of `fit_planes`, (H, W, 2), and (H, W) amplitude.
+    falls
+        Whether the amplitude falls with the squared range; it does not if it is range-compensated.
+    own_lamp
+        Whether the scene is lit by the camera. Otherwise the cosine of incidence is left out, as
+        for a Lambertian surface in ambient light.
+    falloff
+        Exponent of the cosine to the optical axis by which amplitude falls off.
+    out
+        (H, W) written; NaN without plane or amplitude, and at grazing incidence.
     """
     rows, columns = light.shape
     one = np.float32(1)
@@ -310,12 +342,20 @@ def smooth_and_slope(
     start: int,
     stop: int,
 ) -> None:
-    """Box means of an image with NaN holes and their slopes, never across an edge in depth.
+    """Box-filter an image with NaN holes and compute its gradient, not across depth edges.
 
-    For rows start..stop, out is (H, W, 3): mean over (2 radius + 1)^2 pixels, and its derivatives
-    by the ray coordinates x and y. NaN where a pixel of the cross that the slopes need is missing
-    or its plane lies off the centre's by more than `jump` (share of the depth). A box with holes,
-    or cut off by the border, counts where the middle of its pixels is.
+    Parameters
+    ----------
+    image, planes, rays
+        (H, W), (H, W, 4) of `fit_planes`, and (H, W, 2).
+    radius
+        Boxes have (2 radius + 1)^2 pixels. A partial box is assigned to the centroid of its pixels.
+    jump
+        The gradient needs four neighbours whose planes continue the centre's to within this
+        fraction of the inverse depth.
+    out
+        (H, W, 3) written in rows start..stop: mean, and its derivatives by the ray coordinates x
+        and y; NaN where they are not defined.
     """
     rows, columns = image.shape
     h = radius + 1
@@ -327,7 +367,7 @@ def smooth_and_slope(
         out[i] = np.nan
         if i < h or i >= rows - h or inner <= 0:
             continue
-        # The pixels that have a cross, and its four ends.
+        # Pixels with four neighbours at distance h, and these neighbours.
         here, k = slice(h, h + inner), i - above
         m, p, r = mean[k, here], planes[i, here], rays[i, here]
         m0, p0, r0 = mean[k, :inner], planes[i, :inner], rays[i, :inner]
@@ -347,8 +387,8 @@ def smooth_and_slope(
                 and _continues(p[j], p3[j], r3[j], most)
             ):
                 continue
-            # Chain rule: slopes by pixel to slopes by ray coordinate, for any lens. A mean that is
-            # missing is NaN, and so is what it takes part in.
+            # Chain rule from pixel to ray coordinates, for any lens. Missing means are NaN and
+            # propagate.
             du, dv = m1[j, 0] - m0[j, 0], m3[j, 0] - m2[j, 0]
             xu, xv = m1[j, 1] - m0[j, 1], m3[j, 1] - m2[j, 1]
             yu, yv = m1[j, 2] - m0[j, 2], m3[j, 2] - m2[j, 2]
@@ -362,23 +402,23 @@ def smooth_and_slope(
 
 @kernel
 def _continues(plane: Float32, other: Float32, ray: Float32, most: np.float32) -> bool:
-    """Whether a plane goes on to another pixel, to within `most` of its inverse depth."""
+    """Whether a plane extends to another pixel, to within `most` in inverse depth."""
     expected = plane[0] * ray[0] + plane[1] * ray[1] + plane[2]
     return other[3] > 0 and abs(other[3] - expected) <= most
 
 
 @kernel
 def _box_means(image: Float32, rays: Float32, radius: int, above: int, out: Float32) -> None:
-    """Mean of each pixel's box from row `above` on, and where the middle of its pixels is.
+    """Write mean and centroid (x, y) of each pixel's box, from row `above` on, to `out`.
 
-    out is (rows, W, 3): mean, x and y; NaN where the box is empty.
+    `out` is (rows, W, 3); NaN where the box is empty.
     """
     rows, columns = image.shape
     full = np.float32((2 * radius + 1) * (2 * radius + 1))
     per_full = np.float32(1) / full
     known = np.empty(columns, np.float32)
     one, none = np.float32(1), np.float32(0)
-    # Sums over the box's rows, with a margin of zeros, and over its columns as well.
+    # Sums over the rows of a box, padded by zeros, and sums over the whole box.
     down = np.zeros((4, columns + 2 * radius), np.float32)
     box = np.empty((4, columns), np.float32)
     for k in range(out.shape[0]):

@@ -25,7 +25,7 @@ def _place(i: int, j: int, k: int) -> tuple[int, int]:
 
 @kernel
 def _gather(
-    b: int, neighbours: Int32, distance: Float32, weight: Float32, least: float, out: Float32
+    b: int, neighbours: Int32, distance: Float32, weight: Float32, min_weight: float, out: Float32
 ) -> bool:
     """Distances (9, 9, 9) of a block and the next voxels, NaN where unknown; whether 0 is among."""
     below = False
@@ -36,7 +36,7 @@ def _gather(
                 n, v = _place(i, j, k)
                 row = neighbours[b, n]
                 d = np.float32(np.nan)
-                if row >= 0 and weight[row, v] > least:
+                if row >= 0 and weight[row, v] > min_weight:
                     d = distance[row, v]
                     below |= d < 0
                     above |= d >= 0
@@ -50,24 +50,24 @@ def mark_cells(
     distance: Float32,
     weight: Float32,
     seen: UInt16,
-    least: float,
+    min_weight: float,
     views: int,
     cells: Int32,
     counts: Int64,
     start: int,
     stop: int,
 ) -> None:
-    """Number the cells of blocks start..stop that hold a vertex.
+    """Number the cells of blocks start..stop that contain a vertex.
 
-    A cell counts if all its corners have more than the `least` weight, their distances differ in
-    sign, and one of them was seen by at least so many `views`. `cells` (B, VOXELS) gets the number
-    within the block or -1, `counts` (B,) how many there are.
+    They are cells whose corners all have a weight above `min_weight` and distances of both signs,
+    and of which at least one corner was seen by `views` views. Writes `cells` (B, VOXELS), the
+    number within the block or -1, and `counts` (B,), the number of such cells.
     """
     d = np.empty((_SIDE, _SIDE, _SIDE), np.float32)
     for b in range(start, stop):
         cells[b] = -1
         counts[b] = 0
-        if not _gather(b, neighbours, distance, weight, least, d):
+        if not _gather(b, neighbours, distance, weight, min_weight, d):
             continue
         number = 0
         for v in range(VOXELS):
@@ -116,9 +116,9 @@ def make_vertices(
 ) -> None:
     """Make the vertices of the marked cells of blocks start..stop, from row starts[b] on.
 
-    `points` are relative to the world's origin, `normals` the normalised gradient, `tints` the mean
-    light where seen, `sigmas` one over the root of the corners' mean weight, `views` the largest
-    count among the corners.
+    Writes `points` (world frame, m), `normals` (normalised gradient), `tints` (mean colour of the
+    corners that have one), `sigmas` (inverse root of the corners' mean weight) and `views` (largest
+    number of views among the corners).
     """
     d = np.empty((2, 2, 2))
     channels = color.shape[2]

@@ -1,7 +1,7 @@
 """One thread pool, used so that the result does not depend on how many threads there are.
 
-Work is cut into a number of chunks that depends on the work alone. Each chunk is computed by one
-call of a GIL-free kernel, and results are combined in chunk order.
+Work is divided into a number of chunks that depends on the work alone. Each chunk is computed by
+one call of a GIL-free kernel, and results are combined in chunk order.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from tofuse.kernels.cores import usable_cores
 R = TypeVar("R")
 
 _count = usable_cores()
-# A pool for each number of threads that was asked for: none is ever shut down, as another Python
-# thread may be using it.
+# A pool for each number of threads. None is ever shut down, as another thread may be using it.
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()
 _here = threading.local()
@@ -40,7 +39,7 @@ def set_thread_count(count: int) -> None:
 
 @contextmanager
 def threads(count: int | None) -> Iterator[None]:
-    """Use `count` threads inside the block (None: leave it as it is)."""
+    """Use `count` threads inside the block (None: no change)."""
     before = _count
     set_thread_count(before if count is None else count)
     try:
@@ -50,7 +49,7 @@ def threads(count: int | None) -> Iterator[None]:
 
 
 def chunk_bounds(size: int, chunks: int = 16) -> list[tuple[int, int]]:
-    """Cut range(size) into at most `chunks` nearly equal, non-empty (start, stop) pieces."""
+    """Divide range(size) into at most `chunks` nearly equal, non-empty (start, stop) pieces."""
     chunks = max(1, min(chunks, size))
     edges = [size * k // chunks for k in range(chunks + 1)]
     return [(a, b) for a, b in itertools.pairwise(edges) if b > a]
@@ -59,8 +58,8 @@ def chunk_bounds(size: int, chunks: int = 16) -> list[tuple[int, int]]:
 def run_chunks(function: Callable[[int, int], R], size: int, chunks: int = 16) -> list[R]:
     """Return [function(start, stop) for each chunk], in chunk order, computed on the pool.
 
-    An exception in a chunk is raised here: that of the first chunk that failed. Called from inside
-    a chunk, the work is done there and then, as waiting for the pool could last for ever.
+    Raises the exception of the first chunk that failed. Nested calls are computed serially on the
+    calling thread, as waiting for the pool could deadlock.
     """
     bounds = chunk_bounds(size, chunks)
     if _count == 1 or len(bounds) <= 1 or getattr(_here, "inside", False):
@@ -81,17 +80,17 @@ def _mark_inside() -> None:
     _here.inside = True
 
 
-def side_threads(count: int, name: str) -> ThreadPoolExecutor:
-    """Make threads that do whole jobs beside others: what they call does its chunks there and then.
+def job_pool(count: int, name: str) -> ThreadPoolExecutor:
+    """Return a pool for whole jobs in parallel, inside which `run_chunks` is serial.
 
-    Cutting the work of a thread that has others beside it would only add hand-overs.
+    Dividing the work of a job further would only add synchronisation.
     """
     return ThreadPoolExecutor(count, thread_name_prefix=name, initializer=_mark_inside)
 
 
 @contextmanager
-def undivided(wanted: bool = True) -> Iterator[None]:
-    """Do chunks there and then inside the block, while other threads have work of their own."""
+def serial_chunks(wanted: bool = True) -> Iterator[None]:
+    """Compute chunks serially inside the block, while other threads have work of their own."""
     before = getattr(_here, "inside", False)
     _here.inside = before or wanted
     try:

@@ -1,8 +1,8 @@
-"""What each patch of an image says about a pose: normal equations, and their parts tile by tile.
+"""Normal equations of an alignment by image tile, for its sandwich covariance.
 
-Errors of a range camera that are not noise (light by way of other surfaces, scattering in the
-lens, motion) are alike over patches much larger than a pixel. How the patches disagree about the
-pose tells more of its error than the noise of the pixels does.
+Systematic errors of a range camera (multipath, lens scattering, motion) are correlated over patches
+much larger than a pixel. The scatter of the tiles' gradients therefore says more about the error of
+the pose than the pixels' noise.
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ from tofuse.kernels.alignment import (
     STAT,
     WEIGHT_G,
     WEIGHT_P,
-    albedos,
-    distances,
-    land,
-    load,
-    move,
+    compare_albedos,
+    compare_planes,
+    load_block,
+    project_block,
     put_point,
+    transform_block,
 )
 from tofuse.kernels.jit import kernel
 
 # Layout of a tile's sums, over the distances of its pixels.
-A = 0  # 7: sum of w J, what an error common to the tile does to the gradient
+A = 0  # 7: sum of w J, the response of the gradient to an error shared by the tile
 WEIGHT = 7  # sum of w
 RESIDUAL = 8  # sum of w r
 COUNT = 9
 SIZE = 10
-# What is summed over all tiles: upper triangles (28) of 7x7 matrices, whose seventh unknown is the
-# exposure. Of w J J^T, for the distances and for the albedo, and for both the symmetrised product
-# of the Jacobians of target and source, with w, and with the slope of the influence function for w.
+# Sums over the whole image: upper triangles (28) of 7x7 matrices, whose seventh unknown is the
+# exposure. w J J^T of the distances and of the albedo; and for both terms together, the symmetrised
+# product of the target's and source's Jacobians, weighted by w and by the derivative of the
+# influence function.
 GEOMETRY, PHOTO, WEIGHED, CROSS = 0, 1, 2, 3
 KINDS = 4
 UPPER = 28
@@ -51,7 +52,7 @@ def tile_sums(
     rays: Float32,
     planes: Float32,
     plane_variance: Float32,
-    photo: Float32,
+    albedo: Float32,
     target: Float32,
     lookup: Float32,
     lookup_frame: Float64,
@@ -67,11 +68,12 @@ def tile_sums(
 ) -> tuple[Float64, Float64]:
     """Sum over every `stride`-th pixel of every `stride`-th row; see `alignment.accumulate`.
 
-    The source is given by its images, the target as `alignment.make_target` packs it.
+    The source is given by its images (see `alignment.gather`), the target by that of
+    `alignment.make_target`; the image is divided into `tiles_y` x `tiles_x` tiles.
 
     Returns
     -------
-    (tiles_y * tiles_x, SIZE) of the tiles, and (KINDS, UPPER) of the image.
+    (tiles_y * tiles_x, SIZE) sums of the tiles, and (KINDS, UPPER) of the image.
     """
     rows, columns = planes.shape[0], planes.shape[1]
     tiles = np.zeros((tiles_y * tiles_x, SIZE))
@@ -88,20 +90,20 @@ def tile_sums(
                     rays[row, column],
                     planes[row, column],
                     plane_variance[row, column],
-                    photo[row, column],
+                    albedo[row, column],
                 )
                 of[count] = row * tiles_y // rows * tiles_x + column * tiles_x // columns
                 count += 1
             if count < LANES and (row + stride < rows or column + stride < columns):
                 continue
-            load(block, points[:count])
-            move(block, T)
-            land(block, count, target, lookup, lookup_frame)
-            distances(block, T, scale_g, 0.0, robust, min_cosine)
+            load_block(block, points[:count])
+            transform_block(block, T)
+            project_block(block, count, target, lookup, lookup_frame)
+            compare_planes(block, T, scale_g, 0.0, robust, min_cosine)
             _add_to_tiles(tiles, of, block, count)
             _add_products(sums, block, GEOMETRY, WEIGHT_G)
             if scale_p > 0:
-                albedos(block, T, exposure, scale_p, robust)
+                compare_albedos(block, T, exposure, scale_p, robust)
                 _add_products(sums, block, PHOTO, WEIGHT_P)
             count = 0
     upper = np.zeros((KINDS, UPPER))
@@ -126,10 +128,10 @@ def _add_to_tiles(tiles: Float64, of: Int64, block: Float32, count: int) -> None
 
 @kernel
 def _add_products(sums: Float64, block: Float32, of: int, weight: int) -> None:
-    """Add the products of the rows of J to those `of` one kind, and to the cross sums.
+    """Add the products of the rows of J to those of the kind `of`, and to the cross sums.
 
-    With f the root of the robust weight, the slope of the influence is f^2 (5 - 4 / f) times that
-    of least squares: Tukey's is r f^2, and f = 1 - (r / limit)^2.
+    Tukey's influence function is r f^2 with f = 1 - (r / limit)^2; its derivative is f^2 (5 - 4 /
+    f).
     """
     per_weight = np.empty(LANES, np.float32)
     weights = block[(STAT + weight - INLIERS) * LANES : (STAT + weight - INLIERS + 1) * LANES]
@@ -155,7 +157,7 @@ def _add_products(sums: Float64, block: Float32, of: int, weight: int) -> None:
                     both = a[k] * b[k] - c[k] * d[k]
                     weighed[k] += both
                     cross[k] += per_weight[k] * both
-            else:  # of both sides alike
+            else:  # the exposure has the same derivative in both Jacobians
                 for k in range(LANES):
                     weighed[k] += a[k] * b[k]
                     cross[k] += per_weight[k] * a[k] * b[k]

@@ -1,6 +1,6 @@
-"""Signed distances of many views in sparse blocks of voxels (Curless and Levoy 1996).
+"""Truncated signed distances of many views in sparse blocks of voxels (Curless and Levoy 1996).
 
-Distances are positive in front of a surface and cut at `reach`. Blocks are those of
+Distances are positive in front of a surface and truncated at `reach`. Blocks are those of
 `tofuse.kernels.blocks`.
 """
 
@@ -11,13 +11,13 @@ import numpy as np
 from tofuse.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt8, UInt16
 from tofuse.kernels.blocks import EDGE, EMPTY, HALF, VOXELS, block_key, block_of
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import landing
+from tofuse.kernels.projection import project_ray
 
-MOST_SEEN = 65535  # views that a voxel can count
-# How many cells of the grid of rays are looked through before a block is taken voxel by voxel.
-_MOST_CELLS = 600
+MAX_SEEN = 65535  # saturation of a voxel's counter of views
+# Largest number of lookup cells that are inspected to classify a block as a whole.
+_MAX_CELLS = 600
 _PER_UNIT = np.float32(1 / 127)  # of normals in bytes
-_LEAST_WEIGHT = np.float32(1e-30)  # against a division by 0
+_MIN_WEIGHT = np.float32(1e-30)  # avoids a division by 0
 
 
 @kernel
@@ -34,11 +34,22 @@ def near_cubes(
     first: tuple[int, int],
     stride: int,
 ) -> Int64:
-    """Keys of the cubes of space within `reach` of the surface that a view shows; some repeatedly.
+    """Return the keys of the cubes within `reach` of a view's surface, with duplicates.
 
-    Along the normal of each pixel points at most `spacing` cubes apart are taken. The images are
-    those of `open_view`, of which every `stride`-th pixel is looked at, from row and column `first`
-    on.
+    Parameters
+    ----------
+    z, unit, normals, strength, rays
+        Of the view, as in `unpack_view`.
+    T_world_camera
+        (4, 4).
+    cube_m
+        Edge of a cube, m.
+    reach
+        Truncation distance, m.
+    spacing
+        Largest distance between samples along a pixel's normal, in cubes.
+    first, stride
+        Row and column of the first pixel, and step to the next one in both directions.
     """
     T = T_world_camera / cube_m
     steps = max(2, int(np.ceil(2 * reach / (spacing * cube_m))))
@@ -75,7 +86,7 @@ def near_cubes(
 
 
 @kernel
-def draw_to_planes(
+def shrink_to_planes(
     z: Float32,
     sigma: Float32,
     planes: Float32,
@@ -86,9 +97,7 @@ def draw_to_planes(
     variance: Float32,
     measured: Bool,
 ) -> None:
-    """Draw depths towards the planes around them, the more the noisier they are.
-
-    What is added to the plane is the share of what deviates that exceeds the noise (Wiener's gain).
+    """Shrink depths towards their local planes by the Wiener gain, relief / (relief + noise).
 
     Parameters
     ----------
@@ -97,11 +106,11 @@ def draw_to_planes(
     planes, plane_variance
         (H, W, 4) of `fit_planes`, and (H, W) the variance of 1/z on them.
     detail
-        Size of the relief that surfaces have, as a share of the depth.
+        Standard deviation of the surface relief, as a fraction of the depth.
     sigmas
-        A pixel measured the plane if it is no farther off than so many standard deviations.
+        A pixel measures its plane if it is within this number of standard deviations.
     smooth, variance, measured
-        (H, W) get the depth in m, its variance in m^2, and whether the pixel measured a plane.
+        (H, W) written: depth in m, its variance in m^2, and whether the pixel measures its plane.
     """
     rows, columns = z.shape
     one = np.float32(1)
@@ -120,7 +129,7 @@ def draw_to_planes(
             relief = (share * depth) * (share * depth)
             gain = relief / max(relief + noise, np.float32(1e-12))
             rest = (one - gain) * (one - gain)
-            # d z = z^2 d(1/z); and what is left of the relief is not known either.
+            # d z = z^2 d(1/z); the removed part of the relief adds to the uncertainty.
             of_plane = plane_variance[r, c] * (plane * plane) * (plane * plane)
             smooth[r, c] = plane + gain * (depth - plane)
             variance[r, c] = gain * gain * noise + rest * (of_plane + min(relief, noise))
@@ -130,10 +139,17 @@ def draw_to_planes(
 
 @kernel
 def mark_jumps(z: Float32, sigma: Float32, share: float, sigmas: float, jump: UInt8) -> None:
-    """Mark both sides of jumps in depth: by this share of it, and by more than the noise makes.
+    """Mark the pixels on both sides of a depth edge.
 
-    `z` and `sigma` (H, W) are the depth in m, 0 where there is none, and its standard deviation;
-    `jump` (H, W), all 0 before, gets 1 beside a jump by so many `sigmas` of both.
+    Parameters
+    ----------
+    z, sigma
+        (H, W) depth in m, 0 where there is none, and its standard deviation.
+    share, sigmas
+        An edge is a difference by more than this fraction of the depth, and by more than this
+        number of standard deviations.
+    jump
+        (H, W) of zeros; set to 1 at edges.
     """
     rows, columns = z.shape
     part, limit = np.float32(share), np.float32(sigmas * sigmas)
@@ -163,23 +179,25 @@ def pack_view(
     lengths2: Float32,
     variance: Float32,
     good: Bool,
-    least_cosine: float,
+    min_cosine: float,
     normals: Int8,
     weights: Float32,
 ) -> None:
-    """Fill what `unpack_view` needs of a view: `normals` (H, W, 3), and `weights` (H, W) in 1/m^2.
+    """Compute the stored normals and weights of a view, see `unpack_view`.
 
     Parameters
     ----------
     planes
-        (H, W, 4) a, b, c of a X + b Y + c Z = 1, and 1/z on it: 0 where none is fitted, and the
-        surface is taken to face the camera.
+        (H, W, 4) a, b, c of a X + b Y + c Z = 1, and 1/z at the pixel; 0 without a fit, where the
+        surface is assumed to face the camera.
     rays, lengths2
         (H, W, 2) x/z and y/z, and (H, W) the squared ratio of the range to z; NaN where unknown.
     variance, good
-        (H, W) of the depth in m^2, and whether it is to be believed.
-    least_cosine
-        Of the incidence of light that is believed.
+        (H, W) of the depth in m^2, and whether the pixel is to be fused.
+    min_cosine
+        Smallest cosine of incidence of pixels that are fused.
+    normals, weights
+        (H, W, 3) in units of 1/127, and (H, W) in 1/m^2, written.
     """
     rows, columns = good.shape
     for r in range(rows):
@@ -200,13 +218,13 @@ def pack_view(
             normals[r, c, 1] = np.int8(np.rint(np.float32(127) * y))
             normals[r, c, 2] = np.int8(np.rint(np.float32(127) * z))
             cosine = (x * rays[r, c, 0] + y * rays[r, c, 1] + z) / length
-            if good[r, c] and cosine > least_cosine:
+            if good[r, c] and cosine > min_cosine:
                 of_distance = cosine * cosine * variance[r, c]
                 weights[r, c] = 1 / of_distance
 
 
 @kernel
-def open_view(
+def unpack_view(
     z: UInt16,
     unit: float,
     normals: Int8,
@@ -221,27 +239,26 @@ def open_view(
     cells: Float32,
     coarse: Float32,
 ) -> None:
-    """Unfold what is kept of a view, for `integrate`.
+    """Unpack the stored form of a view for `integrate`.
 
     Parameters
     ----------
     z, unit
         (H, W) z in counts of `unit` m, 0 where there is none.
     normals, strength
-        (H, W, 3) 127 times unit vectors away from the camera, and (H, W) codes of the weights that
-        `weights` (256,) has; 0 where nothing is to be believed.
+        (H, W, 3) 127 times the unit normals away from the camera, and (H, W) indices into `weights`
+        (256,); 0 for pixels that are not fused.
     rays, lookup_frame
         Of the view's `Projection`.
     reach, backs
-        How far before a surface a pixel matters, and (256,) how far behind it, by the code of its
-        weight.
+        Truncation distance in front of a surface, and (256,) behind it, by the index of the weight.
     heights, codes
-        (H W + 1,) get h of the pixel's plane n . p = h, and n and the code of its weight in four
-        bytes. The last one stands for all that is not in the image.
+        (H W + 1,) written: h of the pixel's plane n . p = h, and n and the index of the weight in
+        four bytes. The last element stands for all points outside the image.
     cells, coarse
-        (A, B, 3) gets for the cells of the lookup the z before which all is free, the z behind
-        which all is hidden, and the least weight: 0 where a pixel shows nothing, or the cell has no
-        pixel. And the same for each 4 x 4 of them.
+        (A, B, 3) written, for the cells of the lookup: the z in front of which all is free, the z
+        behind which all is occluded, and the smallest weight, 0 where a pixel has no surface or the
+        cell has no pixel. `coarse` is the same for each 4 x 4 cells.
     """
     rows, columns = z.shape
     cells[..., 0] = np.inf
@@ -287,7 +304,7 @@ def open_view(
 
 
 @kernel
-def farthest_told(
+def max_informative_depth(
     z: UInt16,
     unit: float,
     normals: Int8,
@@ -295,11 +312,10 @@ def farthest_told(
     rays: Float32,
     backs: Float32,
 ) -> float:
-    """How far from its camera, along z, a view may still tell something, m; 0 if it tells nothing.
+    """Return an upper bound of the z (m) at which a view still observes anything; 0 if nothing.
 
-    The images are those of `open_view`. Voxels that land on a pixel are up to half of its width
-    from its ray, and the plane of the pixel is the nearer to that ray's direction the farther it
-    reaches: a whole width is allowed for.
+    The arguments are those of `unpack_view`. Voxels that project to a pixel are up to half its
+    width from its ray, and see its plane at another depth; a whole width is allowed for.
     """
     rows, columns = z.shape
     far = 0.0
@@ -337,7 +353,7 @@ def farthest_told(
 
 
 @kernel
-def _told(
+def _classify_ball(
     x: float,
     y: float,
     z: float,
@@ -346,10 +362,10 @@ def _told(
     lookup_frame: Float64,
     margin: float,
 ) -> float:
-    """What a view tells of a ball around (x, y, z) in the camera's frame, as a whole.
+    """Classify a ball around (x, y, z) in the camera's frame.
 
-    -1: nothing, all of it is hidden or outside. Above 0: all of it is free, with this weight. 0: it
-    has to be looked at in parts. `margin` is the half width of a pixel, in cells.
+    Returns -1 if it is occluded or outside the image, a positive weight if it is all free space,
+    and 0 if it is neither. `margin` is half the width of a pixel, in cells.
     """
     if z + radius <= 1e-3:
         return -1.0
@@ -374,7 +390,7 @@ def _told(
     i1 = int(min(gu, cells.shape[1] - 1))
     j0 = int(max(fv, 0))
     j1 = int(min(gv, cells.shape[0] - 1))
-    if (i1 - i0 + 1) * (j1 - j0 + 1) > _MOST_CELLS:
+    if (i1 - i0 + 1) * (j1 - j0 + 1) > _MAX_CELLS:
         return 0.0
     hidden = True
     for j in range(j0, j1 + 1):
@@ -389,10 +405,10 @@ def _told(
 
 
 @kernel
-def _everywhere(
+def _global_projection(
     lookup: Float32, lookup_frame: Float64
 ) -> tuple[float, float, float, float, float, float, bool]:
-    """Where points land on a camera that keeps lines straight; see `_linear`."""
+    """Return the projection of a camera without distortion, in the form of `_local_projection`."""
     last = lookup.shape[1] - 1
     ux = np.float64(lookup[0, last, 0] - lookup[0, 0, 0]) * lookup_frame[2] / last
     vx = np.float64(lookup[0, last, 1] - lookup[0, 0, 1]) * lookup_frame[2] / last
@@ -407,7 +423,7 @@ def _everywhere(
 
 
 @kernel
-def _linear(
+def _local_projection(
     x: float,
     y: float,
     z: float,
@@ -416,14 +432,14 @@ def _linear(
     lookup_frame: Float64,
     nodes: float,
 ) -> tuple[float, float, float, float, float, float, bool]:
-    """Where points of a small ball around (x, y, z) land, as a linear function of x/z and y/z.
+    """Linearise the projection of a small ball around (x, y, z) in x/z and y/z.
 
-    u = u0 + ux x/z + uy y/z, v likewise: (u0, v0, ux, uy, vx, vy), and whether that will do: not
-    for balls that a bent lens shows bent, nor at the border.
+    u = u0 + ux x/z + uy y/z, v likewise. Returns (u0, v0, ux, uy, vx, vy) and whether that is
+    accurate enough: not at the border, nor for a ball over which distortion varies.
     """
     if z - radius < 0.5 * z or radius / z * max(lookup_frame[2], lookup_frame[3]) > nodes:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
-    u, v, i, j = landing(x / z, y / z, lookup, lookup_frame)
+    u, v, i, j = project_ray(x / z, y / z, lookup, lookup_frame)
     if i < 0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False
     ux = np.float64(lookup[j, i + 1, 0] - lookup[j, i, 0]) * lookup_frame[2]
@@ -464,54 +480,63 @@ def integrate(
     start: int,
     stop: int,
 ) -> None:
-    """Add views of one camera, in order, to blocks start..stop.
+    """Integrate views of one camera, in order, into the blocks start..stop.
 
     Voxel (i, j, k) of a block lies at its corner plus (i, j, k) `voxel_m`. Its distance is that to
-    the plane of the pixel that it lands on, cut at `reach`. A view knows nothing from where on it
-    is surely behind its surface: by `reach`, or more where the pixel is noisy. Blocks come first
-    and views second, so that a block is fetched once for all of them.
+    the plane of the pixel it projects to, truncated at `reach`. A view does not observe voxels that
+    are occluded: behind its surface by `reach`, or by more where the pixel is noisy. The loop over
+    blocks is the outer one, so that a block is fetched once for all views.
 
-    Of what is not near to what it saw, a view tells at most that it is free. There only every
-    so-many-th view is looked at, in turn, and counts so many times.
+    Far from its surface a view only observes free space. There, views are integrated round-robin:
+    every `turns`-th one, with `turns` times its weight.
 
     Parameters
     ----------
+    keys
+        (B,) of the blocks.
+    voxel_m
+        Edge of a voxel, m.
     blocks, views
-        (B,) and (V,) the numbers of the blocks and of the views among all that there are, by which
-        views have turns: so a block gets the same, whichever others are held beside it.
+        (B,) and (V,) global numbers of the blocks and views, which determine whose turn it is: a
+        block gets the same result whichever others are in memory.
     T_camera_world
         (V, 4, 4) of the views.
     heights, codes, weights, backs, cells, coarse
-        Of `open_view`, one row for each view.
+        Of `unpack_view`, one row per view.
+    weights, backs
+        (256,) weights in 1/m^2, and truncation distances behind a surface in m.
     near
-        (V, B) bits of the eighths of a block that are near to what a view saw.
+        (V, B) bit mask of the eighths of a block that are near a view's surface.
     turns
-        Every how-many-th view counts where it is not near.
+        Period of the round-robin integration of free space.
     light
-        (V, H W, C) float32; C may be 0.
+        (V, H W, C) float32 colour or amplitude; C may be 0.
     shape
         (H, W) of the views.
     lookup, lookup_frame, nodes
-        Of their `Projection`, and within how many nodes it keeps lines straight.
+        Of their `Projection`, and the number of nodes over which it is linear (infinity:
+        everywhere).
+    reach
+        Truncation distance, m.
     distance, weight
-        (B, VOXELS) mean distance in m, and the sum of the weights.
+        (B, VOXELS) mean distance in m, and sum of the weights, updated.
     seen
-        (B, VOXELS) how many views saw a surface within `reach`.
+        (B, VOXELS) number of views with a surface within `reach`, updated.
     color
-        (B, VOXELS, C) mean light of those views.
+        (B, VOXELS, C) mean of `light` over those views, updated.
     free
-        (B, 8) weight of the views that saw through all of an eighth, not yet in `distance`.
+        (B, 8) weight of free-space observations of whole eighths, not yet in `distance`; updated.
     """
     rows, columns = shape
     middle = 0.5 * (EDGE - 1) * voxel_m
     radius = np.sqrt(3.0) * middle
-    # A block is cut in eight where it can't be told as a whole.
+    # A block that can't be classified as a whole is divided into eighths.
     small = np.sqrt(3.0) * 1.5 * voxel_m
-    # Half a pixel, and as much for lenses whose pixels differ in size.
+    # Half a pixel, doubled as pixels of a lens with distortion differ in size.
     margin = max(cells.shape[2] / columns, cells.shape[1] / rows)
     coarse_frame = lookup_frame.copy()
     coarse_frame[2:] /= 4
-    # What the lookup spans, as the planes that bound it.
+    # Frustum of the lookup.
     x0 = lookup_frame[0]
     y0 = lookup_frame[1]
     x1 = x0 + cells.shape[2] / lookup_frame[2]
@@ -521,13 +546,13 @@ def integrate(
     above = radius * np.sqrt(1 + y0 * y0)
     below = radius * np.sqrt(1 + y1 * y1)
     straight = nodes == np.inf
-    linear = _everywhere(lookup, lookup_frame)
+    linear = _global_projection(lookup, lookup_frame)
     code = np.empty(64, np.int32)
     d = np.empty(64, np.float32)
     w = np.empty(64, np.float32)
     back = np.empty(64, np.float32)
     centre = np.empty(3, np.float32)
-    # The voxels of an eighth as each camera sees them, from its middle.
+    # Offsets of an eighth's voxels from its centre, in the frame of each camera.
     offsets = np.empty((len(T_camera_world), 3, 64), np.float32)
     for s in range(len(T_camera_world)):
         for q in range(64):
@@ -548,7 +573,7 @@ def integrate(
         my = oy + middle
         mz = oz + middle
         for s in range(len(T_camera_world)):
-            # Neighbours have their turns one after the other.
+            # Neighbouring blocks take turns in different views.
             turn = (views[s] + blocks[b]) % turns == 0
             if near[s, b] == 0 and not turn:
                 continue
@@ -563,10 +588,10 @@ def integrate(
             if y - y0 * z < -above or y - y1 * z > below:
                 continue
             if near[s, b] == 0:
-                told = _told(x, y, z, radius, coarse[s], coarse_frame, 0.25 * margin)
-                if told != 0:
+                state = _classify_ball(x, y, z, radius, coarse[s], coarse_frame, 0.25 * margin)
+                if state != 0:
                     for part in range(8):
-                        free[b, part] += turns * max(0.0, told)
+                        free[b, part] += turns * max(0.0, state)
                     continue
             for part in range(8):
                 close = (near[s, b] >> part) & 1 == 1
@@ -579,9 +604,9 @@ def integrate(
                 y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
                 z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
                 if not close:
-                    told = _told(x, y, z, small, cells[s], lookup_frame, margin)
-                    if told != 0:
-                        free[b, part] += turns * max(0.0, told)
+                    state = _classify_ball(x, y, z, small, cells[s], lookup_frame, margin)
+                    if state != 0:
+                        free[b, part] += turns * max(0.0, state)
                         continue
                 times = 1.0 if close else float(turns)
                 centre[0] = x
@@ -589,12 +614,12 @@ def integrate(
                 centre[2] = z
                 lines = straight
                 if not straight:
-                    linear = _linear(x, y, z, small, lookup, lookup_frame, nodes)
+                    linear = _local_projection(x, y, z, small, lookup, lookup_frame, nodes)
                     lines = linear[6]
                 if lines:
-                    _land_linear(centre, offsets[s], linear, rows, columns, place, points)
+                    _project_linear(centre, offsets[s], linear, rows, columns, place, points)
                 else:
-                    _land_bent(
+                    _project_by_lookup(
                         centre, offsets[s], lookup, lookup_frame, rows, columns, place, points
                     )
                 voxels = slice(64 * part, 64 * part + 64)
@@ -603,7 +628,7 @@ def integrate(
                 _average(d, w, back, reach, distance[b, voxels], weight[b, voxels])
                 _count(d, reach, seen[b, voxels])
                 if light.shape[2]:
-                    _tint(place, d, reach, light[s], seen[b, voxels], color[b, voxels])
+                    _average_color(place, d, reach, light[s], seen[b, voxels], color[b, voxels])
 
 
 @kernel
@@ -619,9 +644,9 @@ def _fetch(
     weight: Float32,
     back: Float32,
 ) -> None:
-    """Fetch the pixels of `place` (64,): `distance` gets their heights.
+    """Gather the pixels `place` (64,): plane codes, heights, weights and rear truncation distances.
 
-    Weights are taken so many `times`, and `back` gets how far behind its surface a pixel matters.
+    Heights are written to `distance`; weights are multiplied by `times`.
     """
     many = np.float32(times)
     for q in range(64):
@@ -635,7 +660,7 @@ def _fetch(
 
 @kernel
 def _measure(code: Int32, points: Float32, distance: Float32) -> None:
-    """Turn heights of planes into distances of points in front of them."""
+    """Convert the planes' heights in `distance` (64,) to distances of `points` (3, 64) to them."""
     for q in range(64):
         n0 = np.float32(np.int8(code[q]))
         n1 = np.float32(np.int8(code[q] >> 8))
@@ -652,9 +677,9 @@ def _average(
     distance: Float32,
     weight: Float32,
 ) -> None:
-    """Add distances to means, without a branch: for several voxels at a time in the processor.
+    """Update the weighted mean distances, branch-free so that the loop is vectorised.
 
-    The new distances are cut at the `limit`, on either side, and get it where nothing is known.
+    New distances are truncated to +-`limit`, and are set to `limit` where nothing was observed.
     """
     cut = np.float32(limit)
     for q in range(64):
@@ -663,22 +688,22 @@ def _average(
         d = d if d < cut and new > 0 else cut
         d = d if d > -cut else -cut
         total = weight[q] + new
-        distance[q] += (d - distance[q]) * (new / max(total, _LEAST_WEIGHT))
+        distance[q] += (d - distance[q]) * (new / max(total, _MIN_WEIGHT))
         weight[q] = total
         new_distance[q] = d
 
 
 @kernel
 def _count(distance: Float32, limit: float, seen: UInt16) -> None:
-    """Count the voxels with a surface within the `limit`, up to what a count holds."""
+    """Increment the saturating counter of voxels whose surface is within `limit`."""
     cut = np.float32(limit)
-    most = np.uint16(MOST_SEEN)
+    most = np.uint16(MAX_SEEN)
     for q in range(64):
         seen[q] += np.uint16((distance[q] < cut) & (seen[q] < most))
 
 
 @kernel
-def _tint(
+def _average_color(
     place: Int32,
     distance: Float32,
     limit: float,
@@ -686,9 +711,9 @@ def _tint(
     seen: UInt16,
     color: Float32,
 ) -> None:
-    """Add the light of pixels to the means of the voxels with a surface within the `limit`.
+    """Update the mean colour of the voxels whose surface is within `limit`.
 
-    Black is no colour: it is neither kept from before nor mixed in.
+    Black means that there is no colour, and is not averaged.
     """
     cut = np.float32(limit)
     for q in range(64):
@@ -706,7 +731,7 @@ def _tint(
 
 
 @kernel
-def _land_linear(
+def _project_linear(
     centre: Float32,
     offsets: Float32,
     linear: tuple[float, float, float, float, float, float, bool],
@@ -715,20 +740,20 @@ def _land_linear(
     place: Int32,
     points: Float32,
 ) -> None:
-    """Voxels of an eighth of a block in the camera's frame, and the pixels that they land on.
-
-    One formula without a branch, for several voxels at a time in the processor.
+    """Project the voxels of an eighth of a block, branch-free so that the loop is vectorised.
 
     Parameters
     ----------
     centre, offsets
-        (3,) of the eighth, and (3, 64) the voxels from there.
+        (3,) of the eighth in the camera's frame, and (3, 64) voxels relative to it.
     linear
-        Of `_linear`.
+        From `_local_projection`.
+    rows, columns
+        Size of the image.
     place
-        (64,) gets row * columns + column, or H W.
+        (64,) written: row * columns + column, or rows * columns outside the image.
     points
-        (3, 64) gets the voxels.
+        (3, 64) written: the voxels in the camera's frame.
     """
     u0, v0 = np.float32(linear[0] + 1.5), np.float32(linear[1] + 1.5)
     ux, uy = np.float32(linear[2]), np.float32(linear[3])
@@ -740,7 +765,7 @@ def _land_linear(
     for q in range(64):
         x, y, z = points[0, q], points[1, q], points[2, q]
         per_z = one / z
-        # Whole numbers are cut towards zero: so one is added before and taken off after.
+        # The conversion truncates towards zero; adding 1 first makes it round down.
         c = np.int32(u0 + (ux * x + uy * y) * per_z) - np.int32(1)
         r = np.int32(v0 + (vx * x + vy * y) * per_z) - np.int32(1)
         inside = (z >= nearest) & (c >= 0) & (r >= 0) & (c < columns) & (r < rows)
@@ -748,7 +773,7 @@ def _land_linear(
 
 
 @kernel
-def _land_bent(
+def _project_by_lookup(
     centre: Float32,
     offsets: Float32,
     lookup: Float32,
@@ -758,7 +783,7 @@ def _land_bent(
     place: Int32,
     points: Float32,
 ) -> None:
-    """As `_land_linear`, each voxel by the lens."""
+    """Do the same as `_project_linear` by interpolating in the lookup for each voxel."""
     for q in range(64):
         for a in range(3):
             points[a, q] = centre[a] + offsets[a, q]
@@ -766,17 +791,17 @@ def _land_bent(
         z = points[2, q]
         if z < 1e-3:
             continue
-        u, v, node, _ = landing(points[0, q] / z, points[1, q] / z, lookup, lookup_frame)
+        u, v, node, _ = project_ray(points[0, q] / z, points[1, q] / z, lookup, lookup_frame)
         if node < 0 or not (u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5):
             continue
         place[q] = int(v + 0.5) * columns + int(u + 0.5)
 
 
 @kernel
-def settle_free(
+def apply_free_space(
     distance: Float32, weight: Float32, free: Float32, reach: float, start: int, stop: int
 ) -> None:
-    """Put the weight of views that saw through whole eighths of blocks into their voxels."""
+    """Integrate the free-space weights of whole eighths into the voxels of blocks start..stop."""
     for b in range(start, stop):
         for v in range(VOXELS):
             new = free[b, v >> 6]

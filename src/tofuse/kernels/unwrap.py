@@ -25,7 +25,7 @@ def pass_messages(
     parity: int,
     messages: Float32,
 ) -> None:
-    """Renew the messages that pixels of one colour of the chessboard send to their neighbours.
+    """Update the messages that pixels of one colour of a checkerboard send to their neighbours.
 
     Min-sum (Felzenszwalb and Huttenlocher 2006; half of the pixels at a time, section 3.2).
 
@@ -40,7 +40,7 @@ def pass_messages(
     start, stop, parity
         Rows whose pixels (i + j) % 2 == parity send.
     messages (4, H, W, K)
-        What each pixel was told from each side, `STEPS`; written.
+        Messages received by each pixel from each side, in the order of `STEPS`; updated.
     """
     height, width, labels = unary.shape
     belief = np.empty(labels)
@@ -56,7 +56,7 @@ def pass_messages(
                 for k in range(labels):
                     total = unary[i, j, k]
                     for t in range(4):
-                        # What came from there is not told back.
+                        # The message received from there is not sent back.
                         if t != s:
                             total += messages[t, i, j, k]
                     belief[k] = total

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.kernels.motion import distance_and_angle, moved, twist_between
+from tofuse.kernels.motion import distance_and_angle, retract, twist_between
 
 # What a motion may differ from the expected one, whatever was seen before: m and rad. Carried
 # cameras at 5 to 30 frames a second stay below. At lower rates the same accelerations, of 3 m/s^2,
@@ -113,7 +113,7 @@ class Motion:
         if self._differences or self.is_guess:
             usual = np.max([np.zeros(2), *self._differences], axis=0)
         else:
-            usual = _apart(self._T, moved(self._T, self._velocity * self._interval))
+            usual = _apart(self._T, retract(self._T, self._velocity * self._interval))
         seconds = now.seconds_since(self._when)
         if seconds is None:
             if elapsed > _FORGOTTEN:
@@ -226,7 +226,7 @@ class Motion:
     def _onward(self, velocity: Float64 | None, now: Moment) -> Float64 | None:
         if self._T is None or self._when is None or velocity is None:
             return None
-        return moved(self._T, velocity * now.since(self._when))
+        return retract(self._T, velocity * now.since(self._when))
 
 
 def is_small(T: Float64) -> bool:

@@ -2,9 +2,9 @@
 
 A point in space that another view saw through has moved there; a surface that a later view sees
 through has moved away. Either contradicts a static scene by a likelihood ratio, see
-`tofuse.kernels.moving`. The log-odds of each pixel accumulate over frames, as the camera carries
-them along, and connected pixels are segmented with hysteresis. What a static camera's foreground
-hides or reveals is no evidence: nothing was seen through there.
+`tofuse.kernels.moving_objects`. The log-odds of each pixel accumulate over frames, propagated by
+the camera's motion, and connected pixels are segmented with hysteresis. What a static camera's
+foreground hides or reveals is no evidence: nothing was seen through there.
 
 Everything is judged by the poses given, so the static scene is what agrees with them. A wrong pose
 makes views disagree as well: `Moving` says how well the rest of the view agrees, and nothing is
@@ -21,8 +21,8 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, Int64, UInt8
 from tofuse.geometry import se3
-from tofuse.kernels import moving as kernels
-from tofuse.kernels.middle import median
+from tofuse.kernels import moving_objects as kernels
+from tofuse.kernels.median import median
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView
@@ -443,7 +443,7 @@ class MovingObjects:
         grid = before.projection
 
         def work(a: int, b: int) -> None:
-            kernels.carry(
+            kernels.propagate(
                 view.rays, view.z, view.sigma, view.planes, view.plane_variance, stride,
                 cells.depth, cells.odds, cells.moving, tracked_before, self._stride(before),
                 before.z.shape, grid.lookup, grid.frame, T, options.tolerance, self._prior, depth,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from tofuse.kernels.threads import side_threads, thread_count
+from tofuse.kernels.threads import job_pool, thread_count
 
 # What waits to be done holds on to frames.
 _MOST = 4
@@ -30,7 +30,7 @@ class Behind:
             job()
             return
         if self._pool is None:
-            self._pool = side_threads(1, "tofuse-behind")
+            self._pool = job_pool(1, "tofuse-behind")
         self._jobs.append(self._pool.submit(job))
         while len(self._jobs) > _MOST:
             self._jobs.popleft().result()

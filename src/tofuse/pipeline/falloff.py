@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 
 from tofuse.arrays import Float64
 from tofuse.errors import UnreadableFrameError
-from tofuse.kernels.alignment import LIGHT, POINT
+from tofuse.kernels.alignment import POINT, POINT_ALBEDO
 from tofuse.pipeline.pooling import pooled
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
@@ -195,7 +195,7 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | N
     p, q, u, v = p[inside], q[inside], u[inside], v[inside]
     z = target.planes[v, u, 3].astype(np.float64)
     near = (z > 0) & (np.abs(q[:, 2] - 1 / np.maximum(z, 1e-9)) < _NEAR_M + _NEAR * q[:, 2])
-    lighter = target.photo[v, u, 0] - packed[inside, LIGHT]
+    lighter = target.photo[v, u, 0] - packed[inside, POINT_ALBEDO]
     near &= np.isfinite(lighter)
     if np.count_nonzero(near) < _LEAST_POINTS:
         return None

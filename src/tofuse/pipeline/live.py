@@ -12,7 +12,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
-from tofuse.kernels.threads import side_threads
+from tofuse.kernels.threads import job_pool
 from tofuse.odometry.base import Step
 from tofuse.pipeline.frame_log import FrameLog
 from tofuse.posegraph.graph import PoseGraph
@@ -56,7 +56,7 @@ class LiveLoops:
             work = self._loops.look()
             if work is not None:
                 if self._pool is None:
-                    self._pool = side_threads(1, "tofuse-loops")
+                    self._pool = job_pool(1, "tofuse-loops")
                 self._job = self._pool.submit(work)
                 self._due = self._frames + DELAY
         return bool(found)

@@ -9,7 +9,7 @@ from typing import Any
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.files.memory import give_back
-from tofuse.kernels.threads import thread_count, threads, undivided
+from tofuse.kernels.threads import serial_chunks, thread_count, threads
 from tofuse.odometry.base import Step
 from tofuse.odometry.motion import Moment
 from tofuse.pipeline.assembly import Assembly
@@ -123,7 +123,7 @@ class Mapper:
             self._log.repeated.append(frame.index)
         # A search for a lost camera is worth dividing, while those who prepare frames are waiting.
         busy = prepared is not None and prepared.ready is not None
-        with threads(self.threads), undivided(busy):
+        with threads(self.threads), serial_chunks(busy):
             ready = self._prepare(frame, history, prepared)
             step = self._track(ready, T_odometry, repeated)
             self._remember(ready, step, T_odometry, gravity)

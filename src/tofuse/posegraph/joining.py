@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
-from tofuse.kernels.motion import moved, twist_between
+from tofuse.kernels.motion import retract, twist_between
 from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.cut_edges import cut_edges, sides_without
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
@@ -841,7 +841,7 @@ def _bridged(before: Stretch, after: Stretch) -> Link | None:
     limit = np.repeat([_BRIDGE_M * depth, _BRIDGE_RAD], 3)
     if (sigma > limit).any():
         return None
-    T = moved(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
+    T = retract(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
     sigma = np.maximum(sigma, 0.1 * limit)
     made = Registration(T, True, 0, 0, 0, np.nan, np.nan, np.diag(1 / sigma**2))
     return Link(

@@ -584,7 +584,7 @@ def _allow_for_shared(
 
     def work(a: int, b: int) -> None:
         for k in range(a, b):
-            patch_kernels.allow(sums[k], alike, variance[k], state.rows[lit[k]])
+            patch_kernels.discount_shared_errors(sums[k], alike, variance[k], state.rows[lit[k]])
 
     run_chunks(work, len(lit), -(-len(lit) // _PAIRS_A_CHUNK))
 

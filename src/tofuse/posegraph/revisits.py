@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 from tofuse.geometry import se3
-from tofuse.kernels.spread import executor
+from tofuse.kernels.executors import executor
 from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
 from tofuse.posegraph.graph import LoopRecord

@@ -18,7 +18,7 @@ import numpy as np
 from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.kernels.spread import executor
+from tofuse.kernels.executors import executor
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.refine import (

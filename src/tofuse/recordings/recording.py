@@ -13,7 +13,7 @@ import numpy as np
 
 from tofuse.arrays import Float64, Intp
 from tofuse.errors import InputError, UnreadableFrameError
-from tofuse.kernels.threads import side_threads
+from tofuse.kernels.threads import job_pool
 from tofuse.recordings.frames import Frame, RangeFrame
 
 R = TypeVar("R")
@@ -226,7 +226,7 @@ class Recording:
             return frame, work(frame)
 
         workers = 2 if getattr(self.source, "concurrent", False) else 1
-        pool = side_threads(workers, "tofuse-reader")
+        pool = job_pool(workers, "tofuse-reader")
         indices = iter(self.indices[first:].tolist())
         waiting = deque(pool.submit(read, k) for k in islice(indices, max(1, ahead)))
         try:

@@ -149,7 +149,7 @@ class Comparison:
         """Judge a pose (4, 4); see `agreement`."""
         options = self.options
         T = np.ascontiguousarray(T_target_source, np.float64)
-        total = np.zeros(kernels.AGREE_SIZE)
+        total = np.zeros(kernels.AGREEMENT_SIZE)
         count = 0
         differences = []
         for (points, by, nearest), pose in zip(self.ways, (T, se3.inverse(T)), strict=True):
@@ -196,7 +196,7 @@ def _one_way(
     differences: Float32,
 ) -> Float64:
     def work(a: int, b: int) -> Float64:
-        return kernels.agree(
+        return kernels.measure_agreement(
             points.points,
             points.normals,
             points.sigma,
@@ -219,4 +219,4 @@ def _one_way(
 
     n = len(points.points)
     parts = run_chunks(work, n, max(1, n // _CHUNK_POINTS))
-    return np.asarray(sum(parts, np.zeros(kernels.AGREE_SIZE)))
+    return np.asarray(sum(parts, np.zeros(kernels.AGREEMENT_SIZE)))

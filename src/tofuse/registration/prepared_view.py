@@ -13,8 +13,8 @@ import numpy as np
 from tofuse.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.geometry.cameras import Camera, ray_lengths
 from tofuse.kernels.alignment import make_target
-from tofuse.kernels.middle import median
-from tofuse.kernels.outlines import carry_planes
+from tofuse.kernels.median import median
+from tofuse.kernels.plane_extension import extend_planes
 from tofuse.kernels.surface import (
     albedo_image,
     fit_planes,
@@ -499,7 +499,7 @@ def _with_carried_planes(
     """
     steps, growth = _steps(options.radii[0])
     planes, variance = surface.planes.copy(), surface.plane_variance.copy()
-    carry_planes(
+    extend_planes(
         w, noise * w, surface.rays, missing, quiet, surface.plane_variance, steps, growth,
         _ON_PLANE, options.edge_jump, planes, variance,
     )  # fmt: skip

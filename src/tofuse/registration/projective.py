@@ -16,7 +16,7 @@ import numpy as np
 from tofuse.arrays import Float32, Float64
 from tofuse.kernels import alignment as kernels
 from tofuse.kernels import steps
-from tofuse.kernels.middle import median
+from tofuse.kernels.median import median
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView
 
@@ -282,7 +282,7 @@ def align(
     for number, level in enumerate(options.levels):
         if number and level.stride != options.levels[number - 1].stride:
             points = points_of(source, level.stride)
-        total, doubt, weak, size, done = steps.settle(
+        total, doubt, weak, size, done = steps.iterate_level(
             points,
             views,
             lookups,
@@ -316,7 +316,7 @@ def align(
         cross=steps.cross_information(total) - doubt,
         unobservable=weak,
         points=len(points) * len(targets),
-        landed=int(total[kernels.LANDED]),
+        landed=int(total[kernels.PROJECTED]),
         compared=int(total[kernels.COMPARED]),
         inliers=int(inliers),
         in_front=int(total[kernels.IN_FRONT]),

@@ -493,7 +493,7 @@ def _best(
     order = np.lexsort((top, -finer))
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
-    chosen = kernels.thinned(R, x, depth, 1.5 * scorer.reach, count)
+    chosen = kernels.select_distinct(R, x, depth, 1.5 * scorer.reach, count)
     poses = np.tile(np.eye(4), (len(chosen), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = R[chosen], x[chosen]
     return poses
@@ -513,7 +513,7 @@ def _settle(
     cosine = float(np.cos(options.agreement.max_angle))
     depth = 0.5 * (s.depth + t.depth)
     run_chunks(
-        lambda i, j: kernels.settle(
+        lambda i, j: kernels.refine_poses(
             *some, s.grid, s.frame, t.grid, t.frame, reaches, cosine, depth, poses, i, j
         ),
         len(poses),

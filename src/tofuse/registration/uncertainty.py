@@ -25,7 +25,7 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.kernels import tiles as kernels
-from tofuse.kernels.middle import median
+from tofuse.kernels.median import median
 from tofuse.kernels.motion import distance_and_angle
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, Aligned, ProjectiveOptions, Target

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.arrays import Float32, Float64, Intp
-from tofuse.kernels.alignment import LIGHT, NORMAL, POINT, SIGMA
+from tofuse.kernels.alignment import NORMAL, POINT, POINT_ALBEDO, SIGMA
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import points_of
 
@@ -41,7 +41,7 @@ class ViewPoints:
             points,
             np.ascontiguousarray(packed[:, NORMAL : NORMAL + 3]),
             packed[:, SIGMA] * points[:, 2],
-            packed[:, LIGHT].copy(),
+            packed[:, POINT_ALBEDO].copy(),
         )
 
 

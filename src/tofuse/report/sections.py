@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tofuse._version import __version__
-from tofuse.kernels.threads import side_threads
+from tofuse.kernels.threads import job_pool
 from tofuse.report import (
     section_components,
     section_frames,
@@ -50,7 +50,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         _settings,
     )
     # To thin the surface takes as long as to draw all plots, and leaves the interpreter to these.
-    with side_threads(1, "tofuse-report") as beside:
+    with job_pool(1, "tofuse-report") as beside:
         model = beside.submit(section_model.model, subject)
         for part in parts:
             out.update(part(subject))

@@ -24,7 +24,7 @@ from tofuse.files.trajectory import read_tum, write_tum
 from tofuse.fusion.colors import seen_colors
 from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
-from tofuse.kernels.threads import side_threads
+from tofuse.kernels.threads import job_pool
 from tofuse.posegraph.accuracy import Accuracy
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
@@ -80,7 +80,7 @@ def _write_files(
     texture: Textured | None,
 ) -> None:
     # Both release the interpreter lock for much of their time.
-    with side_threads(1, "tofuse-writer") as background:
+    with job_pool(1, "tofuse-writer") as background:
         model = background.submit(_write_model, result, folder, texture)
         posed = result.has_pose
         write_tum(folder / "trajectory.txt", result.timestamps[posed], result.trajectory[posed])

@@ -32,7 +32,7 @@ from tofuse.sensor.multipath_surfaces import (
     block_nodes,
     fit_planes,
     ray_ranges,
-    seen_sources,
+    visible_sources,
 )
 
 Bounces = Literal["one", "all"]
@@ -138,7 +138,7 @@ class Reflections:
         z, factor = np.empty_like(image.z), np.empty_like(image.z)
         over = np.abs(1 + ratio)
         run_chunks(
-            lambda a, b: kernels.spread(
+            lambda a, b: kernels.upsample_correction(
                 nodes, shift, over, image.z, image.rays, step, _OFF_PLANE, a, b, z, factor
             ),
             len(z),
@@ -209,7 +209,7 @@ class Reflections:
             if self.bounces == "one":
                 radiosity /= 1 + ratio
             sources = np.concatenate(
-                [seen_sources(surfaces, radiosity), around.sources(surfaces, gain, k)]
+                [visible_sources(surfaces, radiosity), around.sources(surfaces, gain, k)]
             )
             ratio = _arriving(surfaces, sources, k)
             shift = np.minimum(np.angle(1 + ratio) / (2 * k), measured / 2)

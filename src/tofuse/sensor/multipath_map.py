@@ -42,7 +42,7 @@ class LightMap:
 
     @property
     def patches(self) -> Float32:
-        """(N, PATCH) in the world frame, see `kernels.multipath.recall`."""
+        """(N, PATCH) in the world frame, see `kernels.multipath.project_patches`."""
         return self._patches
 
     def add(self, surfaces: Surfaces, trusted: Bool, T_world_camera: Float64) -> None:
@@ -111,7 +111,7 @@ class Around:
         lamp
             Angle up to which the lamp lights, relative to that of the image's corner.
         """
-        left, right, top, bottom = kernels.extent(rays).tolist()
+        left, right, top, bottom = kernels.ray_bounds(rays).tolist()
         # A ray is that of its pixel's middle.
         x = (right - left) / (2 * max(rays.shape[1] - 1, 1))
         y = (bottom - top) / (2 * max(rays.shape[0] - 1, 1))
@@ -121,7 +121,7 @@ class Around:
     def recall(self, known: LightMap, T_world_camera: Float64) -> None:
         """Set the planes of the cells that show a surface of the map."""
         if len(self.rays) and len(known.patches):
-            kernels.recall(
+            kernels.project_patches(
                 known.patches,
                 se3.inverse(T_world_camera),
                 self.rays,
@@ -146,7 +146,7 @@ class Around:
         border = surfaces.good & (surfaces.albedo > 0)
         border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
         out = np.empty((len(self.rays), 9), np.float32)
-        count = kernels.unseen_sources(
+        count = kernels.offscreen_sources(
             self.rays,
             self.share * self.pitch.prod(),
             self.planes,

@@ -105,7 +105,9 @@ class Surfaces:
         good = np.empty(shape, bool)
         points, normals = np.empty((*shape, 3)), np.empty((*shape, 3))
         values = np.empty((5, *shape))
-        kernels.light_surfaces(nodes, factor, FALLOFF, LEAST_COSINE, good, points, normals, values)
+        kernels.surface_radiometry(
+            nodes, factor, FALLOFF, LEAST_COSINE, good, points, normals, values
+        )
         return cls(nodes, good, points, normals, *values)
 
     def bright(self) -> float:
@@ -119,7 +121,7 @@ class Surfaces:
         return float(albedo[order][np.searchsorted(share, 0.9 * share[-1])])
 
 
-def seen_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
+def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
     """Sources (S, 9) as `kernels.multipath.exchange` takes them: 2 x 2 nodes, one where alike.
 
     Parameters
@@ -128,7 +130,7 @@ def seen_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
         (Hn, Wn) of the light that the nodes send out, with its phase on leaving.
     """
     out = np.empty((surfaces.good.size, 9), np.float32)
-    count = kernels.seen_sources(
+    count = kernels.visible_sources(
         surfaces.good, surfaces.points, surfaces.normals, surfaces.area, radiosity, out
     )
     return out[:count]

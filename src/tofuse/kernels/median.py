@@ -1,4 +1,4 @@
-"""The median of an array, without what NumPy's spends on axes and NaN: most of it on small ones."""
+"""Median of an array without NumPy's overhead for axes and NaN, which dominates on small arrays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def median(values: NDArray[np.floating[Any]]) -> float:
-    """Upper median of values of any shape, of which there is at least one and none is NaN."""
+    """Return the upper median of a non-empty array of any shape without NaN."""
     flat = values.ravel()
     k = flat.size // 2
     return float(np.partition(flat, k)[k])

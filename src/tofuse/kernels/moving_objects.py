@@ -1,9 +1,9 @@
-"""Per-pixel evidence of motion between two posed views, and where evidence goes with the camera.
+"""Per-pixel evidence of moving objects between two posed views, and its propagation over time.
 
-Every `stride`-th pixel of a view (the cells) is projected into another view. Along the ray it falls
-on, its depth z is compared with that of the other view, z_t: a static scene makes them differ by
-the noise of both, with variance v, while something that moved in between may be anywhere on the ray
-up to z_t. The logarithm of the ratio of the two likelihoods is
+Every `stride`-th pixel of a view (the cells) is projected into another view. Its depth z there is
+compared with that of the other view, z_t: in a static scene they differ by the noise of both, with
+variance v, while an object that moved in between may be anywhere on the ray up to z_t. The
+logarithm of the ratio of the two likelihoods is
 
     llr = (d^2 / v - g) / 2,    g = log(z_t^2 / (2 pi v)),
 
@@ -16,25 +16,25 @@ import numpy as np
 
 from tofuse.arrays import Bool, Float32, Float64, UInt8
 from tofuse.kernels.jit import kernel
-from tofuse.kernels.projection import landing
+from tofuse.kernels.projection import project_ray
 
 # Outcomes of a comparison.
-NONE = 0  # no depth, or it projects to where the other view has none
-AGREES = 1  # both views saw the same surface
-IN_FRONT = 2  # in space that the other view saw through
-BEHIND = 3  # behind what the other view saw
-UNCLEAR = 4  # at an outline of either view, where a pixel more or less decides
+NONE = 0  # no depth, or none in the other view where it projects to
+AGREES = 1  # both views see the same surface
+IN_FRONT = 2  # in free space of the other view
+BEHIND = 3  # occluded in the other view
+UNCLEAR = 4  # at a depth edge of either view, within the registration error
 
-_NEAREST = 0.02  # m; what comes nearer to the other camera is not compared
-_EDGE_SIGMAS = 4.0  # depths of neighbours that differ by less are no outline
+_MIN_DEPTH = 0.02  # m; points nearer to the other camera are not compared
+_EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
 
 
-# What follows takes numbers, not arrays: Numba counts references to each array handed over.
+# The following functions take scalars: Numba counts references to each array that is passed.
 
 
 @kernel
 def cell_depth(w: float, plane_variance: float, z: float, sigma: float) -> tuple[float, float]:
-    """Depth in m of a pixel and its variance: of its plane (w = 1/z), else as measured; or 0."""
+    """Return depth (m) and variance of a pixel, of its plane (w = 1/z) or as measured; else 0."""
     if w > 0:
         depth = 1.0 / w
         square = depth * depth
@@ -46,9 +46,9 @@ def cell_depth(w: float, plane_variance: float, z: float, sigma: float) -> tuple
 
 @kernel
 def _along(w: float, on_ray: float) -> float:
-    """1/z of a pixel's plane on a ray that is within the pixel, where it is w at its centre.
+    """Return 1/z of a pixel's plane on a ray within the pixel, limited to within 10 % of `w`.
 
-    At a grazing angle half a pixel can be far along the plane, which is limited.
+    `w` is 1/z at the pixel's centre; at grazing incidence the plane can change a lot within it.
     """
     return min(max(on_ray, 0.9 * w), 1.1 * w) if w > 0 else w
 
@@ -60,13 +60,13 @@ def moved_point(
     r20: float, r21: float, r22: float, t2: float,
     x: float, y: float, depth: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Ray coordinates (x/z, y/z) and z of the point at `depth` on the ray (x, y), moved by (r, t).
+    """Return (x/z, y/z, z) of the point at `depth` on the ray (x, y), transformed by (r, t).
 
-    All 0 where it comes too near to the camera.
+    All are 0 if it is too near to the camera.
     """
     px, py = x * depth, y * depth
     z = r20 * px + r21 * py + r22 * depth + t2
-    if not z > _NEAREST:
+    if not z > _MIN_DEPTH:
         return 0.0, 0.0, 0.0
     per_z = 1.0 / z
     u = (r00 * px + r01 * py + r02 * depth + t0) * per_z
@@ -76,7 +76,7 @@ def moved_point(
 
 @kernel
 def inside(u: float, v: float, node: int, rows: int, columns: int) -> bool:
-    """Whether what `landing` returned is a pixel of an image."""
+    """Whether the result of `project_ray` lies in an image of `rows` x `columns`."""
     return node >= 0 and u > -0.5 and v > -0.5 and u < columns - 0.5 and v < rows - 0.5
 
 
@@ -99,10 +99,16 @@ def residual_ratios(
     T: Float64,
     model_error: float,
 ) -> Float32:
-    """Absolute differences of depth over their sigma, (N,), where both views know a depth.
+    """Return absolute depth differences divided by their sigma, (N,), where both views have depth.
 
-    Takes every `every`-th cell in both directions that is not known to move (`moving`, one per
-    cell); the other parameters are those of `compare`.
+    Parameters
+    ----------
+    moving
+        (rows, columns) cells that are known to move, and are left out.
+    every
+        Only every `every`-th cell is used, in both directions.
+
+    The other parameters are those of `compare`.
     """
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -142,7 +148,7 @@ def residual_ratios(
             )
             if here == 0:
                 continue
-            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
             if not inside(u, v, node, other_z.shape[0], other_z.shape[1]):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
@@ -190,7 +196,7 @@ def compare(
     start: int,
     stop: int,
 ) -> None:
-    """Compare the rows start..stop of the cells of a view with another view.
+    """Compare the cells of a view, rows start..stop, with another view.
 
     Parameters
     ----------
@@ -201,26 +207,27 @@ def compare(
     other_z, other_sigma, other_planes, other_variance, lookup, lookup_frame
         Of the other view.
     other_moving
-        Cells of the other view that are known to move: that a cell agrees with one of them says
-        little.
+        Cells of the other view that are known to move; agreement with them is weak evidence.
     T
         (4, 4) T_other_view.
     scale
-        By which sigmas are multiplied.
+        Factor of the sigmas.
     model_error
-        Sigma of errors that noise does not show, as a fraction of the depth.
+        Sigma of systematic errors, as a fraction of the depth.
     edge_jump
-        Depths that differ by more than this fraction are an outline.
+        Relative difference between neighbouring depths that makes an edge.
     radius
-        Pixels by which the other view may be misregistered: a point counts as in front of it, or
-        behind it, only if it is so for all pixels within.
+        Registration error of the views in pixels: a point is in front of the other view, or behind
+        it, only if it is so for all pixels within this radius.
     max_evidence, max_agreement
-        Largest llr, and largest -llr.
+        Upper limits of llr and of -llr.
     flagged_weight
-        Factor of the llr of a cell that agrees with one that moves.
+        Factor of the llr of a cell that agrees with a moving one.
     outcome, llr
-        (rows, columns) of cells, written: see above. Of what is behind the other view, llr is that
-        of something that moved away from it.
+        (rows, columns) of cells, written: see above. For cells behind the other view, llr is that
+        of an object that has moved away in between.
+    start, stop
+        Rows of cells.
     """
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -259,7 +266,7 @@ def compare(
             )
             if here == 0:
                 continue
-            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
             if not inside(u, v, node, rows, columns):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
@@ -307,7 +314,7 @@ def compare(
 
 
 @kernel
-def carry(
+def propagate(
     rays: Float32,
     z: Float32,
     sigma: Float32,
@@ -332,25 +339,27 @@ def carry(
     start: int,
     stop: int,
 ) -> None:
-    """Look up, for the rows start..stop of the cells of a view, what was known of them before.
+    """Propagate the state of the previous view's cells to the cells of a view, rows start..stop.
 
     Parameters
     ----------
     rays, z, sigma, planes, plane_variance, stride
         Of the view, as in `compare`.
     before, odds_before, moving_before, tracked_before, stride_before
-        Cells of the view before: depth in m (0 unknown), log-odds, whether they were segmented, and
-        whether they are tracked.
+        Cells of the previous view: depth in m (0 unknown), log-odds, whether they were segmented
+        as moving, and whether they are tracked.
     shape_before, lookup, lookup_frame
-        Rows and columns of that view, and where points fall on it.
+        Rows and columns of the previous view, and its projection.
     T
         (4, 4) T_before_view.
     tolerance
-        By which fraction of its depth a surface may have moved since.
+        Fraction of its depth by which a surface may have moved since.
     prior
-        Log-odds of what was not seen before.
+        Log-odds of cells that were not seen before.
     depth_now, odds, tracked, arrived
-        Cells of the view, written. `arrived` is whether the view before saw through there.
+        Cells of the view, written. `arrived`: the cell lies in free space of the previous view.
+    start, stop
+        Rows of cells.
     """
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -387,7 +396,7 @@ def carry(
             )
             if here == 0:
                 continue
-            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
             if not inside(u, v, node, shape_before[0], shape_before[1]):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
@@ -396,7 +405,7 @@ def carry(
             apart = max(tolerance * here, _EDGE_SIGMAS * np.sqrt(variance))
             if there > 0 and abs(here - there) <= apart:
                 odds[a, b], tracked[a, b] = odds_before[k, m], tracked_before[k, m]
-            else:  # what moves may move with the camera, and be where it was in the image
+            else:  # an object may move with the camera and stay where it was in the image
                 k, m = _cell_on_ray(rays[i, j], shape_before, stride_before, lookup, lookup_frame)
                 if (
                     k >= 0
@@ -423,10 +432,18 @@ def predict(
     radius: int,
     moving: Bool,
 ) -> None:
-    """Mark cells of a view that are near, in the image and in depth, to what moved before.
+    """Mark cells of a view that are near, in image and depth, to moving cells of the previous view.
 
-    `moving` (one per cell of the view) is written, `moving_before` says which cells of the view
-    before moved, `radius` is in its cells. The others are those of `carry`.
+    Parameters
+    ----------
+    moving_before
+        Cells of the previous view that were segmented as moving.
+    radius
+        In cells of the previous view.
+    moving
+        (rows, columns) of cells, written.
+
+    The other parameters are those of `propagate`.
     """
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -457,13 +474,13 @@ def predict(
             )
             if here == 0:
                 continue
-            u, v, node, _ = landing(x, y, lookup, lookup_frame)
+            u, v, node, _ = project_ray(x, y, lookup, lookup_frame)
             if not inside(u, v, node, shape_before[0], shape_before[1]):
                 continue
             k, m = int(v + 0.5), int(u + 0.5)
             k, m = k // stride_before, m // stride_before
             moving[a, b] = _moved_near(k, m, here, before, moving_before, tolerance, radius)
-            if not moving[a, b]:  # it may move with the camera
+            if not moving[a, b]:  # an object may move with the camera
                 k, m = _cell_on_ray(rays[i, j], shape_before, stride_before, lookup, lookup_frame)
                 moving[a, b] = k >= 0 and _moved_near(
                     k, m, depth, before, moving_before, tolerance, radius
@@ -478,8 +495,8 @@ def _cell_on_ray(
     lookup: Float32,
     lookup_frame: Float64,
 ) -> tuple[int, int]:
-    """Cell of a view on one of its rays; -1 where it has none."""
-    u, v, node, _ = landing(np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame)
+    """Return row and column of the cell that a ray hits; -1 outside the image."""
+    u, v, node, _ = project_ray(np.float64(ray[0]), np.float64(ray[1]), lookup, lookup_frame)
     if not inside(u, v, node, shape[0], shape[1]):
         return -1, -1
     return int(v + 0.5) // stride, int(u + 0.5) // stride
@@ -495,7 +512,7 @@ def _moved_near(
     tolerance: float,
     radius: int,
 ) -> bool:
-    """Whether a moving cell is within the radius of cell (k, m), and at about the depth."""
+    """Whether a moving cell lies within `radius` of cell (k, m), at a similar depth."""
     for p in range(max(k - radius, 0), min(k + radius + 1, before.shape[0])):
         for q in range(max(m - radius, 0), min(m + radius + 1, before.shape[1])):
             if moving_before[p, q] and abs(before[p, q] - depth) <= tolerance * depth:

@@ -1,6 +1,6 @@
-"""Independent pieces of a run's work: on the threads here, or spread over other processes.
+"""Execution of independent tasks on the threads of this process or on other processes.
 
-What a piece returns depends on its arguments alone, so that it does not matter where it is done.
+The result of a task depends on its arguments alone, so that it does not matter where it runs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Arguments = Callable[[int], tuple[Any, ...]]
 
 
 class Executor(Protocol):
-    """Does pieces of work that know nothing of each other."""
+    """Runs independent tasks."""
 
     def map(
         self, function: Callable[..., R], count: int, arguments: Arguments, *, large: bool = False
@@ -26,17 +26,18 @@ class Executor(Protocol):
         Parameters
         ----------
         function
-            At the top level of a module, as other processes look it up by its name.
+            At the top level of a module, as other processes import it by its name.
         arguments
-            Gives those of one piece when it begins: what they are made of may be on disk.
+            Returns the arguments of task k; called when it starts, as they may have to be read from
+            disk.
         large
-            Whether a piece uses all threads by itself, and much memory: one at a time in a process.
+            Whether a task uses all threads and much memory: one at a time per process.
         """
         ...
 
 
-class Here(Executor):
-    """The threads of this process."""
+class LocalExecutor(Executor):
+    """Runs tasks on the threads of this process."""
 
     def map(
         self, function: Callable[..., R], count: int, arguments: Arguments, *, large: bool = False
@@ -47,17 +48,17 @@ class Here(Executor):
         return run_chunks(lambda k, _: function(*arguments(k)), count, count)
 
 
-_executor: Executor = Here()
+_executor: Executor = LocalExecutor()
 
 
 def executor() -> Executor:
-    """Return who does pieces of work at present."""
+    """Return the current executor."""
     return _executor
 
 
 @contextmanager
-def spread_over(wanted: Executor) -> Iterator[None]:
-    """Give pieces of work to an executor inside the block, whichever thread asks."""
+def using_executor(wanted: Executor) -> Iterator[None]:
+    """Use an executor inside the block, for all threads."""
     global _executor
     before, _executor = _executor, wanted
     try:

@@ -1,4 +1,4 @@
-"""Planes for the pixels that no window fits one to, from the pixels beside them."""
+"""Extension of fitted planes to neighbouring pixels without a fit of their own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tofuse.kernels.jit import kernel
 
 
 @kernel
-def carry_planes(
+def extend_planes(
     w: Float32,
     sigma: Float32,
     rays: Float32,
@@ -23,7 +23,7 @@ def carry_planes(
     found: Float32,
     varied: Float32,
 ) -> None:
-    """Give each `wanted` pixel the plane of the nearest pixel whose plane it has measured.
+    """Assign to each `wanted` pixel the plane of the nearest pixel that its depth agrees with.
 
     Parameters
     ----------
@@ -34,14 +34,14 @@ def carry_planes(
     planes, variance
         (H, W, 4) of `fit_planes`, 0 where there is none, and (H, W) the variance of 1/z on them.
     steps, growth
-        (K, 2) rows and columns to the pixels that are asked, in this order, and (K,) how many times
-        larger the variance of their planes is here.
+        (K, 2) offsets in rows and columns of the candidates, in order of preference, and (K,) the
+        factor by which the variance of their planes grows up to the pixel.
     sigmas, jump
-        The pixel is on a plane if 1/z differs by at most so many standard deviations, the plane is
-        no further off, here from there, than by this share, and the pixel is not more than twice
-        as noisy as the one there: quiet surfaces end where noisy ones begin.
+        The pixel agrees with a plane if 1/z differs by at most `sigmas` standard deviations, 1/z of
+        the plane changes by at most the fraction `jump` between the two pixels, and the pixel's
+        sigma is at most twice that of the other one, as a change in noise marks another surface.
     found, varied
-        (H, W, 4) and (H, W) get the planes and their variances here, where there is one.
+        (H, W, 4) and (H, W), written: planes and their variances.
     """
     rows, columns = w.shape
     limit = np.float32(sigmas * sigmas)
