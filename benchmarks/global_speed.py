@@ -83,7 +83,7 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, most: int) -> str:
     options = Keyframes().surface
     for k, frame in enumerate(there_and_back(frames, len(frames))):
         if result.has_pose[k]:
-            surface = prepare_view(frame, options).thinned(200)
+            surface = prepare_view(frame, options).subsampled(200)
             store.push(surface, poses[k])
             loops.push(frame, poses[k])
     views = [KeptView.of(posed.view, 600) for posed in store.views]

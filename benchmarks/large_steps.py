@@ -113,7 +113,7 @@ def load(steps: Steps, data: Path) -> Views:
 def without_albedo(taken: Views) -> Views:
     """The same views, as a camera that measures nothing but ranges would give them."""
     bare = [
-        replace(view, photo=np.full_like(view.photo, np.nan), has_photo=False)
+        replace(view, albedo=np.full_like(view.albedo, np.nan), has_albedo=False)
         for view in taken.views
     ]
     return replace(taken, views=bare)

@@ -63,7 +63,7 @@ def count(scene: str, effects: Effects, seed: int, every: int, period: float = P
         frames.append(frame if period == PERIOD_M else as_if(frame, period))
         z = made.model.depth_kind == "z"
         truth.append(range_from_z(rendered.frame.camera, rendered.depth) if z else rendered.depth)
-    corrector = Unwrap().learnt(frames).start()
+    corrector = Unwrap().fit(frames).start()
     out = Counts()
     for frame, radial in zip(frames, truth, strict=True):
         lacks = np.rint((radial - frame.radial_range) / period)

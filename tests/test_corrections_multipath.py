@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.corrections.multipath import Multipath
-from tofuse.corrections.raw_amplitude import light_image
+from tofuse.corrections.raw_amplitude import tof_image
 from tofuse.geometry.cameras import Pinhole, ray_lengths
 from tofuse.kernels.threads import threads
 from tofuse.lab.simulation import record
@@ -17,7 +17,7 @@ from tofuse.lab.simulation.render import render
 from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
-from tofuse.sensor.multipath import GainEstimator, Interference, LightImage, Reflections
+from tofuse.sensor.multipath import GainEstimator, MultipathEstimate, MultipathModel, ToFImage
 
 CAMERA = Pinhole(60, 48, 54.0, 54.0, 29.5, 23.5)
 PERIOD_M = 5.0
@@ -76,9 +76,9 @@ class Seen:
         self.length = length
 
     @property
-    def image(self) -> LightImage:
+    def image(self) -> ToFImage:
         z = ((self.range + self.bias) / self.length).astype(np.float32)
-        return LightImage(z, self.camera.rays(), self.raw.astype(np.float32), PERIOD_M)
+        return ToFImage(z, self.camera.rays(), self.raw.astype(np.float32), PERIOD_M)
 
     def frame(self, **changes: object) -> RangeFrame:
         image = self.image
@@ -96,11 +96,13 @@ def corner() -> Seen:
 
 
 # No light from beyond the image: there is none in `Seen`.
-REFLECTIONS = Reflections(columns=30, lamp=0.1)
-EVERY_PIXEL = Reflections(columns=60, lamp=0.1)
+REFLECTIONS = MultipathModel(columns=30, lamp=0.1)
+EVERY_PIXEL = MultipathModel(columns=60, lamp=0.1)
 
 
-def solved(seen: Seen, reflections: Reflections = REFLECTIONS, gain: float = GAIN) -> Interference:
+def solved(
+    seen: Seen, reflections: MultipathModel = REFLECTIONS, gain: float = GAIN
+) -> MultipathEstimate:
     found = reflections.solve(seen.image, gain)
     assert found is not None
     return found
@@ -184,7 +186,7 @@ def test_a_convex_edge_stays_where_it_is() -> None:
     rays = CAMERA.rays().astype(float)
     # Two faces that fall back from the edge at x = 0.
     z = (2 / (1 - 0.7 * np.abs(rays[..., 0]))).astype(np.float32)
-    found = REFLECTIONS.solve(LightImage(z, CAMERA.rays(), np.full_like(z, 100), PERIOD_M), GAIN)
+    found = REFLECTIONS.solve(ToFImage(z, CAMERA.rays(), np.full_like(z, 100), PERIOD_M), GAIN)
     assert found is not None
     assert np.abs(found.z - z).max() < 0.0005
 
@@ -231,7 +233,7 @@ def test_nothing_to_compute_from_gives_nothing() -> None:
 
 
 def test_the_part_corrects_depth_of_both_kinds_and_amplitude_of_both_kinds(corner: Seen) -> None:
-    found = solved(corner, Reflections(columns=30, lamp=1.0))
+    found = solved(corner, MultipathModel(columns=30, lamp=1.0))
     part = Multipath(gain=GAIN, lamp=1.0, columns=30)
     frame = corner.frame()
     fixed = part.start().apply(frame)
@@ -263,8 +265,8 @@ def test_the_doubt_is_a_share_of_the_correction_on_top_of_what_was_known(corner:
     frame = corner.frame()
     own = np.full(frame.depth.shape, 0.003, np.float32)
 
-    def doubted(given: RangeFrame, doubt: float) -> RangeFrame:
-        fixed = Multipath(gain=GAIN, columns=30, doubt=doubt).start().apply(given)
+    def doubted(given: RangeFrame, relative_sigma: float) -> RangeFrame:
+        fixed = Multipath(gain=GAIN, columns=30, relative_sigma=relative_sigma).start().apply(given)
         assert isinstance(fixed, RangeFrame)
         return fixed
 
@@ -362,7 +364,7 @@ def test_options_that_make_no_sense_are_refused() -> None:
         {"iterations": 0},
         {"columns": 4},
         {"lamp": 0.5},
-        {"doubt": -0.1},
+        {"relative_sigma": -0.1},
     ):
         with pytest.raises(ValueError, match="must be"):
             Multipath(**options)  # type: ignore[arg-type]
@@ -376,7 +378,7 @@ def test_the_simulated_corner_comes_closer_to_the_truth(texture: bool, share: fl
     for k in (0, 30):
         rendered = render(plan.scene, plan.sequence, plan.model, k, effects=plan.effects)
         frame = rendered.frame
-        image = light_image(frame)
+        image = tof_image(frame)
         assert image is not None
         fixed = corrector.apply(frame)
         assert isinstance(fixed, RangeFrame)

@@ -64,7 +64,7 @@ def shown(scene: str, camera: str = "sr4000", count: int = 7, off: tuple[str, ..
 
 def check(case: Shown, least: float) -> None:
     """Overlap of what is kept with the truth; a lens blurs a pixel at the outline."""
-    found = Background().learnt(case.frames)
+    found = Background().fit(case.frames)
     for frame, mask, stand in zip(case.frames, case.masks, case.stands, strict=True):
         counted = frame.valid & ~(cv2.dilate(stand.astype(np.uint8), np.ones((5, 5))) > 0)
         keep, true = found.mask(frame, ()) & counted, mask & counted
@@ -101,7 +101,7 @@ def test_a_camera_in_motion_is_refused_and_says_what_to_do() -> None:
     made = plan("rail", every=35, effects=Effects.none(shot_noise=True))
     frames = [rendered.frame for rendered in made.frames(None)]
     with pytest.raises(InputError, match="leave it out if the camera moves"):
-        Background().learnt(frames)
+        Background().fit(frames)
 
 
 def test_the_filter_must_learn_first_and_keeps_its_options() -> None:
@@ -109,9 +109,9 @@ def test_the_filter_must_learn_first_and_keeps_its_options() -> None:
     case = shown("box")
     with pytest.raises(InputError, match="has not learnt"):
         filter_.mask(case.frames[0], ())
-    found = filter_.learnt(case.frames)
-    assert filter_.learns
-    assert not found.learns
+    found = filter_.fit(case.frames)
+    assert filter_.needs_fit
+    assert not found.needs_fit
     assert (
         to_dict(found) == to_dict(filter_) == {"part": "background", "sigmas": 5.0, "share": 0.02}
     )
@@ -130,12 +130,12 @@ def test_the_filter_must_learn_first_and_keeps_its_options() -> None:
 def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
     """It learns what the simulator scatters, though the shape of its blur is another one."""
     case, clean = shown("box"), shown("box", off=("scatter",))
-    learnt = LensScattering().learnt(case.frames)
-    assert learnt.shares is not None
-    assert not learnt.learns
-    assert 0.015 < sum(learnt.shares) < 0.035
-    none = LensScattering().learnt(clean.frames)
-    assert none.shares == (0.0, 0.0, 0.0)
+    learnt = LensScattering().fit(case.frames)
+    assert learnt.fractions is not None
+    assert not learnt.needs_fit
+    assert 0.015 < sum(learnt.fractions) < 0.035
+    none = LensScattering().fit(clean.frames)
+    assert none.fractions == (0.0, 0.0, 0.0)
     assert none.start().apply(case.frames[0]) is case.frames[0]
     corrector = learnt.start()
     for k in (0, 4):
@@ -152,14 +152,14 @@ def test_the_lens_scattering_is_learnt_and_taken_off() -> None:
 
 def test_scattering_that_is_given_needs_no_recording_and_light_is_needed() -> None:
     frame = shown("box").frames[0]
-    given = LensScattering(shares=(0.01, 0.0, 0.01))
-    assert not given.learns
+    given = LensScattering(fractions=(0.01, 0.0, 0.01))
+    assert not given.needs_fit
     assert not np.array_equal(given.start().apply(frame).depth, frame.depth)
     dark = replace(frame, amplitude_image=None)
     assert given.start().apply(dark) is dark
-    assert LensScattering().learnt([dark] * 8).shares == (0.0, 0.0, 0.0)
-    for options in ({"shares": (0.1,)}, {"widths": ()}, {"widths": (0.0,)}, {"period_m": 0.0}):
-        with pytest.raises(ValueError, match=r"shares|widths|period_m"):
+    assert LensScattering().fit([dark] * 8).fractions == (0.0, 0.0, 0.0)
+    for options in ({"fractions": (0.1,)}, {"widths": ()}, {"widths": (0.0,)}, {"period_m": 0.0}):
+        with pytest.raises(ValueError, match=r"fractions|widths|period_m"):
             LensScattering(**options)
 
 

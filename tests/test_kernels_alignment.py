@@ -26,11 +26,11 @@ def target(camera=CAMERA):
     planes = np.empty((*rays.shape[:2], 4), np.float32)
     planes[..., :3] = NORMAL
     planes[..., 3] = rays @ NORMAL[:2] + NORMAL[2]
-    photo = np.empty((*rays.shape[:2], 3), np.float32)
-    photo[..., 0] = 1 + rays @ SLOPES
-    photo[..., 1:] = SLOPES
+    albedo = np.empty((*rays.shape[:2], 3), np.float32)
+    albedo[..., 0] = 1 + rays @ SLOPES
+    albedo[..., 1:] = SLOPES
     variance = np.full(rays.shape[:2], 1e-6, np.float32)
-    return planes, variance, photo, Projection.of(camera, 1)
+    return planes, variance, albedo, Projection.of(camera, 1)
 
 
 def source(n=60, noise=0.004, seed=1):
@@ -43,27 +43,27 @@ def source(n=60, noise=0.004, seed=1):
     normals = np.broadcast_to(NORMAL / np.linalg.norm(NORMAL), (n, 3)) @ MOTION[:3, :3]
     normals = normals + rng.normal(0, 0.02, (n, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    photo = np.empty((n, 3), np.float32)
-    photo[:, 0] = 1 + xy @ SLOPES + rng.normal(0, 0.1, n)
-    photo[:, 1:] = SLOPES + rng.normal(0, 0.1, (n, 2))
-    return points, normals, np.full(n, 0.003, np.float32), photo
+    albedo = np.empty((n, 3), np.float32)
+    albedo[:, 0] = 1 + xy @ SLOPES + rng.normal(0, 0.1, n)
+    albedo[:, 1:] = SLOPES + rng.normal(0, 0.1, (n, 2))
+    return points, normals, np.full(n, 0.003, np.float32), albedo
 
 
-def packed(points, normals, sigma, photo):
+def packed(points, normals, sigma, albedo):
     """The source's points as the kernel takes them."""
     z = points[:, 2:]
-    slopes = photo[:, 1:] / z
+    slopes = albedo[:, 1:] / z
     third = -(slopes * points[:, :2]).sum(1, keepdims=True) / z
-    columns = [points, normals, sigma[:, None] / z, photo[:, :1], slopes, third]
+    columns = [points, normals, sigma[:, None] / z, albedo[:, :1], slopes, third]
     return np.concatenate(columns, 1).astype(np.float32)
 
 
 def accumulate(view, of, T=MOTION, *, exposure=0.0, scale_g=1.0, scale_p=SCALE_P, slack=0.01,
                min_cosine=0.5, robust=ROBUST, start=0, stop=None):  # fmt: skip
-    planes, variance, photo, projection = of
+    planes, variance, albedo, projection = of
     points = (view if isinstance(view, np.ndarray) else packed(*view))[start:stop]
     return kernels.accumulate(
-        points, kernels.make_target(projection.rays, planes, variance, photo), projection.lookup,
+        points, kernels.make_target(projection.rays, planes, variance, albedo), projection.lookup,
         projection.frame, np.ascontiguousarray(T), exposure, scale_g, scale_p, slack, robust,
         min_cosine,
     )  # fmt: skip
@@ -165,9 +165,9 @@ def test_the_gradient_is_that_of_the_cost_by_finite_differences():
         xi = np.zeros(6)
         xi[k] = step
         slopes = (cost(xi) - cost(-xi)) / (2 * step) / 2
-        photo = together - alone
+        albedo = together - alone
         assert slopes[0] == pytest.approx(alone[k], abs=0.03 * np.abs(alone[:6]).max())
-        assert slopes[1] == pytest.approx(photo[k], abs=0.03 * np.abs(photo[:6]).max())
+        assert slopes[1] == pytest.approx(albedo[k], abs=0.03 * np.abs(albedo[:6]).max())
     up, down = (cost(np.zeros(6), e)[1] for e in (step, -step))
     assert (up - down) / (2 * step) / 2 == pytest.approx(together[6], rel=1e-3)
 
@@ -188,8 +188,8 @@ def test_a_point_lands_on_the_pixel_that_sees_it(camera, step):
     ahead = np.tile(np.float32([0, 0, 1]), (n, 1))
     view = (points.reshape(n, 3).astype(np.float32), ahead,
             np.full(n, 1e-4, np.float32), np.full((n, 3), np.nan, np.float32))  # fmt: skip
-    photo = np.full((rows, columns, 3), np.nan, np.float32)
-    of = (planes, np.full((rows, columns), 1e-8, np.float32), photo, Projection.of(camera, step))
+    albedo = np.full((rows, columns, 3), np.nan, np.float32)
+    of = (planes, np.full((rows, columns), 1e-8, np.float32), albedo, Projection.of(camera, step))
     sums = accumulate(view, of, np.eye(4), slack=0.0, robust=10.0)
     assert sums[kernels.INLIERS] == n
     assert sums[kernels.SQUARES_M] < 1e-9
@@ -363,11 +363,11 @@ def test_the_difference_in_exposure_is_seen_where_points_land():
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 4])
 def test_gather_takes_every_strideth_pixel_with_a_plane(stride):
-    planes, variance, photo, _ = target()
+    planes, variance, albedo, _ = target()
     planes[3:9, 5:11] = 0
     variance[...] = np.random.default_rng(8).uniform(1e-6, 4e-6, variance.shape)
     rays = CAMERA.rays()
-    points = kernels.gather(rays, planes, variance, photo, stride)
+    points = kernels.gather(rays, planes, variance, albedo, stride)
     pick = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     w = planes[pick][..., 3]
     good = w > 0
@@ -378,5 +378,5 @@ def test_gather_takes_every_strideth_pixel_with_a_plane(stride):
     np.testing.assert_allclose(points[:, :3] @ NORMAL, 1, rtol=1e-5)
     unit = np.tile(NORMAL / np.linalg.norm(NORMAL), (n, 1))
     sigma = np.sqrt(variance[pick][good]) * z**2
-    light = photo[pick][good]
+    light = albedo[pick][good]
     np.testing.assert_allclose(points, packed(wanted, unit, sigma, light), rtol=1e-5, atol=1e-6)

@@ -323,7 +323,7 @@ def test_pixels_left_out_have_no_surface_but_free_space_up_to_them(room):
     rest = without_pixels(view, mask)
     assert not (rest.planes[mask] != 0).any()
     assert not rest.sigma[mask].any()
-    assert np.isnan(rest.photo[mask]).all()
+    assert np.isnan(rest.albedo[mask]).all()
     assert not rest.target[mask].any()
     np.testing.assert_array_equal(rest.z, view.z)
     np.testing.assert_array_equal(rest.planes[~mask], view.planes[~mask])

@@ -125,7 +125,7 @@ def test_what_no_constructor_makes_is_refused(kept: Kept, name: str) -> None:
 def test_a_view_whose_images_do_not_go_together(kept: Kept) -> None:
     view = kept.again("tracking").mapper.views[0].view
     assert isinstance(through(view), PreparedView)
-    for name in ("rays", "z", "sigma", "planes", "plane_variance", "photo"):
+    for name in ("rays", "z", "sigma", "planes", "plane_variance", "albedo"):
         array = getattr(view, name)
         for other in (array[:-3].copy(), array[..., :1].copy(), array.astype(np.float64)):
             with pytest.raises(StateError, match="of a PreparedView"):

@@ -44,7 +44,7 @@ def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Record
     listener = Listener()
     config = learnt(from_method("default"), straight, 1, listener)
     part = multipath_of(config)
-    assert part.left_out
+    assert part.disabled
     assert not part.trial
     assert part.seen is not None
     assert abs(part.seen[0]) < 0.15
@@ -52,7 +52,7 @@ def test_compensation_goes_where_there_is_nothing_to_compensate(straight: Record
     # Views pass as they are.
     corrector, frame = part.start(), straight[0]
     assert corrector.apply(frame) is frame
-    assert corrector.alone(frame)
+    assert corrector.is_independent(frame)
     # What has been decided is not tried again.
     assert learnt(config, straight, 1) == config
 
@@ -68,7 +68,9 @@ def test_compensation_stays_where_there_is_indirect_light() -> None:
     strength, error = part.seen
     assert 0.2 < strength < 1
     # What is not known of the strength is in the error of each pixel.
-    assert part.doubt == pytest.approx(math.hypot(Multipath().doubt, error / strength))
+    assert part.relative_sigma == pytest.approx(
+        math.hypot(Multipath().relative_sigma, error / strength)
+    )
     assert not listener.notes
     assert learnt(config, recording, 1) == config
 

@@ -194,9 +194,9 @@ def test_an_error_that_pixels_share_counts_once_where_all_views_are_compared():
     shared = np.full(corner(truth[0]).depth.shape, 0.01, np.float32)
     frames = [replace(corner(T), index=k, shared_sigma_image=shared) for k, T in enumerate(truth)]
     views = [prepare_view(frame, SHARP) for frame in frames]
-    whole = [view.once() for view in views]
+    whole = [view.with_pixel_variance() for view in views]
     np.testing.assert_array_equal(whole[0].plane_variance, views[0].pixel_variance)
-    assert whole[0].once() is whole[0]
+    assert whole[0].with_pixel_variance() is whole[0]
     found = refiner(Joint(), views, truth)
     # A hundred pixels that share their error are not worth one, but no less than they are alone.
     wary = refine([KeptView.of(view, 1500) for view in views], truth, OPTIONS)

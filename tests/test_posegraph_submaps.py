@@ -80,7 +80,7 @@ def test_a_store_keeps_views_on_disk_and_spaces_them_by_motion_alone(swing, tmp_
         assert a.index == a.view.index
         np.testing.assert_array_equal(a.view.z, b.view.z)
         np.testing.assert_array_equal(a.view.target, b.view.target)
-        np.testing.assert_array_equal(a.view.photo, b.view.photo)
+        np.testing.assert_array_equal(a.view.albedo, b.view.albedo)
         assert a.view.projection is views[0].projection
         assert a.depth == a.view.depth
 

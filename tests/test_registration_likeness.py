@@ -45,7 +45,7 @@ def test_a_look_is_the_mean_log_depth_and_albedo_of_each_cell(views, looks) -> N
             if r * 9 // rows == i and c * 12 // columns == j
         ]
         depth = [np.log(view.z[r, c]) for r, c in cell if view.z[r, c] > 0]
-        light = [view.photo[r, c, 0] for r, c in cell if np.isfinite(view.photo[r, c, 0])]
+        light = [view.albedo[r, c, 0] for r, c in cell if np.isfinite(view.albedo[r, c, 0])]
         assert made[0, i, j] == pytest.approx(np.mean(depth), rel=1e-5)
         if 3 * len(light) > len(cell):
             assert made[1, i, j] == pytest.approx(np.mean(light), rel=1e-5)

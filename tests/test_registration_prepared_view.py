@@ -17,7 +17,7 @@ from tofuse.registration.prepared_view import (
     Smoothed,
     SurfaceOptions,
     prepare_view,
-    with_more_planes,
+    with_extended_planes,
 )
 from tofuse.registration.projective import ProjectiveOptions, Target, align
 
@@ -100,7 +100,7 @@ def test_the_stated_variance_of_surfaces_is_that_of_their_errors():
 def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
     view = prepare_view(wall(kind=kind), OPTIONS)
     assert view.index == 3
-    assert view.planar_share > 0.9
+    assert view.planar_fraction > 0.9
     assert np.abs(view.planes[inside(view)][..., :3] - PLANE).max() < 1e-3
     unit = PLANE / np.linalg.norm(PLANE)
     assert np.abs(view.normals[inside(view)] - unit).max() < 1e-3
@@ -110,19 +110,19 @@ def test_planes_are_those_of_the_scene_whatever_the_depth_kind(kind):
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
 def test_albedo_and_its_slopes_are_freed_of_range_and_incidence(amplitude):
     view = prepare_view(wall(amplitude=amplitude, texture=2.0), OPTIONS)
-    assert view.has_photo
-    found = view.photo[np.isfinite(view.photo).all(-1)]
+    assert view.has_albedo
+    found = view.albedo[np.isfinite(view.albedo).all(-1)]
     assert len(found) > 0.8 * view.z.size
     assert np.abs(found[:, 1:] - [2, 0]).max() < 0.05
-    level = view.photo[..., 0] - 2 * view.rays[..., 0]
+    level = view.albedo[..., 0] - 2 * view.rays[..., 0]
     assert np.nanmax(level) - np.nanmin(level) < 0.02
 
 
 def test_without_amplitude_there_is_no_albedo_but_all_the_rest():
     view = prepare_view(wall(amplitude=None), OPTIONS)
-    assert not view.has_photo
-    assert np.isnan(view.photo).all()
-    assert view.planar_share > 0.9
+    assert not view.has_albedo
+    assert np.isnan(view.albedo).all()
+    assert view.planar_fraction > 0.9
 
 
 def test_saturated_pixels_say_nothing_of_the_albedo():
@@ -130,9 +130,9 @@ def test_saturated_pixels_say_nothing_of_the_albedo():
     light = frame.amplitude_image.copy()
     light[30:40, 30:40] = SATURATED_AMPLITUDE
     view = prepare_view(replace(frame, amplitude_image=light), OPTIONS)
-    assert np.isnan(view.photo[30:40, 30:40]).all()
-    good = np.isfinite(view.photo[..., 0])
-    assert np.ptp(view.photo[good][:, 0]) < 0.05
+    assert np.isnan(view.albedo[30:40, 30:40]).all()
+    good = np.isfinite(view.albedo[..., 0])
+    assert np.ptp(view.albedo[good][:, 0]) < 0.05
 
 
 @pytest.mark.parametrize("columns", [88, 44])
@@ -152,7 +152,7 @@ def test_a_ray_table_with_unknown_rays(columns):
     # Far from the holes they change nothing.
     far = np.s_[-20 // step :, : 60 // step]
     np.testing.assert_allclose(view.planes[far], whole.planes[far], atol=1e-4)
-    assert view.planar_share > 0.7
+    assert view.planar_fraction > 0.7
 
 
 @pytest.mark.parametrize("columns", [320, 44])
@@ -161,9 +161,9 @@ def test_a_view_without_a_single_pixel_has_no_surface(columns, amplitude):
     frame = wall(amplitude=amplitude)
     blank = replace(frame, depth=np.zeros_like(frame.depth))
     view = prepare_view(blank, SurfaceOptions(columns=columns))
-    assert view.planar_share == 0
+    assert view.planar_fraction == 0
     assert np.isfinite(view.sigma).all()
-    assert np.isnan(view.photo).all()
+    assert np.isnan(view.albedo).all()
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (2, 40), (40, 2), (5, 5), (3, 100)])
@@ -172,7 +172,7 @@ def test_tiny_images_give_a_view(shape):
     view = prepare_view(wall(camera), SurfaceOptions(columns=16))
     assert view.planes.shape == (*view.z.shape, 4)
     assert np.isfinite(view.planes).all()
-    assert 0 <= view.planar_share <= 1
+    assert 0 <= view.planar_fraction <= 1
 
 
 def test_a_frame_full_of_nonsense_gives_a_view():
@@ -218,7 +218,7 @@ def test_threads_change_nothing():
         one = prepare_view(frame, OPTIONS)
     with threads(2):
         two = prepare_view(frame, OPTIONS)
-    for name in ("planes", "plane_variance", "photo", "sigma"):
+    for name in ("planes", "plane_variance", "albedo", "sigma"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
@@ -232,7 +232,7 @@ def test_threads_change_nothing():
         {"radii": (0,)},
         {"radii": (2, 10**9)},
         {"edge_margin": -1},
-        {"photo_radius": -1},
+        {"albedo_radius": -1},
         {"edge_jump": float("nan")},
         {"fill": 0.0},
         {"offset": -1.0},
@@ -315,7 +315,7 @@ def test_noise_is_no_edge():
     """At 1.5 m, 4 cm between neighbours is noise here, and a step of 40 cm still is none."""
     frame = wall(sigma=0.04, seed=2)
     strict, default = (
-        prepare_view(frame, replace(OPTIONS, edge_sigmas=k)).planar_share for k in (0.0, 3.0)
+        prepare_view(frame, replace(OPTIONS, edge_sigmas=k)).planar_fraction for k in (0.0, 3.0)
     )
     assert strict < 0.3 < 0.75 < default
     step = frame.depth.copy()
@@ -384,20 +384,20 @@ def test_saturated_and_dark_colour_is_none():
     color[40:60, 40:60, 1] = 255
     color[80:100, 80:100] = 2
     view = prepare_view(replace(frame, color_image=color), OPTIONS)
-    assert np.isnan(view.photo[44:56, 44:56]).all()
-    assert np.isnan(view.photo[84:96, 84:96]).all()
-    assert np.isfinite(view.photo[44:56, 84:96]).all()
+    assert np.isnan(view.albedo[44:56, 44:56]).all()
+    assert np.isnan(view.albedo[84:96, 84:96]).all()
+    assert np.isfinite(view.albedo[44:56, 84:96]).all()
 
 
 def test_colour_that_is_not_registered_takes_no_part():
     view = prepare_view(replace(painted(), color_registered=False), OPTIONS)
-    assert not view.has_photo
+    assert not view.has_albedo
 
 
 def test_amplitude_goes_before_colour():
     frame = replace(wall(amplitude="raw", texture=1.0), color_image=np.zeros((72, 88, 3), np.uint8))
     plain = prepare_view(replace(frame, color_image=None), OPTIONS)
-    np.testing.assert_array_equal(prepare_view(frame, OPTIONS).photo, plain.photo)
+    np.testing.assert_array_equal(prepare_view(frame, OPTIONS).albedo, plain.albedo)
 
 
 def test_what_pixels_share_of_an_error_is_not_averaged_away() -> None:
@@ -440,20 +440,20 @@ def test_a_shared_error_is_reduced_with_the_image() -> None:
 
 def test_a_thinned_view_is_kept_once():
     view = prepare_view(wall(sigma=0.01), OPTIONS)
-    thin = view.thinned(50)
-    assert thin is view.thinned(44)
-    assert view.thinned(88) is view
+    thin = view.subsampled(50)
+    assert thin is view.subsampled(44)
+    assert view.subsampled(88) is view
     np.testing.assert_array_equal(thin.z, view.z[1::2, 1::2])
 
 
 def test_views_without_light_share_one_image_of_it():
     dark = [prepare_view(replace(wall(), amplitude_image=None), OPTIONS) for _ in range(2)]
-    assert dark[0].photo is dark[1].photo
-    assert dark[0].thinned(50).photo is dark[1].thinned(50).photo
-    assert not dark[0].has_photo
-    assert np.isnan(dark[0].photo).all()
-    assert np.isnan(dark[0].thinned(50).photo).all()
-    assert prepare_view(wall(), OPTIONS).photo is not dark[0].photo
+    assert dark[0].albedo is dark[1].albedo
+    assert dark[0].subsampled(50).albedo is dark[1].subsampled(50).albedo
+    assert not dark[0].has_albedo
+    assert np.isnan(dark[0].albedo).all()
+    assert np.isnan(dark[0].subsampled(50).albedo).all()
+    assert prepare_view(wall(), OPTIONS).albedo is not dark[0].albedo
 
 
 def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
@@ -466,7 +466,7 @@ def test_planes_go_on_to_outlines_but_not_to_what_mixes_two_surfaces():
     depth[:, 40] += 0.4
     frame = replace(frame, depth=depth)
     view = prepare_view(frame, OPTIONS)
-    more = with_more_planes(view, frame, OPTIONS)
+    more = with_extended_planes(view, frame, OPTIONS)
     before, after = (v.planes[6:-6, :, 3] > 0 for v in (view, more))
     assert not before[:, [*range(37, 43), *range(58, 62)]].any()
     assert not after[:, 40].any()

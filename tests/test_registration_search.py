@@ -272,7 +272,7 @@ def agreed(source, target, T, o):
 
 
 def test_agreement_counts_what_a_loop_over_the_pixels_counts(pair):
-    o = AgreementOptions(points=int(0.25 * pair[0].planar_share * pair[0].z.size))
+    o = AgreementOptions(points=int(0.25 * pair[0].planar_fraction * pair[0].z.size))
     T = TRUE @ se3.exp([0.02, 0, 0.05, 0, 0.03, 0])
     found = agreement(*pair, T, o)
     counts = agreed(*pair, T, o) + agreed(pair[1], pair[0], se3.inverse(T), o)

@@ -215,7 +215,7 @@ def test_tile_sums_match_numpy():
     sigma = (np.sqrt(source.plane_variance) * z * z).astype(np.float32)
 
     found, whole = tiles.tile_sums(
-        source.rays, source.planes, source.plane_variance, source.photo, target.target,
+        source.rays, source.planes, source.plane_variance, source.albedo, target.target,
         target.projection.lookup, target.projection.frame, T, 0.0, 1.0, 0.0, 3.5,
         np.cos(0.7), 2, 4, 3,
     )  # fmt: skip

@@ -16,8 +16,8 @@ from tofuse.kernels.multipath import PATCH
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.sensor.multipath import LightImage, Reflections
-from tofuse.sensor.multipath_map import Around, LightMap
+from tofuse.sensor.multipath import MultipathModel, ToFImage
+from tofuse.sensor.multipath_map import OffscreenCells, ReflectorMap
 from tofuse.sensor.multipath_surfaces import Surfaces, block_nodes, fit_planes
 
 ALBEDO = 0.6
@@ -53,7 +53,7 @@ def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
     rays = CAMERA.rays().astype(float)
     half = 0.5 / CAMERA.fx
     low, high = rays.min((0, 1)) - half, rays.max((0, 1)) + half
-    around = Around.of(CAMERA.rays(), 1.3)
+    around = OffscreenCells.of(CAMERA.rays(), 1.3)
     left, right = around.rays - around.pitch / 2, around.rays + around.pitch / 2
     overlap = np.clip(np.minimum(right, high) - np.maximum(left, low), 0, None).prod(1)
     assert overlap.max() < 1e-6
@@ -67,13 +67,13 @@ def test_the_cells_tile_what_is_around_the_image_up_to_the_lamp() -> None:
 
 
 def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
-    known = LightMap()
+    known = ReflectorMap()
     # To and fro, so that the newest view is the one in the middle.
     for angle in (-0.5, 0.5, 0.0):
         T = turned(angle)
         surfaces = surfaces_of(seen_from(T, LEFT, RIGHT, FLOOR))
         known.add(surfaces, everywhere(surfaces), T)
-    around = Around.of(CAMERA.rays(), 1.3)
+    around = OffscreenCells.of(CAMERA.rays(), 1.3)
     assert not around.albedo.any()
     around.recall(known, np.eye(4))
     found = around.albedo > 0
@@ -95,19 +95,19 @@ def test_a_turned_camera_recalls_the_planes_and_albedo_of_what_it_saw() -> None:
 
 def test_light_of_a_remembered_wall_is_taken_out_better_than_that_of_a_guess() -> None:
     whole = Seen(LEFT, RIGHT, FLOOR)
-    known = LightMap()
+    known = ReflectorMap()
     surfaces = surfaces_of(whole)
     known.add(surfaces, everywhere(surfaces), np.eye(4))
     # The image ends before the corner; the light of what it leaves out is there all the same.
     part = np.s_[:, :26]
     image = whole.image
-    cut = LightImage(
+    cut = ToFImage(
         np.ascontiguousarray(image.z[part]),
         np.ascontiguousarray(image.rays[part]),
         np.ascontiguousarray(image.light[part]),
         PERIOD_M,
     )
-    reflections = Reflections(columns=26, lamp=1.0)
+    reflections = MultipathModel(columns=26, lamp=1.0)
     errors = []
     for T in (None, np.eye(4)):
         found = reflections.solve(cut, GAIN, known, T)
@@ -118,7 +118,7 @@ def test_light_of_a_remembered_wall_is_taken_out_better_than_that_of_a_guess() -
 
 
 def test_views_are_remembered_by_motion_and_no_more_than_a_fixed_number() -> None:
-    known = LightMap()
+    known = ReflectorMap()
     surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
     trusted = everywhere(surfaces)
     known.add(surfaces, trusted, np.eye(4))
@@ -144,7 +144,7 @@ def test_only_what_stands_still_is_remembered() -> None:
     surfaces = surfaces_of(Seen(LEFT, RIGHT, FLOOR))
     trusted = everywhere(surfaces)
     trusted[:, : trusted.shape[1] // 2] = False
-    known = LightMap()
+    known = ReflectorMap()
     known.add(surfaces, trusted, np.eye(4))
     assert len(known.patches) > 50
     assert (known.patches[:, 0] > -0.1).all()
@@ -161,8 +161,8 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
         corrector.apply(first, None)
         if placed:
             # Of another frame: says nothing.
-            corrector.placed(second, np.eye(4))
-            corrector.placed(first, T)
+            corrector.add_pose(second, np.eye(4))
+            corrector.add_pose(first, T)
         fixed = corrector.apply(second, T_expected)
         assert isinstance(fixed, RangeFrame)
         return fixed.depth
@@ -173,7 +173,7 @@ def test_the_part_recalls_what_was_placed_and_guesses_without_a_pose() -> None:
     # Nothing of the view was left by the filters.
     corrector = Multipath(gain=GAIN, columns=30, lamp=1.2).start()
     corrector.apply(first, None)
-    corrector.placed(first.keep(np.zeros(first.depth.shape, bool)), T)
+    corrector.add_pose(first.keep(np.zeros(first.depth.shape, bool)), T)
     fixed = corrector.apply(second, np.eye(4))
     assert isinstance(fixed, RangeFrame)
     np.testing.assert_array_equal(fixed.depth, guessed)
@@ -195,7 +195,7 @@ class Listening(Correction, Corrector):
         self.expected.append(T_world_camera)
         return frame
 
-    def placed(self, frame: Frame, T_world_camera: np.ndarray) -> None:
+    def add_pose(self, frame: Frame, T_world_camera: np.ndarray) -> None:
         self.heard.append((frame.index, T_world_camera))
 
 

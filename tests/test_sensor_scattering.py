@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.sensor.scattering import Scattering, blurred, learn_shares
+from tofuse.sensor.scattering import Scattering, blur, estimate_fractions
 
 ROWS, COLUMNS = 60, 88
 V, U = np.mgrid[:ROWS, :COLUMNS]
@@ -28,15 +28,15 @@ def own_light(k: int = 0) -> np.ndarray:
     return np.where(disc, (400 + 100 * np.cos(1.7 * k)) * np.exp(1j), wall)
 
 
-def measured(own: np.ndarray, shares: tuple[float, ...]) -> np.ndarray:
-    parts = (s * slowly_blurred(own, w) for w, s in zip(WIDTHS, shares, strict=True))
+def measured(own: np.ndarray, fractions: tuple[float, ...]) -> np.ndarray:
+    parts = (s * slowly_blurred(own, w) for w, s in zip(WIDTHS, fractions, strict=True))
     return own + sum(parts)
 
 
-def frames(shares: tuple[float, ...], sigma: float, count: int = 14) -> np.ndarray:
+def frames(fractions: tuple[float, ...], sigma: float, count: int = 14) -> np.ndarray:
     rng = np.random.default_rng(1)
     noise = rng.normal(0, sigma, (2, count, ROWS, COLUMNS))
-    clean = np.stack([measured(own_light(k), shares) for k in range(count)])
+    clean = np.stack([measured(own_light(k), fractions) for k in range(count)])
     return clean + noise[0] + 1j * noise[1]
 
 
@@ -48,7 +48,7 @@ STILL = ~(((V - 30) ** 2 < 300) & ((U - 44) ** 2 < 30**2))
 def test_the_coarse_blur_is_the_blur(width: float) -> None:
     light = own_light()
     expected = slowly_blurred(light, width)
-    off = np.abs(blurred(light, width) - expected)
+    off = np.abs(blur(light, width) - expected)
     assert off.max() < 0.04 * np.abs(expected).max()
     assert off.mean() < 0.01 * np.abs(expected).mean()
 
@@ -64,25 +64,25 @@ def test_scattered_light_is_taken_off() -> None:
 
 
 def test_shares_are_learnt_from_the_light_that_follows_what_moves() -> None:
-    shares = learn_shares(frames((0.012, 0.02), 0.5), SOURCE, STILL, WIDTHS)
-    assert shares == pytest.approx((0.012, 0.02), rel=0.1)
+    fractions = estimate_fractions(frames((0.012, 0.02), 0.5), SOURCE, STILL, WIDTHS)
+    assert fractions == pytest.approx((0.012, 0.02), rel=0.1)
 
 
 def test_exposure_and_temperature_are_not_scattering() -> None:
     light = frames((0.012, 0.02), 0.5)
     rng = np.random.default_rng(8)
     changes = (1 + 0.1 * rng.normal(size=len(light))) * np.exp(0.02j * rng.normal(size=len(light)))
-    shares = learn_shares(light * changes[:, None, None], SOURCE, STILL, WIDTHS)
-    assert shares == pytest.approx((0.012, 0.02), rel=0.2)
+    fractions = estimate_fractions(light * changes[:, None, None], SOURCE, STILL, WIDTHS)
+    assert fractions == pytest.approx((0.012, 0.02), rel=0.2)
 
 
 def test_nothing_is_learnt_where_nothing_is_scattered_or_seen() -> None:
-    assert not learn_shares(frames((0.0, 0.0), 0.5), SOURCE, STILL, WIDTHS).any()
+    assert not estimate_fractions(frames((0.0, 0.0), 0.5), SOURCE, STILL, WIDTHS).any()
     light = frames((0.012, 0.02), 0.5)
-    assert not learn_shares(light, SOURCE, STILL & (U < 3), WIDTHS).any()  # too few pixels
-    assert not learn_shares(light[:2], SOURCE, STILL, WIDTHS).any()
-    assert not learn_shares(light, np.zeros_like(SOURCE), STILL, WIDTHS).any()
+    assert not estimate_fractions(light, SOURCE, STILL & (U < 3), WIDTHS).any()  # too few pixels
+    assert not estimate_fractions(light[:2], SOURCE, STILL, WIDTHS).any()
+    assert not estimate_fractions(light, np.zeros_like(SOURCE), STILL, WIDTHS).any()
     # Noise that hides it.
-    assert not learn_shares(frames((0.0002, 0.0), 20.0), SOURCE, STILL, WIDTHS).any()
+    assert not estimate_fractions(frames((0.0002, 0.0), 20.0), SOURCE, STILL, WIDTHS).any()
     # Another effect: a third of the light is no scattering in a lens.
-    assert not learn_shares(frames((0.3, 0.1), 0.5), SOURCE, STILL, WIDTHS).any()
+    assert not estimate_fractions(frames((0.3, 0.1), 0.5), SOURCE, STILL, WIDTHS).any()

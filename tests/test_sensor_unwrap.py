@@ -54,7 +54,7 @@ def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.nd
 def test_a_hall_beyond_the_period_is_brought_back() -> None:
     """8 x 8 m before a camera of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
-    part = Unwrap().learnt([frame for frame, _ in frames])
+    part = Unwrap().fit([frame for frame, _ in frames])
     corrector = part.start()
     wrapped = restored = good = harmed = 0
     for frame, radial in frames:
@@ -73,7 +73,7 @@ def test_a_hall_beyond_the_period_is_brought_back() -> None:
 def test_a_room_within_the_period_is_left_alone() -> None:
     """Its dark chairs and floor reflect as little as a white wall a period farther would."""
     frames = taken("room", 128)
-    corrector = Unwrap().learnt([frame for frame, _ in frames]).start()
+    corrector = Unwrap().fit([frame for frame, _ in frames]).start()
     for frame, _ in frames:
         moved = corrector.apply(frame).depth != frame.depth
         assert moved.mean() < 0.001
@@ -83,7 +83,7 @@ def test_amplitude_follows_the_range() -> None:
     """Range-compensated amplitude of a wall is the same before and behind the period."""
     frame, _ = taken("hall", 180)[0]
     assert frame.amplitude_kind == "range_compensated"
-    out = Unwrap().learnt([frame]).start().apply(frame)
+    out = Unwrap().fit([frame]).start().apply(frame)
     assert isinstance(out, RangeFrame)
     assert frame.amplitude_image is not None
     assert out.amplitude_image is not None
@@ -99,7 +99,7 @@ def test_amplitude_follows_the_range() -> None:
 def test_other_views_are_passed_on() -> None:
     camera = Pinhole(16, 12, 12.0, 12.0, 7.5, 5.5)
     frame = RangeFrame(0, 0.0, camera, np.full((12, 16), 2.0, np.float32))
-    corrector = Unwrap().learnt([frame]).start()
+    corrector = Unwrap().fit([frame]).start()
     assert corrector.apply(frame) is frame
     empty = replace(frame, depth=np.zeros((12, 16), np.float32), ambiguity_m=PERIOD)
     assert corrector.apply(empty) is empty

@@ -25,14 +25,14 @@ class Corrector(Protocol):
         """
         ...
 
-    def alone(self, frame: Frame) -> bool:
+    def is_independent(self, frame: Frame) -> bool:
         """Whether `apply` asks for nothing but this frame: then it may come out of turn.
 
         Neither frames before it nor where the camera is then play a part, and nothing is kept.
         """
         return False
 
-    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
+    def add_pose(self, frame: Frame, T_world_camera: Float64) -> None:
         """Hear where the view that was corrected last has been found to be.
 
         Parameters
@@ -44,7 +44,7 @@ class Corrector(Protocol):
         """
         return
 
-    def forget(self) -> None:
+    def reset_poses(self) -> None:
         """Hear that poses are in another frame from here on: where surfaces were is not known."""
         return
 
@@ -56,12 +56,12 @@ class Correction(Protocol):
     ----------
     takes
         Kinds of view it works on, or passes through: "range", "cloud".
-    learns
+    needs_fit
         Whether it can learn from frames of the whole recording first.
-    on_trial
+    needs_trial
         Whether it may bend what is straight where the error that it takes off is not there, so
         that it stays only where views show this error.
-    left_out
+    disabled
         Whether a trial has found that it is better left out.
     """
 
@@ -69,21 +69,21 @@ class Correction(Protocol):
     takes: ClassVar[frozenset[str]]
 
     @property
-    def learns(self) -> bool:
-        """Whether it can learn from frames of the whole recording, with `learnt`, beforehand."""
+    def needs_fit(self) -> bool:
+        """Whether it can learn from frames of the whole recording, with `fit`, beforehand."""
         return False
 
     @property
-    def on_trial(self) -> bool:
+    def needs_trial(self) -> bool:
         """Whether a trial on the recording (`pipeline.trial`) is to decide if it stays."""
         return False
 
     @property
-    def left_out(self) -> bool:
+    def disabled(self) -> bool:
         """Whether it changes nothing, as views did not show in a trial what it corrects."""
         return False
 
-    def tried(
+    def after_trial(
         self, helps: bool, strength: float = float("nan"), error: float = float("inf")
     ) -> Correction:
         """Return the correction as it is after a trial.
@@ -98,7 +98,7 @@ class Correction(Protocol):
         """
         return self
 
-    def learnt(self, frames: Sequence[Frame]) -> Correction:
+    def fit(self, frames: Sequence[Frame]) -> Correction:
         """Return the correction with what it has learnt from frames spread over a recording.
 
         Parameters

@@ -97,6 +97,6 @@ class _Corrector(Corrector):
             frame = replace(frame, depth=depth, depth_kind="range")
         return frame
 
-    def alone(self, frame: Frame) -> bool:
-        """See `Corrector.alone`."""
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`."""
         return True

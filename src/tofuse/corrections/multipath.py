@@ -10,11 +10,17 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.bounds import above, at_least, whole, within
 from tofuse.corrections.base import Correction, Corrector
-from tofuse.corrections.raw_amplitude import light_image, modulation_period
+from tofuse.corrections.raw_amplitude import modulation_period, tof_image
 from tofuse.parts import part
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.sensor.multipath import Bounces, GainEstimator, Interference, LightImage, Reflections
-from tofuse.sensor.multipath_map import LightMap
+from tofuse.sensor.multipath import (
+    Bounces,
+    GainEstimator,
+    MultipathEstimate,
+    MultipathModel,
+    ToFImage,
+)
+from tofuse.sensor.multipath_map import ReflectorMap
 
 
 @part("correction", "multipath", label="validated")
@@ -39,9 +45,9 @@ class Multipath(Correction):
     columns
         Blocks of pixels along the image's width for which the light is computed.
     lamp
-        Angle up to which the lamp lights, relative to that of the image's corner. Around the image
+        Angle up to which the lamp lights, relative to that of the image's corner. OffscreenCells the image
         surfaces are taken to go on.
-    doubt
+    relative_sigma
         Standard deviation of the correction, as a share of it; neighbouring pixels share its
         error.
     trial
@@ -60,7 +66,7 @@ class Multipath(Correction):
     iterations: int = 3
     columns: int = 44
     lamp: float = 1.2
-    doubt: float = 0.2
+    relative_sigma: float = 0.2
     trial: bool = True
     applied: bool = True
     seen: tuple[float, ...] | None = None
@@ -75,24 +81,24 @@ class Multipath(Correction):
         whole("iterations", self.iterations, 1, 10)
         whole("columns", self.columns, 8, 200)
         at_least("lamp", self.lamp, 1)
-        within("doubt", self.doubt, 0, 10)
+        within("relative_sigma", self.relative_sigma, 0, 10)
         if self.seen is not None and not (len(self.seen) == 2 and np.isfinite(self.seen).all()):
             raise ValueError(f"seen is {self.seen}, not a strength and its standard error")
 
     @property
-    def on_trial(self) -> bool:
-        """See `Correction.on_trial`."""
+    def needs_trial(self) -> bool:
+        """See `Correction.needs_trial`."""
         return self.trial and self.applied and self.gain is None
 
     @property
-    def left_out(self) -> bool:
-        """See `Correction.left_out`."""
+    def disabled(self) -> bool:
+        """See `Correction.disabled`."""
         return not self.applied
 
-    def tried(
+    def after_trial(
         self, helps: bool, strength: float = float("nan"), error: float = float("inf")
     ) -> Multipath:
-        """See `Correction.tried`.
+        """See `Correction.after_trial`.
 
         The strength itself is not scaled by: what is seen of it is diluted (`pipeline.trial`), and
         the gain has been found from the recording already. But as far as it is not known, all
@@ -100,9 +106,11 @@ class Multipath(Correction):
         """
         if not np.isfinite([strength, error]).all():
             return replace(self, trial=False, applied=helps)
-        doubt = float(np.hypot(self.doubt, error / strength)) if helps else self.doubt
+        relative_sigma = (
+            float(np.hypot(self.relative_sigma, error / strength)) if helps else self.relative_sigma
+        )
         seen = (float(strength), float(error))
-        return replace(self, trial=False, applied=helps, seen=seen, doubt=doubt)
+        return replace(self, trial=False, applied=helps, seen=seen, relative_sigma=relative_sigma)
 
     def start(self) -> MultipathCorrector:
         """See `Correction.start`."""
@@ -110,7 +118,7 @@ class Multipath(Correction):
 
 
 class MultipathCorrector(Corrector):
-    """Corrects the frames of one recording, with a gain that it learns from them unless given.
+    """Corrects the frames of one recording, with a gain that it needs_fit from them unless given.
 
     Surfaces that the image does not show are those that earlier views have, where it is known how
     the camera has moved.
@@ -124,15 +132,15 @@ class MultipathCorrector(Corrector):
     def __init__(self, options: Multipath) -> None:
         self.gain = options.gain
         self._options = options
-        self._reflections = Reflections(
+        self._reflections = MultipathModel(
             options.columns, options.iterations, options.lamp, options.bounces
         )
         self._estimator = GainEstimator(self._reflections)
-        self._map = LightMap()
-        self._last: tuple[int, Interference] | None = None
+        self._map = ReflectorMap()
+        self._last: tuple[int, MultipathEstimate] | None = None
 
-    def alone(self, frame: Frame) -> bool:
-        """See `Corrector.alone`: so are views that are passed on."""
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`: so are views that are passed on."""
         if not isinstance(frame, RangeFrame) or not self._options.applied:
             return True
         return (
@@ -144,7 +152,7 @@ class MultipathCorrector(Corrector):
         """See `Corrector.apply`. The amplitude loses its indirect share as well."""
         if not isinstance(frame, RangeFrame) or not self._options.applied:
             return frame
-        image = light_image(frame, self._options.period_m)
+        image = tof_image(frame, self._options.period_m)
         if image is None:
             return frame
         if self._options.gain is None:
@@ -156,14 +164,14 @@ class MultipathCorrector(Corrector):
         if found is None:
             return frame
         self._last = frame.index, found
-        return _corrected(frame, image, found, self._options.doubt)
+        return _corrected(frame, image, found, self._options.relative_sigma)
 
-    def forget(self) -> None:
-        """See `Corrector.forget`."""
-        self._map, self._last = LightMap(), None
+    def reset_poses(self) -> None:
+        """See `Corrector.reset_poses`."""
+        self._map, self._last = ReflectorMap(), None
 
-    def placed(self, frame: Frame, T_world_camera: Float64) -> None:
-        """See `Corrector.placed`."""
+    def add_pose(self, frame: Frame, T_world_camera: Float64) -> None:
+        """See `Corrector.add_pose`."""
         if self._last is None or not isinstance(frame, RangeFrame) or frame.index != self._last[0]:
             return
         found = self._last[1]
@@ -175,7 +183,7 @@ class MultipathCorrector(Corrector):
 
 
 def _corrected(
-    frame: RangeFrame, image: LightImage, found: Interference, doubt: float
+    frame: RangeFrame, image: ToFImage, found: MultipathEstimate, relative_sigma: float
 ) -> RangeFrame:
     assert frame.amplitude_image is not None
     nearer = np.where(image.z > 0, found.z / np.where(image.z > 0, image.z, 1), 1)
@@ -185,8 +193,8 @@ def _corrected(
     plain = (image.z <= 0) | (frame.amplitude_image >= SATURATED_AMPLITUDE)
     amplitude = np.where(plain, frame.amplitude_image, frame.amplitude_image * factor)
     shared = frame.shared_sigma_image
-    if doubt > 0:
-        own = doubt * np.abs(frame.radial_range * (1 - nearer))
+    if relative_sigma > 0:
+        own = relative_sigma * np.abs(frame.radial_range * (1 - nearer))
         shared = (own if shared is None else np.hypot(shared, own)).astype(np.float32)
     return replace(
         frame,

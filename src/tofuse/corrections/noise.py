@@ -35,8 +35,8 @@ class Noise(Correction, Corrector):
         """See `Correction.start`. Nothing is learnt from frames."""
         return self
 
-    def alone(self, frame: Frame) -> bool:
-        """See `Corrector.alone`."""
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`."""
         return True
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:

@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.arrays import Complex128, Float32
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.sensor.multipath import LightImage
+from tofuse.sensor.multipath import ToFImage
 from tofuse.sensor.multipath_surfaces import FALLOFF
 
 # Cameras of one frequency measure with periods up to this. A longer ambiguity is a beat of several
@@ -14,7 +14,7 @@ from tofuse.sensor.multipath_surfaces import FALLOFF
 _LONGEST_PERIOD_M = 6.0
 
 
-def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage | None:
+def tof_image(frame: RangeFrame, period_m: float | None = None) -> ToFImage | None:
     """Return the frame's depth and raw light; None if its light or its period is not known."""
     period_m = modulation_period(frame, period_m)
     if period_m is None or frame.amplitude_image is None or not len(frame):
@@ -29,7 +29,7 @@ def light_image(frame: RangeFrame, period_m: float | None = None) -> LightImage 
         square = np.where(fine, 1 + (rays * rays).sum(-1), np.float32(1))
         # z squared times the square of the ray's length is the range's.
         light = light / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
-    return LightImage(z, rays, light.astype(np.float32, copy=False), period_m)
+    return ToFImage(z, rays, light.astype(np.float32, copy=False), period_m)
 
 
 def modulation_period(frame: RangeFrame, given: float | None) -> float | None:
@@ -42,39 +42,41 @@ def modulation_period(frame: RangeFrame, given: float | None) -> float | None:
     return period_m
 
 
-def light_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex128 | None:
+def frame_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex128 | None:
     """Return the light (H, W) of a frame, with its phase; 0 where there is none.
 
     None where the light or the period is not known.
     """
-    image = light_image(frame, period_m)
+    image = tof_image(frame, period_m)
     return None if image is None else phasor(image)
 
 
-def phasor(image: LightImage) -> Complex128:
+def phasor(image: ToFImage) -> Complex128:
     """Phasor (H, W) of the raw light; 0 where there is none."""
-    seen = (image.z > 0) & (image.light > 0)
+    seen = (image.z > 0) & (image.amplitude > 0)
     x, y = image.rays[..., 0], image.rays[..., 1]
     r = np.where(seen, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
     phase = np.float32(2 * np.pi / image.period_m) * r
-    light = np.where(seen, image.light, np.float32(0))
+    light = np.where(seen, image.amplitude, np.float32(0))
     out = np.empty(r.shape, np.complex128)
     out.real, out.imag = light * np.cos(phase), light * np.sin(phase)
     return out
 
 
-def wrapped_light(frame: Frame, period_m: float | None) -> tuple[Float32, Float32, float] | None:
+def range_and_amplitude(
+    frame: Frame, period_m: float | None
+) -> tuple[Float32, Float32, float] | None:
     """Return radial range and raw light with the falloff of lens and lamp taken off, and period."""
     if not isinstance(frame, RangeFrame):
         return None
-    image = light_image(frame, period_m)
+    image = tof_image(frame, period_m)
     if image is None:
         return None
     rays = frame.camera.rays()
     cosine2 = 1 / (1 + (rays * rays).sum(-1))
     radial = np.where(frame.valid, frame.radial_range, np.float32(0))
     with np.errstate(invalid="ignore"):
-        light = np.nan_to_num(image.light / cosine2 ** (FALLOFF / 2))
+        light = np.nan_to_num(image.amplitude / cosine2 ** (FALLOFF / 2))
     return radial, light.astype(np.float32), image.period_m
 
 

@@ -13,16 +13,16 @@ import numpy as np
 from tofuse.arrays import Bool, Float64
 from tofuse.bounds import above, within
 from tofuse.corrections.base import Correction, Corrector
-from tofuse.corrections.raw_amplitude import light_image, light_phasor, phasor
+from tofuse.corrections.raw_amplitude import frame_phasor, phasor, tof_image
 from tofuse.errors import InputError
 from tofuse.parts import part
 from tofuse.recordings.background import moving_object
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.sensor.scattering import Scattering, learn_shares
+from tofuse.sensor.scattering import Scattering, estimate_fractions
 
-# A pixel with less than this share of its light its own is measured too badly to be saved.
-_LEAST_OWN = 0.5
-# Around what moves, pixels that are neither still nor of the object: the lens blurs its outline.
+# A pixel with less than this fraction of its light its own is measured too badly to be saved.
+_MIN_OWN = 0.5
+# OffscreenCells what moves, pixels that are neither still nor of the object: the lens blurs its outline.
 _RIM = 4
 # Share of the frames in which a still pixel must show its background.
 _STILL = 0.9
@@ -34,20 +34,20 @@ class LensScattering(Correction):
     """Take off the light that the lens scatters (Mure-Dubois and Huegli 2007), see `sensor`.
 
     Works on cameras of one modulation frequency that record amplitude; other views are passed on
-    as they are, and all are where the shares are neither given nor learnt.
+    as they are, and all are where the fractions are neither given nor learnt.
 
     Attributes
     ----------
-    shares
+    fractions
         Share of the light that goes into each Gaussian. None: learnt from the recording, where
         something moves before a background that stands still.
     widths
-        Standard deviations of the Gaussians, as shares of the image's width.
+        Standard deviations of the Gaussians, as fractions of the image's width.
     period_m
         Range after which the phase repeats; None: as the frame says.
     """
 
-    shares: tuple[float, ...] | None = None
+    fractions: tuple[float, ...] | None = None
     widths: tuple[float, ...] = (0.04, 0.1, 0.3)
     period_m: float | None = None
 
@@ -59,31 +59,31 @@ class LensScattering(Correction):
         for width in self.widths:
             above("widths", width, 0.005)
             within("widths", width, 0, 2)
-        if self.shares is not None:
-            if len(self.shares) != len(self.widths):
+        if self.fractions is not None:
+            if len(self.fractions) != len(self.widths):
                 raise ValueError(
-                    f"shares has {len(self.shares)} numbers, widths {len(self.widths)}"
+                    f"fractions has {len(self.fractions)} numbers, widths {len(self.widths)}"
                 )
-            for share in self.shares:
-                within("shares", share, 0, 0.5)
+            for fraction in self.fractions:
+                within("fractions", fraction, 0, 0.5)
         if self.period_m is not None:
             above("period_m", self.period_m, 0)
 
     @property
-    def learns(self) -> bool:
-        """See `Correction.learns`."""
-        return self.shares is None
+    def needs_fit(self) -> bool:
+        """See `Correction.needs_fit`."""
+        return self.fractions is None
 
-    def learnt(self, frames: Sequence[Frame]) -> LensScattering:
-        """See `Correction.learnt`; no share where nothing moves before a still background."""
-        shares = np.zeros(len(self.widths))
+    def fit(self, frames: Sequence[Frame]) -> LensScattering:
+        """See `Correction.fit`; no fraction where nothing moves before a still background."""
+        fractions = np.zeros(len(self.widths))
         images = [frame for frame in frames if isinstance(frame, RangeFrame)]
-        light = [x for image in images if (x := light_phasor(image, self.period_m)) is not None]
+        light = [x for image in images if (x := frame_phasor(image, self.period_m)) is not None]
         if images and len(light) == len(images):
             with suppress(InputError):
                 moves, still = _moves_and_still(images)
-                shares = learn_shares(np.stack(light), moves, still, self.widths)
-        return replace(self, shares=tuple(float(share) for share in shares))
+                fractions = estimate_fractions(np.stack(light), moves, still, self.widths)
+        return replace(self, fractions=tuple(float(fraction) for fraction in fractions))
 
     def start(self) -> ScatteringCorrector:
         """See `Correction.start`."""
@@ -96,25 +96,25 @@ class ScatteringCorrector(Corrector):
     def __init__(self, options: LensScattering) -> None:
         self._period_m = options.period_m
         self._model = (
-            Scattering(options.widths, options.shares)
-            if options.shares is not None and any(options.shares)
+            Scattering(options.widths, options.fractions)
+            if options.fractions is not None and any(options.fractions)
             else None
         )
 
-    def alone(self, frame: Frame) -> bool:
-        """See `Corrector.alone`."""
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`."""
         return True
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
-        """See `Corrector.apply`. The amplitude loses its scattered share as well."""
+        """See `Corrector.apply`. The amplitude loses its scattered fraction as well."""
         if self._model is None or not isinstance(frame, RangeFrame):
             return frame
-        image = light_image(frame, self._period_m)
+        image = tof_image(frame, self._period_m)
         if image is None:
             return frame
         measured = phasor(image)
         own = self._model.removed(measured)
-        lit = (measured != 0) & (np.abs(own) > _LEAST_OWN * np.abs(measured))
+        lit = (measured != 0) & (np.abs(own) > _MIN_OWN * np.abs(measured))
         ratio = np.where(lit, own, 1) / np.where(lit, measured, 1)
         r = np.where(lit, frame.radial_range, 1)
         nearer = 1 + np.angle(ratio) * (image.period_m / (2 * np.pi)) / r

@@ -11,10 +11,10 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.bounds import above
 from tofuse.corrections.base import Correction, Corrector
-from tofuse.corrections.raw_amplitude import pixel_pitch, wrapped_light
+from tofuse.corrections.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
+from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_amplitude
 
 _ROUNDS = 4
 
@@ -50,11 +50,11 @@ class Unwrap(Correction):
             above("period_m", self.period_m, 0)
 
     @property
-    def learns(self) -> bool:
-        """See `Correction.learns`."""
+    def needs_fit(self) -> bool:
+        """See `Correction.needs_fit`."""
         return self.white is None
 
-    def learnt(self, frames: Sequence[Frame]) -> Self:
+    def fit(self, frames: Sequence[Frame]) -> Self:
         """Return the part with the amplitude of white that the brightest frames show."""
         white = 0.0
         # Where most is beyond the period, white is known only once that has been brought back.
@@ -72,13 +72,13 @@ class Unwrap(Correction):
         return UnwrapCorrector(self)
 
     def _white_of(self, frame: Frame, white: float) -> float:
-        known = wrapped_light(frame, self.period_m)
+        known = range_and_amplitude(frame, self.period_m)
         if known is None:
             return 0.0
         radial, light, period = known
         pitch = pixel_pitch(frame)
         periods = count_periods(radial, light, period, white, pitch, self.options)
-        return white_light(light, (radial + periods * period).astype(np.float32), radial > 0)
+        return white_amplitude(light, (radial + periods * period).astype(np.float32), radial > 0)
 
 
 class UnwrapCorrector(Corrector):
@@ -87,13 +87,13 @@ class UnwrapCorrector(Corrector):
     def __init__(self, part: Unwrap) -> None:
         self.part = part
 
-    def alone(self, frame: Frame) -> bool:
-        """See `Corrector.alone`."""
+    def is_independent(self, frame: Frame) -> bool:
+        """See `Corrector.is_independent`."""
         return True
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`. Range-compensated amplitude is that of the new range."""
-        known = wrapped_light(frame, self.part.period_m)
+        known = range_and_amplitude(frame, self.part.period_m)
         if known is None or not isinstance(frame, RangeFrame):
             return frame
         radial, light, period = known

@@ -110,7 +110,7 @@ def cross_view_consistency(frames: Sequence[RangeFrame], poses: ArrayLike) -> Cr
 
 def prepare_for_comparison(frame: RangeFrame) -> PreparedView:
     """Prepare a frame for `compare_views`."""
-    return prepare_view(frame, SurfaceOptions()).thinned(_COLUMNS)
+    return prepare_view(frame, SurfaceOptions()).subsampled(_COLUMNS)
 
 
 def restore_thinned(frame: RangeFrame, filtered: RangeFrame) -> RangeFrame:

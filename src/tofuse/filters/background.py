@@ -26,23 +26,23 @@ class Background(Filter):
 
     Attributes
     ----------
-    sigmas, share
+    sigmas, fraction
         How far in front of the background a point must be: in standard deviations of the
-        background's depth, and as a share of it; both together.
+        background's depth, and as a fraction of it; both together.
     """
 
     sigmas: float = 4.0
-    share: float = 0.02
+    fraction: float = 0.02
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
     def __post_init__(self) -> None:
         above("sigmas", self.sigmas, 0)
-        within("share", self.share, 0, 1)
+        within("fraction", self.fraction, 0, 1)
 
     @property
-    def learns(self) -> bool:
-        """See `Filter.learns`."""
+    def needs_fit(self) -> bool:
+        """See `Filter.needs_fit`."""
         return True
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
@@ -50,11 +50,11 @@ class Background(Filter):
         raise InputError(
             "has not learnt the background",
             where="filter 'background'",
-            remedy="use tofuse.reconstruct, or the filter that its `learnt` returns",
+            remedy="use tofuse.reconstruct, or the filter that its `fit` returns",
         )
 
-    def learnt(self, frames: Sequence[Frame]) -> Filter:
-        """See `Filter.learnt`.
+    def fit(self, frames: Sequence[Frame]) -> Filter:
+        """See `Filter.fit`.
 
         Raises
         ------
@@ -62,10 +62,10 @@ class Background(Filter):
             If the camera moves, nothing moves, or the object can't be told from what it stands on.
         """
         images = [frame for frame in frames if isinstance(frame, RangeFrame)]
-        return LearntBackground(self, moving_object(images, self.sigmas, self.share))
+        return FittedBackground(self, moving_object(images, self.sigmas, self.fraction))
 
 
-class LearntBackground(Background):
+class FittedBackground(Background):
     """A `Background` that knows what the background is."""
 
     _found: MovingObject
@@ -75,8 +75,8 @@ class LearntBackground(Background):
         object.__setattr__(self, "_found", found)
 
     @property
-    def learns(self) -> bool:
-        """See `Filter.learns`."""
+    def needs_fit(self) -> bool:
+        """See `Filter.needs_fit`."""
         return False
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:

@@ -20,7 +20,7 @@ class Filter(Protocol):
         Kinds of view it works on: "range", "cloud".
     window
         How many frames it looks at, the current one included; 1 for all but temporal filters.
-    learns
+    needs_fit
         Whether it must see frames of the whole recording first.
     """
 
@@ -33,11 +33,11 @@ class Filter(Protocol):
         return 1
 
     @property
-    def learns(self) -> bool:
-        """Whether it must see frames of the whole recording, with `learnt`, before it works."""
+    def needs_fit(self) -> bool:
+        """Whether it must see frames of the whole recording, with `fit`, before it works."""
         return False
 
-    def learnt(self, frames: Sequence[Frame]) -> Filter:
+    def fit(self, frames: Sequence[Frame]) -> Filter:
         """Return the filter with what it has learnt from frames spread over a recording.
 
         Parameters

@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 
 # More neighbours than this are no neighbourhood, and need memory for each of them and each point.
-_MOST = 1000
+_MAX_NEIGHBOURS = 1000
 
 
 @part("filter", "neighbour_distance")
@@ -39,7 +39,7 @@ class NeighbourDistance(Filter):
 
     def __post_init__(self) -> None:
         above("threshold", self.threshold, 0)
-        whole("k", self.k, 1, _MOST)
+        whole("k", self.k, 1, _MAX_NEIGHBOURS)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
@@ -49,32 +49,32 @@ class NeighbourDistance(Filter):
 @part("filter", "neighbour_share")
 @dataclass(frozen=True)
 class NeighbourShare(Filter):
-    """Remove a share of the points: those with the largest mean distance to their neighbours.
+    """Remove a fraction of the points: those with the largest mean distance to their neighbours.
 
     Chapter 4 removes half, by 3 neighbours. Of equal distances the later points go first.
 
     Attributes
     ----------
-    share
+    fraction
         Share of the points to remove, 0 to 1, rounded down to whole points.
     k
         How many neighbours.
     """
 
-    share: float = 0.5
+    fraction: float = 0.5
     k: int = 3
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        within("share", self.share, 0, 1)
-        whole("k", self.k, 1, _MOST)
+        within("fraction", self.fraction, 0, 1)
+        whole("k", self.k, 1, _MAX_NEIGHBOURS)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
         distance = mean_neighbour_distance(frame.points, self.k)
         # The small addition keeps 0.29 of 100 points at 29.
-        kept = len(distance) - int(self.share * len(distance) + 1e-6)
+        kept = len(distance) - int(self.fraction * len(distance) + 1e-6)
         keep = np.zeros(len(distance), bool)
         keep[np.argsort(distance, kind="stable")[:kept]] = True
         return _spread(frame, keep)

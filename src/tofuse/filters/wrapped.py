@@ -10,11 +10,11 @@ import numpy as np
 
 from tofuse.arrays import Bool
 from tofuse.bounds import within
-from tofuse.corrections.raw_amplitude import pixel_pitch, wrapped_light
+from tofuse.corrections.raw_amplitude import pixel_pitch, range_and_amplitude
 from tofuse.filters.base import Filter
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
-from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_light
+from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_amplitude
 
 # So many pixels of a view show how bright white is, and whether any are too dark.
 _ASKED = 10_000
@@ -36,37 +36,37 @@ class Wrapped(Filter):
 
     Attributes
     ----------
-    darkest
+    min_albedo
         Least albedo that there is.
-    share
+    fraction
         Fraction of the valid pixels that have to be darker than that.
     options
         How periods are counted.
     """
 
-    darkest: float = 0.02
-    share: float = 0.001
+    min_albedo: float = 0.02
+    fraction: float = 0.001
     options: UnwrapOptions = field(default_factory=lambda: UnwrapOptions(iterations=20))
 
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
-        within("darkest", self.darkest, 0, 1)
-        within("share", self.share, 0, 1)
+        within("min_albedo", self.min_albedo, 0, 1)
+        within("fraction", self.fraction, 0, 1)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
         keep = np.ones(frame.valid.shape, bool)
-        known = wrapped_light(frame, None)
+        known = range_and_amplitude(frame, None)
         if known is None or not isinstance(frame, RangeFrame):
             return keep
         radial, light, period = known
         step = max(1, round(np.sqrt(radial.size / _ASKED)))
         some, lit = radial[::step, ::step], light[::step, ::step]
-        white = white_light(lit, some, some > 0)
+        white = white_amplitude(lit, some, some > 0)
         seen = (some > 0) & (lit > 0)
-        dark = seen & (lit * np.square(some) < self.darkest * white)
-        if dark.sum() <= self.share * seen.sum():
+        dark = seen & (lit * np.square(some) < self.min_albedo * white)
+        if dark.sum() <= self.fraction * seen.sum():
             return keep
         periods = count_periods(radial, light, period, white, pixel_pitch(frame), self.options)
-        return (periods == 0) & (light * np.square(radial) >= self.darkest * white)
+        return (periods == 0) & (light * np.square(radial) >= self.min_albedo * white)

@@ -19,7 +19,7 @@ from tofuse.registration.prepared_view import (
     Projection,
     SurfaceOptions,
     prepare_view,
-    with_more_planes,
+    with_extended_planes,
 )
 
 # Weights, in 1/m^2, are kept as logarithms: six steps an octave, from 2^-14 on.
@@ -90,7 +90,7 @@ class RangeView:
         options = options or SurfaceOptions()
         if surface is None:
             surface = prepare_view(frame, options)
-        surface = with_more_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
+        surface = with_extended_planes(surface, frame, replace(options, fill=_FILL, offset=_OFFSET))
         shape = surface.z.shape
         smoothed, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
         measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)

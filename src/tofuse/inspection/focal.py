@@ -124,10 +124,10 @@ def _scores(pair: Pair) -> list[float]:
 def _scaled(view: PreparedView, scale: float) -> PreparedView:
     """Return the view had its rays been longer by a factor to all sides."""
     rays = view.rays * np.float32(scale)
-    planes, photo = view.planes.copy(), view.photo.copy()
+    planes, albedo = view.planes.copy(), view.albedo.copy()
     planes[..., :2] /= np.float32(scale)
-    photo[..., 1:] /= np.float32(scale)
+    albedo[..., 1:] /= np.float32(scale)
     x0, y0, per_x, per_y = view.projection.frame
     frame = np.array([x0 * scale, y0 * scale, per_x / scale, per_y / scale])
     projection = replace(view.projection, rays=rays, frame=frame)
-    return replace(view, rays=rays, planes=planes, photo=photo, projection=projection)
+    return replace(view, rays=rays, planes=planes, albedo=albedo, projection=projection)

@@ -70,7 +70,7 @@ class KeyframeMap:
         """Add the newest keyframe; where there are too many, the most dispensable one goes."""
         if self._keyframes:  # only lost views are compared with it from here on
             before = self._keyframes[-1]
-            self._keyframes[-1] = replace(before, view=before.view.bare())
+            self._keyframes[-1] = replace(before, view=before.view.without_caches())
         self._keyframes.append(keyframe)
         if len(self._keyframes) > CAPACITY:
             del self._keyframes[self._dispensable()]

@@ -243,9 +243,9 @@ def without_pixels(view: PreparedView, mask: Bool) -> PreparedView:
         sigma=view.sigma * keep,
         planes=view.planes * keep[..., None],
         plane_variance=view.plane_variance * keep,
-        photo=np.where(keep[..., None], view.photo, np.float32(np.nan))
-        if view.has_photo
-        else view.photo,
+        albedo=np.where(keep[..., None], view.albedo, np.float32(np.nan))
+        if view.has_albedo
+        else view.albedo,
         pixel_variance=None if own is None else own * keep,
     )
 

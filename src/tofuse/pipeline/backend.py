@@ -458,7 +458,7 @@ class BackEnd:
 
     def _about_corrections(self) -> tuple[Reason, ...]:
         """What is to be said where a correction was left out."""
-        names = [name_of(c) for c in self._config.corrections if c.left_out]
+        names = [name_of(c) for c in self._config.corrections if c.disabled]
         if not names:
             return ()
         text = (

@@ -102,7 +102,7 @@ class _Views:
         if not isinstance(frame, RangeFrame) or not len(frame):
             return None
         view = prepare_view(frame, self._options)
-        return view if view.has_photo else None
+        return view if view.has_albedo else None
 
 
 def _from(views: _Views, start: int, known: float) -> _Slope | None:
@@ -174,8 +174,8 @@ def _without(view: PreparedView, exponent: float) -> PreparedView:
     x, y = np.moveaxis(view.rays, -1, 0)
     length2 = 1 + x * x + y * y
     more = np.stack([0.5 * np.log(length2), x / length2, y / length2], -1)
-    photo = np.asarray(view.photo + exponent * more, np.float32)
-    return replace(view, photo=photo)
+    albedo = np.asarray(view.albedo + exponent * more, np.float32)
+    return replace(view, albedo=albedo)
 
 
 def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | None:
@@ -195,7 +195,7 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64) -> _Slope | N
     p, q, u, v = p[inside], q[inside], u[inside], v[inside]
     z = target.planes[v, u, 3].astype(np.float64)
     near = (z > 0) & (np.abs(q[:, 2] - 1 / np.maximum(z, 1e-9)) < _NEAR_M + _NEAR * q[:, 2])
-    lighter = target.photo[v, u, 0] - packed[inside, POINT_ALBEDO]
+    lighter = target.albedo[v, u, 0] - packed[inside, POINT_ALBEDO]
     near &= np.isfinite(lighter)
     if np.count_nonzero(near) < _LEAST_POINTS:
         return None

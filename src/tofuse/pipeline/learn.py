@@ -50,16 +50,16 @@ def learnt(
         If the recording does not show what a filter has to learn.
     """
     asked = config
-    filters_learn = any(f.learns for f in (*config.filters, *config.model_filters))
+    filters_learn = any(f.needs_fit for f in (*config.filters, *config.model_filters))
     # BLAS sums differ with its number of threads; ours don't.
     with use_threads(threads), threadpool_limits(1):
-        if filters_learn or any(c.learns for c in config.corrections):
+        if filters_learn or any(c.needs_fit for c in config.corrections):
             config = _taught(config, recording)
         for item in config.corrections:
-            if item.on_trial:
+            if item.needs_trial:
                 config = _tried(config, item, recording, progress or Silent())
-        left_out = sum(c.left_out for c in config.corrections)
-        if filters_learn and left_out > sum(c.left_out for c in asked.corrections):
+        left_out = sum(c.disabled for c in config.corrections)
+        if filters_learn and left_out > sum(c.disabled for c in asked.corrections):
             # They have to learn from images as they will be.
             unlearnt = replace(config, filters=asked.filters, model_filters=asked.model_filters)
             config = _taught(unlearnt, recording)
@@ -94,11 +94,11 @@ def _tried(config: Config, item: Correction, recording: Recording, progress: Pro
     ways = _prepared(without), _prepared(config)
     if _changes(config, recording, *ways):
         found = trial(recording, *ways)
-        after = item.tried(found.helps, found.strength, found.error)
-        if after.left_out:
+        after = item.after_trial(found.helps, found.strength, found.error)
+        if after.disabled:
             progress.note(f"correction {name_of(item)} not applied: {found.in_words()}")
     else:
-        after = item.tried(helps=True)
+        after = item.after_trial(helps=True)
     kept = tuple(after if c is item else c for c in config.corrections)
     return replace(config, corrections=kept)
 
@@ -138,7 +138,7 @@ def _corrections(
     """Let each correction learn from what the ones before it made; also returns what all made."""
     out = []
     for item in corrections:
-        knowing = item.learnt(frames) if item.learns else item
+        knowing = item.fit(frames) if item.needs_fit else item
         corrector = knowing.start()
         frames = [corrector.apply(frame) for frame in frames]
         out.append(knowing)
@@ -151,7 +151,7 @@ def _filters(
     """Let each filter learn from what the ones before it left; also returns what they all left."""
     out = []
     for item in filters:
-        knowing = item.learnt(frames) if item.learns else item
+        knowing = item.fit(frames) if item.needs_fit else item
         if item.window == 1:  # a sample has no neighbours in time
             frames = [frame.keep(knowing.mask(frame, ())) for frame in frames]
         out.append(knowing)

@@ -36,7 +36,7 @@ def thesis(kind: ViewKind) -> Config:
     icp = algorithm_1(resolution=0.01, points=1000)
     return Config(
         method="thesis",
-        filters=(Confidence(minimum=7), NeighbourShare(share=0.5, k=3)),
+        filters=(Confidence(minimum=7), NeighbourShare(fraction=0.5, k=3)),
         odometry=Sequential(registration=icp, guess="previous"),
         # Wide, because the trajectory has drifted when a loop closes; strict in what is accepted,
         # because a wrong loop does more harm than a missing one.

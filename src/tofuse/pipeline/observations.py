@@ -65,7 +65,7 @@ class Observations:
             # Only who looks at surfaces states errors that can be relied on; ICP's are too small.
             self._knows_errors = True
             if self.views.wants(surface.index, surface.depth, T, step.component):
-                self.views.push(surface.thinned(_COLUMNS).bare(), T, step.component)
+                self.views.push(surface.subsampled(_COLUMNS).without_caches(), T, step.component)
         view: Frame = ready.clean
         # Who looks at surfaces leaves the points alone, which take long to make.
         if surface is None or self.loops.points or self._refiner.points:

@@ -102,7 +102,7 @@ class Preparation:
             return None
         corrected = 0
         for corrector in self._correctors:
-            if not corrector.alone(frame):
+            if not corrector.is_independent(frame):
                 return Prepared(frame, corrected, None)
             frame, corrected = corrector.apply(frame), corrected + 1
         if self._config.window > 1:
@@ -141,12 +141,12 @@ class Preparation:
     def placed(self, frame: Frame, T_component_camera: Float64) -> None:
         """Tell the corrections where a frame is, in the frame of the present component."""
         for corrector in self._correctors:
-            corrector.placed(frame, T_component_camera)
+            corrector.add_pose(frame, T_component_camera)
 
     def begin_component(self) -> None:
         """Forget what corrections know of places: their frame is another one now."""
         for corrector in self._correctors:
-            corrector.forget()
+            corrector.reset_poses()
 
     def _corrected(
         self, frame: Frame, T_expected: Float64 | None = None, prepared: Prepared | None = None

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.corrections.raw_amplitude import wrapped_light
+from tofuse.corrections.raw_amplitude import range_and_amplitude
 from tofuse.corrections.unwrap import Unwrap
 from tofuse.errors import InputError
 from tofuse.filters.base import apply_filters
@@ -309,7 +309,7 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
 
 def _check_unwrap(recording: Recording) -> None:
     """Refuse what can't be unwrapped before work starts."""
-    if not any(wrapped_light(frame, None) for frame in recording.readable(_LOOKED_AT)):
+    if not any(range_and_amplitude(frame, None) for frame in recording.readable(_LOOKED_AT)):
         raise InputError(
             "the recording can't be unwrapped: that needs its amplitude, and the range after which "
             "the phase of its camera repeats",

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _ARRAYS: dict[type, dict[str, str]] = {
     PreparedView: {
         "rays": "f4 H W 2", "z": "f4 H W", "sigma": "f4 H W", "planes": "f4 H W 4",
-        "plane_variance": "f4 H W", "photo": "f4 H W 3", "pixel_variance": "f4 H W",
+        "plane_variance": "f4 H W", "albedo": "f4 H W 3", "pixel_variance": "f4 H W",
         "target": f"f4 H W {PIXEL_SIZE}",
     },
     Projection: {"rays": "f4 H W 2", "lookup": "f4 A B 2", "frame": "f8! 4", "lengths2": "f4 H W"},

@@ -146,8 +146,8 @@ def degenerate_directions(
         if (i, j) in own:
             found = unobservable.get(j, _NONE)
         elif len(known) and i in views and j in views:
-            target = [Target(views[i].view.bare(), np.eye(4))]
-            aligned = align(views[j].view.bare(), target, T_i_j, _ALIGNMENT)
+            target = [Target(views[i].view.without_caches(), np.eye(4))]
+            aligned = align(views[j].view.without_caches(), target, T_i_j, _ALIGNMENT)
             found = aligned.unobservable * UNITS
         # A direction is known to some degrees only, and what is left of it would still look
         # measured: where a pair is degenerate, so it is in all that its views were.

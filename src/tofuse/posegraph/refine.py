@@ -485,7 +485,7 @@ def _directed(
     system = PairSystem(count, np.concatenate([ends, beside.pairs]), fixed=first)
     unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
     state = _Pairs(target, source, *unknown, most[source], system)
-    lit = np.array([v.surface.has_photo for v in views]) & options.photometric
+    lit = np.array([v.surface.has_albedo for v in views]) & options.photometric
     state.scale_p[~(lit[target] & lit[source])] = 0.0
     row = {ts: k for k, ts in enumerate(zip(before.target, before.source, strict=True))}
     old = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)

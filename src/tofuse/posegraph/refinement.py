@@ -297,7 +297,7 @@ class _Seen:
 
 
 def _kept(posed: PosedView[PreparedView], options: Joint) -> KeptView:
-    return KeptView.of(posed.view.once().bare(), options.refine.points)
+    return KeptView.of(posed.view.with_pixel_variance().without_caches(), options.refine.points)
 
 
 def _suspicion(one: InSubmap, options: Joint) -> Suspicion:

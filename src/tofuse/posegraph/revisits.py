@@ -268,7 +268,7 @@ class _RevisitLoops(Loops):
         return list(self._seen.values())
 
     def _seen_of(self, posed: View) -> _Seen:
-        surface = posed.view.bare()
+        surface = posed.view.without_caches()
         outline = KeptView.of(surface, _POINTS).outline
         kept = Spilled(outline, self._store.outlines)
         return _Seen(outline.middle, look_of(surface), kept)
@@ -281,9 +281,9 @@ class _RevisitLoops(Loops):
                 continue
             self._learnt.add(pair)
             guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
-            target = [Target(a.view.bare(), np.eye(4))]
+            target = [Target(a.view.without_caches(), np.eye(4))]
             scale = self._usual.noise_scale
-            aligned = align(b.view.bare(), target, guess, _FREELY, usual_scale=scale)
+            aligned = align(b.view.without_caches(), target, guess, _FREELY, usual_scale=scale)
             if aligned.overlap >= _LEAST_OVERLAP:
                 self._usual.learn(aligned, b.view.depth)
 
@@ -311,7 +311,7 @@ class _RevisitLoops(Loops):
         """What `register_near` takes, from where the trajectory has two views."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Else all views would keep, until the end, what they are compared with here.
-        return source.view.bare(), target.view.bare(), guess, self._usual
+        return source.view.without_caches(), target.view.without_caches(), guess, self._usual
 
     def _decided(self, pair: tuple[int, int], made: Registration | None) -> ClosedLoop:
         """What becomes of frames (i, j) that were registered."""

@@ -91,7 +91,7 @@ class KeptView:
     def outline(self) -> Outline:
         """What tells what it overlaps with."""
         some = self.points[:: max(1, len(self.points) // _OVERLAP_POINTS)]
-        coarse = self.surface.thinned(_OVERLAP_COLUMNS)
+        coarse = self.surface.subsampled(_OVERLAP_COLUMNS)
         return Outline(some, coarse.target, coarse.projection)
 
     @cached_property

@@ -203,7 +203,7 @@ def _one_way(
             points.light,
             view.planes,
             view.plane_variance,
-            view.photo,
+            view.albedo,
             nearest,
             view.projection.lookup,
             view.projection.frame,

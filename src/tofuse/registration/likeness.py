@@ -36,7 +36,7 @@ def look_of(view: PreparedView) -> Float32:
     third = np.bincount(cell, minlength=size) / 3
     look = np.full((2, size), np.nan, np.float32)
     depth = np.log(np.where(view.z > 0, view.z, np.float32(np.nan)))
-    for image, out in ((depth, look[0]), (view.photo[..., 0], look[1])):
+    for image, out in ((depth, look[0]), (view.albedo[..., 0], look[1])):
         known = np.isfinite(image).ravel()
         count = np.bincount(cell[known], minlength=size)
         total = np.bincount(cell[known], image.ravel()[known].astype(float), minlength=size)

@@ -30,21 +30,21 @@ _CHUNK_ROWS = 60
 # Depths within this share of each other are one surface when an image is halved.
 _HALVING_JUMP = 0.02
 # Levels of colour: below, the logarithm is noise; from the other on, a channel is saturated.
-_DARKEST, _BRIGHTEST = 8, 254
+_MIN_LEVEL, _MAX_LEVEL = 8, 254
 # m. Depths and sigmas beyond are no measurement, and their squares no float32.
-_NEAREST, _FARTHEST = 1e-3, 1e3
-_LEAST_SIGMA = 1e-6
+_MIN_DEPTH, _MAX_DEPTH = 1e-3, 1e3
+_MIN_SIGMA = 1e-6
 # Share of the depth below which no camera's errors are: a view without noise, averaged or made by
 # a program, is not known to a hundredth of a millimetre either.
-_LEAST_NOISE = 3e-4
+_MIN_NOISE = 3e-4
 # An alignment takes pixels for independent. Where so many share an error, they tell together what
 # each of them would with that many times its variance.
-_SHARE_ERROR = 100.0
+_CORRELATED_PIXELS = 100.0
 # The typical noise does not stand for pixels with so many times as much; to fit planes to them is
 # worth its time where they are this share of a view.
-_NOISIER, _WORTH_FITTING = 2.0, 0.02
+_NOISY_RATIO, _MIN_NOISY = 2.0, 0.02
 # A pixel within so many standard deviations of a plane has measured it.
-_ON_PLANE = 3.0
+_MAX_PLANE_SIGMAS = 3.0
 # Of the absolute values of a normal distribution, in standard deviations.
 _MEDIAN_OF_NORMAL = 0.6745
 
@@ -121,7 +121,7 @@ class SurfaceOptions:
     fill, offset
         Least share of a window that must be valid, and largest squared offset of its centre, as a
         share of its squared spread.
-    photo_radius
+    albedo_radius
         Half width of the box that smooths the albedo, pixels.
     falloff
         Exponent of the cosine to the axis by which amplitude falls off towards the corners; None to
@@ -139,7 +139,7 @@ class SurfaceOptions:
     flatness: float = 0.002
     fill: float = 0.7
     offset: float = 0.2
-    photo_radius: int = 1
+    albedo_radius: int = 1
     falloff: float | None = None
     smoothed: Smoothed = Smoothed()
 
@@ -147,8 +147,8 @@ class SurfaceOptions:
         if not 16 <= self.columns <= 4096:
             raise ValueError(f"columns is {self.columns}, not 16 to 4096")
         _check_windows(self)
-        if not 0 <= self.photo_radius <= 20:
-            raise ValueError(f"photo_radius is {self.photo_radius}, not 0 to 20 pixels")
+        if not 0 <= self.albedo_radius <= 20:
+            raise ValueError(f"albedo_radius is {self.albedo_radius}, not 0 to 20 pixels")
         for name in ("edge_jump", "offset"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0 and up to 1")
@@ -186,7 +186,7 @@ class Projection:
     rays: Float32
     lookup: Float32
     frame: Float64
-    _thinned: dict[int, Projection] = field(default_factory=dict, init=False, repr=False)
+    _subsampled: dict[int, Projection] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def unknown(self) -> Bool | None:
@@ -220,19 +220,19 @@ class Projection:
         pixels = (camera.project(nodes) + 0.5) / step - 0.5
         lookup = np.where(np.isfinite(pixels), pixels, -1e6).astype(np.float32)
         scale = np.array([x[0], y[0], 1 / (x[1] - x[0]), 1 / (y[1] - y[0])])
-        return cls(_halved_rays(rays, step), lookup, scale)
+        return cls(_halve_rays(rays, step), lookup, scale)
 
-    def thinned(self, step: int) -> Projection:
+    def subsampled(self, step: int) -> Projection:
         """Every `step`-th pixel; one object for all views, which is soon found in the caches."""
-        if step not in self._thinned:
+        if step not in self._subsampled:
             first = step // 2
             rays = np.ascontiguousarray(self.rays[first::step, first::step])
             lookup = (self.lookup - np.float32(first)) / np.float32(step)
-            self._thinned[step] = Projection(rays, lookup, self.frame)
-        return self._thinned[step]
+            self._subsampled[step] = Projection(rays, lookup, self.frame)
+        return self._subsampled[step]
 
 
-def _halved_rays(rays: Float32, step: int) -> Float32:
+def _halve_rays(rays: Float32, step: int) -> Float32:
     while step > 1:
         rows, columns = rays.shape[0] // 2, rays.shape[1] // 2
         rays = rays[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 2).mean((1, 3))
@@ -262,7 +262,7 @@ class PreparedView:
         there is none.
     plane_variance
         (H, W) variance of that 1/z, 1/m^2, as if pixels were independent.
-    photo
+    albedo
         (H, W, 3) logarithm of the albedo (of amplitude, else of colour), smoothed, and its slopes
         by x/z and y/z; NaN where unknown.
     projection
@@ -278,11 +278,11 @@ class PreparedView:
     sigma: Float32
     planes: Float32
     plane_variance: Float32
-    photo: Float32
+    albedo: Float32
     projection: Projection
-    has_photo: bool = field(default=False)
+    has_albedo: bool = field(default=False)
     pixel_variance: Float32 | None = None
-    _thinned: dict[int, PreparedView] = field(default_factory=dict, init=False, repr=False)
+    _subsampled: dict[int, PreparedView] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def normals(self) -> Float32:
@@ -298,7 +298,7 @@ class PreparedView:
         """How many there are, valid or not."""
         return self.z.size
 
-    def once(self) -> PreparedView:
+    def with_pixel_variance(self) -> PreparedView:
         """Return the view with `pixel_variance` for `plane_variance`, if it has both.
 
         A single alignment can't but take an error that pixels share for the camera's motion, so it
@@ -309,11 +309,11 @@ class PreparedView:
             return self
         return replace(self, plane_variance=self.pixel_variance, pixel_variance=None)
 
-    def bare(self) -> PreparedView:
+    def without_caches(self) -> PreparedView:
         """Return the view without what was derived from it, which takes as much memory again."""
         return replace(self)
 
-    def thinned(self, columns: int) -> PreparedView:
+    def subsampled(self, columns: int) -> PreparedView:
         """Return the view at every n-th pixel, so that it has at most so many columns.
 
         A plane fits beyond its own pixel, so for comparing views few pixels are enough. All who
@@ -322,31 +322,33 @@ class PreparedView:
         step = -(-self.z.shape[1] // columns)
         if step == 1:
             return self
-        if step in self._thinned:
-            return self._thinned[step]
+        if step in self._subsampled:
+            return self._subsampled[step]
         first = step // 2
         kept = (slice(first, None, step),) * 2
         z, sigma, planes, variance = (
             np.ascontiguousarray(image[kept])
             for image in (self.z, self.sigma, self.planes, self.plane_variance)
         )
-        photo = np.ascontiguousarray(self.photo[kept]) if self.has_photo else _no_photo(*z.shape)
-        projection = self.projection.thinned(step)
+        albedo = (
+            np.ascontiguousarray(self.albedo[kept]) if self.has_albedo else _no_albedo(*z.shape)
+        )
+        projection = self.projection.subsampled(step)
         rays = projection.rays
         own = self.pixel_variance
-        self._thinned[step] = PreparedView(
+        self._subsampled[step] = PreparedView(
             self.index,
             rays,
             z,
             sigma,
             planes,
             variance,
-            photo,
+            albedo,
             projection,
-            self.has_photo,
+            self.has_albedo,
             pixel_variance=None if own is None else np.ascontiguousarray(own[kept]),
         )
-        return self._thinned[step]
+        return self._subsampled[step]
 
     @cached_property
     def depth(self) -> float:
@@ -357,10 +359,10 @@ class PreparedView:
     @cached_property
     def target(self) -> Float32:
         """(H, W, PIXEL_SIZE) what points of other views are compared with, see `make_target`."""
-        return make_target(self.rays, self.planes, self.plane_variance, self.photo)
+        return make_target(self.rays, self.planes, self.plane_variance, self.albedo)
 
     @cached_property
-    def planar_share(self) -> float:
+    def planar_fraction(self) -> float:
         """Share of the pixels at which a plane was fitted."""
         return float(np.count_nonzero(self.planes[..., 3] > 0)) / self.z.size
 
@@ -373,7 +375,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     the view itself, as the median misfit of small planes. What a frame states of its noise is not
     made less: planes don't show noise that neighbouring pixels share.
     """
-    projection, z, light, own = _reduced(frame, options.columns)
+    projection, z, light, own = _at_working_resolution(frame, options.columns)
     rays = projection.rays
     w = _inverse(z, z > 0)
     lit = frame.amplitude_image is not None
@@ -384,31 +386,31 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
     options = options.for_noise(noise)
     if options.edge_margin:
         jump = max(options.edge_jump, options.edge_sigmas * noise)
-        weight[_near_edges(w, jump, options.edge_margin)] = 0
+        weight[_edge_pixels(w, jump, options.edge_margin)] = 0
     known = weight > 0
     rows, columns = z.shape
     scale = max(
         _noise_scale(w, rays, weight, options.radii[0]),
-        _scale_at(_LEAST_NOISE, z, sigma) if own is None else 1.0,
+        _scale_at(_MIN_NOISE, z, sigma) if own is None else 1.0,
     )
     limit = options.misfit * max(scale, _scale_at(options.flatness, z, sigma))
-    planes, quality = _fitted(w, rays, weight, known, limit, options)
-    photo = _no_photo(rows, columns)
-    has_photo = light is not None
+    planes, quality = _fit(w, rays, weight, known, limit, options)
+    albedo = _no_albedo(rows, columns)
+    has_albedo = light is not None
     if light is not None:
-        photo = np.full((rows, columns, 3), np.nan, np.float32)
+        albedo = np.full((rows, columns, 3), np.nan, np.float32)
         albedo = np.empty((rows, columns), np.float32)
         falls = lit and frame.amplitude_kind == "raw"
         albedo_image(planes, rays, light, falls, lit, options.falloff or 0.0, albedo)
         run_chunks(
             lambda a, b: smooth_and_slope(
-                albedo, planes, rays, options.photo_radius, 0.05, photo, a, b
+                albedo, planes, rays, options.albedo_radius, 0.05, albedo, a, b
             ),
             rows,
             _chunks(rows),
         )
     shared = _shared_sigma(frame, projection.lengths2)
-    variance, own_variance = _with_shared(quality[..., 1] * np.float32(scale), planes, shared)
+    variance, own_variance = _add_shared_error(quality[..., 1] * np.float32(scale), planes, shared)
     return PreparedView(
         frame.index,
         rays,
@@ -416,28 +418,28 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         sigma * np.float32(np.sqrt(scale)),
         planes,
         variance,
-        photo,
+        albedo,
         projection,
-        has_photo,
+        has_albedo,
         pixel_variance=own_variance,
     )
 
 
 @lru_cache(maxsize=16)
-def _no_photo(rows: int, columns: int) -> Float32:
+def _no_albedo(rows: int, columns: int) -> Float32:
     """NaN (H, W, 3), never written to: one image for all views, as there are many of them."""
     return np.full((rows, columns, 3), np.nan, np.float32)
 
 
-def with_more_planes(
+def with_extended_planes(
     surface: PreparedView, frame: RangeFrame, options: SurfaceOptions
 ) -> PreparedView:
     """Return the view of `frame` with planes where the tracker does well to have none.
 
     Where pixels are noisier than the typical one, and at outlines. Planes that were fitted before
-    stay; variances are those of `PreparedView.once`.
+    stay; variances are those of `PreparedView.with_pixel_variance`.
     """
-    surface = surface.once()
+    surface = surface.with_pixel_variance()
     known = (surface.z > 0) & (surface.sigma > 0)
     if not known.any():
         return surface
@@ -447,13 +449,13 @@ def with_more_planes(
     options = options.for_noise(float(np.sqrt(2) * typical))
     missing = known & (surface.planes[..., 3] == 0)
     quiet = surface.planes
-    if np.count_nonzero(missing & (noise > _NOISIER * typical)) >= _WORTH_FITTING * known.size:
-        surface = _with_noisy_planes(surface, frame, w, noise, missing, options)
+    if np.count_nonzero(missing & (noise > _NOISY_RATIO * typical)) >= _MIN_NOISY * known.size:
+        surface = _with_planes_at_noisy_pixels(surface, frame, w, noise, missing, options)
         missing = known & (surface.planes[..., 3] == 0)
-    return _with_carried_planes(surface, quiet, w, noise, missing, options)
+    return _with_planes_of_neighbours(surface, quiet, w, noise, missing, options)
 
 
-def _with_noisy_planes(
+def _with_planes_at_noisy_pixels(
     surface: PreparedView,
     frame: RangeFrame,
     w: Float32,
@@ -467,14 +469,14 @@ def _with_noisy_planes(
     jump is what differs by more than the noise of the pixels next to it, unless one of these is
     much noisier than the other. `noise` (H, W) is a share of the depth.
     """
-    edge = _noisy_edges(w, noise, options)
+    edge = _edge_pixels_by_noise(w, noise, options)
     missing = missing & ~edge
     weight = _inverse((noise * w) ** 2, (w > 0) & ~edge)
     limit = options.misfit * max(1.0, _scale_at(options.flatness, surface.z, surface.sigma))
-    planes, quality = _fitted(w, surface.rays, weight, missing, limit, options)
+    planes, quality = _fit(w, surface.rays, weight, missing, limit, options)
     new = missing & (planes[..., 3] > 0)
     shared = _shared_sigma(frame, surface.projection.lengths2)
-    variance, own = _with_shared(quality[..., 1], planes, shared)
+    variance, own = _add_shared_error(quality[..., 1], planes, shared)
     return replace(
         surface,
         planes=np.where(new[..., None], planes, surface.planes),
@@ -482,7 +484,7 @@ def _with_noisy_planes(
     )
 
 
-def _with_carried_planes(
+def _with_planes_of_neighbours(
     surface: PreparedView,
     quiet: Float32,
     w: Float32,
@@ -501,7 +503,7 @@ def _with_carried_planes(
     planes, variance = surface.planes.copy(), surface.plane_variance.copy()
     extend_planes(
         w, noise * w, surface.rays, missing, quiet, surface.plane_variance, steps, growth,
-        _ON_PLANE, options.edge_jump, planes, variance,
+        _MAX_PLANE_SIGMAS, options.edge_jump, planes, variance,
     )  # fmt: skip
     return replace(surface, planes=planes, plane_variance=variance)
 
@@ -521,8 +523,8 @@ def _steps(radius: int) -> tuple[Int32, Float32]:
     return around[order].astype(np.int32), growth.astype(np.float32)
 
 
-def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
-    """As `_near_edges`, where each pixel has a noise (H, W) of its own, as a share of its depth."""
+def _edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
+    """As `_edge_pixels`, where each pixel has a noise (H, W) of its own, as a share of its depth."""
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         n, m = noise[a] ** 2, noise[b] ** 2
@@ -532,22 +534,22 @@ def _noisy_edges(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
         across = np.abs(w[a] - w[b]) > share * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
-    return _widened(edge, options.edge_margin)
+    return _dilate(edge, options.edge_margin)
 
 
-def _widened(edge: UInt8, margin: int) -> Bool:
+def _dilate(edge: UInt8, margin: int) -> Bool:
     size = 2 * margin + 1
     return cv2.dilate(edge, np.ones((size, size), np.uint8)) > 0
 
 
-def _with_shared(
+def _add_shared_error(
     variance: Float32, planes: Float32, shared: Float32 | None
 ) -> tuple[Float32, Float32 | None]:
     """Variances of planes where pixels also share errors: for alignments, and of one pixel."""
     if shared is None:
         return variance, None
     once = (shared * planes[..., 3] ** 2) ** 2
-    return variance + np.float32(_SHARE_ERROR) * once, variance + once
+    return variance + np.float32(_CORRELATED_PIXELS) * once, variance + once
 
 
 def _inverse(values: Float32, known: Bool) -> Float32:
@@ -562,18 +564,18 @@ def _projection(camera: Camera, step: int) -> Projection:
     return known[step]
 
 
-def _reduced(
+def _at_working_resolution(
     frame: RangeFrame, columns: int
 ) -> tuple[Projection, Float32, Float32 | None, Float32 | None]:
     """Grid, z, amplitude (or colour's) and the frame's own sigma of z at the working resolution."""
     z = frame.z
-    z = np.where(frame.valid & (z > _NEAREST) & (z < _FARTHEST), z, np.float32(0))
-    light = _light(frame)
+    z = np.where(frame.valid & (z > _MIN_DEPTH) & (z < _MAX_DEPTH), z, np.float32(0))
+    light = _amplitude(frame)
     sigma = _own_sigma(frame)
     step = 1
     while z.shape[1] > columns and z.shape[0] > 1:
         variance = z if sigma is None else sigma * sigma
-        halves = _halved(z, z if light is None else light, variance)
+        halves = _halve(z, z if light is None else light, variance)
         z = halves[0]
         light = None if light is None else halves[1]
         sigma = None if sigma is None else np.sqrt(halves[2])
@@ -585,7 +587,7 @@ def _reduced(
     return projection, z, light, sigma
 
 
-def _light(frame: RangeFrame) -> Float32 | None:
+def _amplitude(frame: RangeFrame) -> Float32 | None:
     """Amplitude, or without it the luminance of the colour; 0 where saturated or too dark.
 
     Colour is coded by a power of the light, which its logarithm turns into a factor.
@@ -596,7 +598,7 @@ def _light(frame: RangeFrame) -> Float32 | None:
     if frame.color_image is None or not frame.color_registered:
         return None
     grey = cv2.cvtColor(np.ascontiguousarray(frame.color_image), cv2.COLOR_RGB2GRAY)
-    seen = (grey >= _DARKEST) & (frame.color_image.max(-1) < _BRIGHTEST)
+    seen = (grey >= _MIN_LEVEL) & (frame.color_image.max(-1) < _MAX_LEVEL)
     return np.where(seen, grey, 0).astype(np.float32)
 
 
@@ -604,7 +606,7 @@ def _own_sigma(frame: RangeFrame) -> Float32 | None:
     """Sigma of z that the frame states, m; 0 where it does not."""
     if frame.sigma_image is None:
         return None
-    known = (frame.sigma_image > _LEAST_SIGMA) & (frame.sigma_image < _FARTHEST)
+    known = (frame.sigma_image > _MIN_SIGMA) & (frame.sigma_image < _MAX_DEPTH)
     # The noise is that of the range, along the ray.
     sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
     return np.asarray(sigma, np.float32)
@@ -623,7 +625,7 @@ def _shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
     return np.asarray(np.where(known, picked, 0) / np.sqrt(lengths2), np.float32)
 
 
-def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
+def _halve(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
     out = [np.empty((z.shape[0] // 2, z.shape[1] // 2), np.float32) for _ in range(3)]
     run_chunks(
         lambda a, b: halve(z, light, variance, _HALVING_JUMP, out[0], out[1], out[2], a, b),
@@ -633,7 +635,7 @@ def _halved(z: Float32, light: Float32, variance: Float32) -> list[Float32]:
     return out
 
 
-def _fitted(
+def _fit(
     w: Float32,
     rays: Float32,
     weight: Float32,
@@ -661,7 +663,7 @@ def _chunks(rows: int) -> int:
     return max(2, rows // _CHUNK_ROWS)
 
 
-def _near_edges(w: Float32, jump: float, margin: int) -> Bool:
+def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
     """Pixels within `margin` of a jump in depth by a share `jump`, or of a missing pixel.
 
     There a pixel mixes light of both sides, as far as the lens blurs.
@@ -671,7 +673,7 @@ def _near_edges(w: Float32, jump: float, margin: int) -> Bool:
         across = np.abs(w[a] - w[b]) > np.float32(min(jump, 0.9)) * np.maximum(w[a], w[b])
         edge[a] |= across
         edge[b] |= across
-    return _widened(edge, margin)
+    return _dilate(edge, margin)
 
 
 def _typical_noise(w: Float32, weight: Float32) -> float:

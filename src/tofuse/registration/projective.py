@@ -115,7 +115,7 @@ def points_of(view: PreparedView, stride: int) -> Float32:
     The points lie on the fitted surface, as the target's do: what smoothing does to a curved
     surface is then the same on both sides.
     """
-    return kernels.gather(view.rays, view.planes, view.plane_variance, view.photo, stride)
+    return kernels.gather(view.rays, view.planes, view.plane_variance, view.albedo, stride)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +259,7 @@ def align(
     T_world_predicted = np.ascontiguousarray(T_world_predicted)
     T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
     photometric = (
-        options.photometric and source.has_photo and all(t.view.has_photo for t in targets)
+        options.photometric and source.has_albedo and all(t.view.has_albedo for t in targets)
     )
     prior = np.array([options.prior_m] * 3 + [options.prior_rad] * 3)
     points = points_of(source, options.levels[0].stride)

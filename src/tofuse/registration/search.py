@@ -328,7 +328,7 @@ class Search:
         """Order candidates, after albedo has placed the best ones where geometry alone can't."""
         source, target, options = self.source, self.target, self.options
         distinct = _distinct(found, options)
-        if not (source.has_photo and target.has_photo):
+        if not (source.has_albedo and target.has_albedo):
             return distinct
         best, rest = distinct[: options.photo_candidates], distinct[options.photo_candidates :]
         targets = [Target(target, np.eye(4))]
@@ -378,7 +378,7 @@ def _prepare(view: PreparedView) -> _View:
     grid = np.where(known[..., None], np.dstack([abc / length[..., None], 1 / length]), 0)
     grid[..., 3] -= np.where(inside & ~known, nearest_depth(view)[v, u], 0)
     seen = ViewPoints.of(view, _SEEN)
-    light = _around(np.where(known, view.photo[v, u, 0], np.nan), _BLUR / spacing)
+    light = _around(np.where(known, view.albedo[v, u, 0], np.nan), _BLUR / spacing)
     at = seen.points[:, :2] / seen.points[:, 2:] - (x[0], y[0])
     j, i = (at / spacing).round().astype(int).T
     i, j = np.clip(i, 0, len(y) - 1), np.clip(j, 0, len(x) - 1)

@@ -141,7 +141,7 @@ def patches(
     stride = max(1, round(float(np.sqrt(rows * columns / _PIXELS))))
     across, down = options.tiles
     photometric = (
-        alignment.photometric and source.has_photo and all(t.view.has_photo for t in targets)
+        alignment.photometric and source.has_albedo and all(t.view.has_albedo for t in targets)
     )
     some = source.planes[stride // 2 :: stride, stride // 2 :: stride, 3]
     some = some[some > 0]
@@ -158,7 +158,7 @@ def patches(
             source.rays,
             source.planes,
             source.plane_variance,
-            source.photo,
+            source.albedo,
             view.target,
             view.projection.lookup,
             view.projection.frame,

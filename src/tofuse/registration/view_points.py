@@ -34,7 +34,7 @@ class ViewPoints:
     @classmethod
     def of(cls, view: PreparedView, count: int) -> ViewPoints:
         """Take about `count` pixels that have a plane, evenly over the image."""
-        there = view.planar_share * view.z.size
+        there = view.planar_fraction * view.z.size
         packed = points_of(view, max(1, round(float(np.sqrt(there / count)))))
         points = np.ascontiguousarray(packed[:, POINT : POINT + 3])
         return cls(

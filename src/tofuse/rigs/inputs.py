@@ -36,7 +36,7 @@ class Camera:
         moving camera fit.
         """
         config = fitted(from_method("default", "range"), self.recording)
-        kept = tuple(c for c in config.corrections if not c.on_trial)
+        kept = tuple(c for c in config.corrections if not c.needs_trial)
         return replace(config, corrections=kept)
 
     def images(self, count: int) -> list[RangeFrame]:

@@ -26,7 +26,7 @@ from tofuse.arrays import Complex128, Float32, Float64
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import W, X, Y
 from tofuse.kernels.threads import run_chunks
-from tofuse.sensor.multipath_map import Around, LightMap
+from tofuse.sensor.multipath_map import OffscreenCells, ReflectorMap
 from tofuse.sensor.multipath_surfaces import (
     Surfaces,
     block_nodes,
@@ -40,11 +40,11 @@ Bounces = Literal["one", "all"]
 # A pixel this share of its depth off a plane no longer belongs to it.
 _OFF_PLANE = 0.03
 # Pixels with more indirect light than direct are measured too badly to be saved.
-_MOST = 1.0
+_MAX_RATIO = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class LightImage:
+class ToFImage:
     """What is known of an image.
 
     Attributes
@@ -53,7 +53,7 @@ class LightImage:
         (H, W) float32 z depth in m, 0 where invalid.
     rays
         (H, W, 2) float32 of the pixels, x/z and y/z; may be NaN where z is 0.
-    light
+    amplitude
         (H, W) float32 raw amplitude in counts, as it fell on the sensor; 0 where there is none.
     period_m
         Range after which the phase repeats, c / (2 f).
@@ -61,12 +61,12 @@ class LightImage:
 
     z: Float32
     rays: Float32
-    light: Float32
+    amplitude: Float32
     period_m: float
 
 
 @dataclass(frozen=True, eq=False)
-class Interference:
+class MultipathEstimate:
     """What indirect light does to an image.
 
     Attributes
@@ -88,7 +88,7 @@ class Interference:
 
 
 @dataclass(frozen=True)
-class Reflections:
+class MultipathModel:
     """How the indirect light of an image is computed.
 
     Attributes
@@ -110,11 +110,11 @@ class Reflections:
 
     def solve(
         self,
-        image: LightImage,
+        image: ToFImage,
         gain: float,
-        known: LightMap | None = None,
+        known: ReflectorMap | None = None,
         T_world_camera: Float64 | None = None,
-    ) -> Interference | None:
+    ) -> MultipathEstimate | None:
         """Find the indirect light in an image; None where there is nothing to compute it from.
 
         Parameters
@@ -127,10 +127,10 @@ class Reflections:
             (4, 4) pose of the camera in the frame of `known`; without it, nothing is known.
         """
         step = self._step(image)
-        nodes = block_nodes(image.z, image.rays, image.light, step)
-        around = Around.of(image.rays, self.lamp)
+        nodes = block_nodes(image.z, image.rays, image.amplitude, step)
+        around = OffscreenCells.of(image.rays, self.lamp)
         if known is not None and T_world_camera is not None:
-            around.recall(known, T_world_camera)
+            around.add_known(known, T_world_camera)
         found = self._at_nodes(nodes, image.period_m, gain, around, at_edges=True)
         if found is None:
             return None
@@ -143,15 +143,15 @@ class Reflections:
             ),
             len(z),
         )
-        return Interference(z, factor, surfaces, step)
+        return MultipathEstimate(z, factor, surfaces, step)
 
-    def bright(self, image: LightImage) -> float:
+    def bright(self, image: ToFImage) -> float:
         """Counts at 1 m that a tenth of the surfaces exceeds, faced head-on; 0 if none is seen."""
-        nodes = block_nodes(image.z, image.rays, image.light, self._step(image))
+        nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         fit_planes(nodes)
         return Surfaces.of(nodes, np.ones(nodes.shape[:2])).bright()
 
-    def flatness(self, image: LightImage, gain: float, window: int = 4) -> float:
+    def flatness(self, image: ToFImage, gain: float, window: int = 4) -> float:
         """How flat the surfaces become with a gain: the number of nodes on the plane around them.
 
         Parameters
@@ -159,9 +159,9 @@ class Reflections:
         window
             Radius in nodes around which planes are fitted.
         """
-        nodes = block_nodes(image.z, image.rays, image.light, self._step(image))
+        nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         measured = ray_ranges(nodes)
-        around = Around.of(image.rays, self.lamp)
+        around = OffscreenCells.of(image.rays, self.lamp)
         found = self._at_nodes(nodes, image.period_m, gain, around, at_edges=False)
         if found is None:
             return 0.0
@@ -169,7 +169,7 @@ class Reflections:
         fit_planes(nodes)
         return kernels.flat_nodes(nodes, window, 0.1, 0.003)
 
-    def _step(self, image: LightImage) -> int:
+    def _step(self, image: ToFImage) -> int:
         return max(1, round(image.z.shape[1] / self.columns))
 
     def _at_nodes(
@@ -177,7 +177,7 @@ class Reflections:
         nodes: Float64,
         period_m: float,
         gain: float,
-        around: Around,
+        around: OffscreenCells,
         *,
         at_edges: bool,
     ) -> tuple[Float64, Complex128, Surfaces] | None:
@@ -211,7 +211,7 @@ class Reflections:
             sources = np.concatenate(
                 [visible_sources(surfaces, radiosity), around.sources(surfaces, gain, k)]
             )
-            ratio = _arriving(surfaces, sources, k)
+            ratio = _indirect_ratio(surfaces, sources, k)
             shift = np.minimum(np.angle(1 + ratio) / (2 * k), measured / 2)
         return shift, ratio, surfaces
 
@@ -223,7 +223,7 @@ def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:
     nodes[..., W] = np.where(seen, length / np.where(seen, measured - shift, 1), 0)
 
 
-def _arriving(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex128:
+def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex128:
     """I / D (Hn, Wn) at the nodes of the sources' light; 0 where no plane fits."""
     good = surfaces.good
     receivers = np.ascontiguousarray(
@@ -239,7 +239,7 @@ def _arriving(surfaces: Surfaces, sources: Float32, wave_number: float) -> Compl
     light = (total[0] + 1j * total[1]) * np.exp(-1j * wave_number * surfaces.range_m[good])
     ratio = np.zeros(good.shape, complex)
     ratio[good] = light / surfaces.lit[good]
-    ratio /= np.maximum(1, np.abs(ratio) / _MOST)
+    ratio /= np.maximum(1, np.abs(ratio) / _MAX_RATIO)
     return ratio
 
 
@@ -258,7 +258,7 @@ class GainEstimator:
         How the light is computed; the estimate uses half as many columns.
     """
 
-    reflections: Reflections
+    reflections: MultipathModel
     _gains: Float64 = field(default_factory=lambda: np.zeros(0))
     _flat: Float64 = field(default_factory=lambda: np.zeros(0))
     _bright: list[float] = field(default_factory=list)
@@ -283,13 +283,13 @@ class GainEstimator:
         weight = np.exp(score - score.max())
         return float(np.exp((weight * log).sum() / weight.sum()))
 
-    def add(self, image: LightImage) -> None:
+    def add(self, image: ToFImage) -> None:
         """Look at the next image of a recording, or pass it over."""
         turn = self._frames
         self._frames += 1
         if len(self._bright) >= self.MOST or (turn >= self.FIRST and turn % self.EVERY):
             return
-        coarse = Reflections(
+        coarse = MultipathModel(
             max(8, self.reflections.columns // 2),
             self.reflections.iterations,
             self.reflections.lamp,

@@ -15,7 +15,7 @@ from tofuse.kernels.multipath import PATCH
 from tofuse.sensor.multipath_surfaces import FALLOFF, LEAST_COSINE, Surfaces
 
 # The lamp is taken to light no wider than this.
-_WIDEST_LAMP = np.pi / 3
+_MAX_LAMP_ANGLE = np.pi / 3
 # Cells of the directions around the image, along its width.
 _CELLS = 12
 # Of the nodes along an image's border, this many rows and columns are taken to go on beyond it.
@@ -26,10 +26,10 @@ _GROWTH = np.array([0.3, 3.0])
 # of the depth; and never more than so many.
 _ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
 # A surface is remembered where it was lit no more askance than this.
-_LEAST_LIT = 0.25
+_MIN_INCIDENCE = 0.25
 
 
-class LightMap:
+class ReflectorMap:
     """What a camera has seen of the surfaces around it, as sources of light.
 
     Views are kept spaced by the motion of the camera, and the newest ones only.
@@ -68,7 +68,7 @@ class LightMap:
         )
         cosine = -(points * normals).sum(-1) / surfaces.range_m[pick]
         table = np.concatenate([points, normals, albedo[:, None], cosine[:, None]], 1)
-        table = table[cosine > _LEAST_LIT]
+        table = table[cosine > _MIN_INCIDENCE]
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
         # einsum, not a matrix product: BLAS may sum differently with more threads.
         table[:, :3] = np.einsum("nc,dc->nd", table[:, :3], R) + t
@@ -79,7 +79,7 @@ class LightMap:
 
 
 @dataclass(eq=False)
-class Around:
+class OffscreenCells:
     """The directions around an image that the lamp lights as well, in a grid of cells.
 
     Attributes
@@ -103,7 +103,7 @@ class Around:
     albedo: Float64
 
     @classmethod
-    def of(cls, rays: Float32, lamp: float) -> Around:
+    def of(cls, rays: Float32, lamp: float) -> OffscreenCells:
         """Lay the grid around an image, whose rays (H, W, 2) are x/z and y/z, NaN where unknown.
 
         Parameters
@@ -118,7 +118,7 @@ class Around:
         cells = _cells(left - x, top - y, right + x, bottom + y, lamp)
         return cls(*cells, np.zeros((len(cells[1]), 3)), np.zeros(len(cells[1])))
 
-    def recall(self, known: LightMap, T_world_camera: Float64) -> None:
+    def add_known(self, known: ReflectorMap, T_world_camera: Float64) -> None:
         """Set the planes of the cells that show a surface of the map."""
         if len(self.rays) and len(known.patches):
             kernels.project_patches(
@@ -174,7 +174,7 @@ def _cells(
     count = np.array([_CELLS, max(1, round(_CELLS * height / width))])
     pitch = (high - low) / count
     corner = float(np.arctan(np.sqrt(np.maximum(low**2, high**2).sum())))
-    limit = float(np.tan(min(lamp * corner, _WIDEST_LAMP)))
+    limit = float(np.tan(min(lamp * corner, _MAX_LAMP_ANGLE)))
     first, last = np.floor((-limit - low) / pitch), np.ceil((limit - low) / pitch)
     i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
     gi, gj = (g.ravel() for g in np.meshgrid(i, j))

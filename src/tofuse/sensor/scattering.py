@@ -1,14 +1,14 @@
 """Light that the lens scatters over the image, and the range bias that it makes.
 
-Between lens and sensor a share of the light is reflected to and fro, and falls on other pixels:
+Between lens and sensor a fraction of the light is reflected to and fro, and falls on other pixels:
 a bright, near object pulls the range of all others towards its own, in a pattern that is fixed to
-the image. What a pixel measures, as a phasor (amplitude and phase), is its own light plus a blurred
+the image. What a pixel measures, as a phasor (amplitude and phase), is its own light plus a blur
 image of all light (Mure-Dubois and Huegli 2007, who take the blur for a sum of Gaussians, too)::
 
     M = D + sum_i s_i G_i * D
 
-The shares s_i can be seen where a thing moves before a background that stands still: whatever of
-the background's light follows the blurred image of the thing was scattered.
+The fractions s_i can be seen where a thing moves before a background that stands still: whatever of
+the background's light follows the blur image of the thing was scattered.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from tofuse.arrays import Bool, Complex128, Float64
 
 # The blur is computed on an image of about so many columns.
 _COLUMNS = 44
-# Fixed-point steps that take the scattered light off: each is right to one more power of its share.
+# Fixed-point steps that take the scattered light off: each is right to one more power of its fraction.
 _STEPS = 2
 # Fewest still pixels to learn from.
-_LEAST_PIXELS = 200
-# Least chi^2 that scattering must explain to be believed: neighbouring pixels share some noise.
-_LEAST_CHI2 = 50.0
-# Larger shares than this in all are another effect.
-_MOST_SHARE = 0.2
+_MIN_PIXELS = 200
+# Least chi^2 that scattering must explain to be believed: neighbouring pixels fraction some noise.
+_MIN_CHI2 = 50.0
+# Larger fractions than this in all are another effect.
+_MAX_FRACTION = 0.2
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class Scattering:
     Attributes
     ----------
     widths
-        Standard deviations of the Gaussians, as shares of the image's width.
-    shares
+        Standard deviations of the Gaussians, as fractions of the image's width.
+    fractions
         Share of the light that goes into each.
     """
 
     widths: tuple[float, ...]
-    shares: tuple[float, ...]
+    fractions: tuple[float, ...]
 
     def removed(self, measured: Complex128) -> Complex128:
         """Return the measured light (H, W) without what was scattered onto each pixel.
@@ -54,25 +54,25 @@ class Scattering:
         What is scattered varies slowly over the image, so it is computed on a coarse grid.
         """
         step = _coarse_step(measured.shape[1], min(self.widths))
-        coarse = _reduced(measured, step)
+        coarse = _reduce(measured, step)
         own, scattered = coarse, np.zeros_like(coarse)
         for _ in range(_STEPS):
             scattered = np.zeros_like(coarse)
-            for width, share in zip(self.widths, self.shares, strict=True):
-                if share:
-                    scattered += share * _blurred(own, width * measured.shape[1] / step)
+            for width, fraction in zip(self.widths, self.fractions, strict=True):
+                if fraction:
+                    scattered += fraction * _blur(own, width * measured.shape[1] / step)
             own = coarse - scattered
-        return measured - _enlarged(scattered, step, measured.shape)
+        return measured - _enlarge(scattered, step, measured.shape)
 
 
-def blurred(light: Complex128, width: float) -> Complex128:
+def blur(light: Complex128, width: float) -> Complex128:
     """Blur an image (H, W) by a Gaussian of `width` times its width; beyond it there is no light.
 
     Fine detail is lost in a wide blur, so that it is computed on a coarse grid.
     """
     step = _coarse_step(light.shape[1], width)
-    small = _blurred(_reduced(light, step), width * light.shape[1] / step)
-    return _enlarged(small, step, light.shape)
+    small = _blur(_reduce(light, step), width * light.shape[1] / step)
+    return _enlarge(small, step, light.shape)
 
 
 def _coarse_step(columns: int, width: float) -> int:
@@ -80,7 +80,7 @@ def _coarse_step(columns: int, width: float) -> int:
     return max(1, min(columns // _COLUMNS, int(width * columns / 2)))
 
 
-def _reduced(light: Complex128, step: int) -> Float64:
+def _reduce(light: Complex128, step: int) -> Float64:
     """Block means (h, w, 2): real and imaginary part."""
     rows, columns = light.shape
     h, w = -(-rows // step), -(-columns // step)
@@ -91,25 +91,25 @@ def _reduced(light: Complex128, step: int) -> Float64:
     return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.float64)
 
 
-def _blurred(small: Float64, sigma: float) -> Float64:
+def _blur(small: Float64, sigma: float) -> Float64:
     kernel = cv2.getGaussianKernel(2 * int(np.ceil(3 * sigma)) + 1, sigma)
     border = cv2.BORDER_CONSTANT
     return np.asarray(cv2.sepFilter2D(small, cv2.CV_64F, kernel, kernel, borderType=border))
 
 
-def _enlarged(small: Float64, step: int, shape: tuple[int, ...]) -> Complex128:
+def _enlarge(small: Float64, step: int, shape: tuple[int, ...]) -> Complex128:
     size = (small.shape[1] * step, small.shape[0] * step)
     large = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
     return np.ascontiguousarray(large).view(np.complex128)[..., 0]
 
 
-def learn_shares(
+def estimate_fractions(
     light: Complex128, source: Bool, still: Bool, widths: tuple[float, ...]
 ) -> Float64:
-    """Find the shares of light that a lens scatters from what moves onto what does not.
+    """Find the fractions of light that a lens scatters from what moves onto what does not.
 
-    Of each still pixel the change over time is compared with that of the blurred images of what
-    moves (least squares, no share below 0). What changes all still pixels alike, the exposure or
+    Of each still pixel the change over time is compared with that of the blur images of what
+    moves (least squares, no fraction below 0). What changes all still pixels alike, the exposure or
     the sensor's temperature, is taken off from both.
 
     Parameters
@@ -123,11 +123,11 @@ def learn_shares(
 
     Returns
     -------
-    The share of each width; all 0 where nothing is scattered, or nothing can be told.
+    The fraction of each width; all 0 where nothing is scattered, or nothing can be told.
     """
     none = np.zeros(len(widths))
     still = still & (light != 0).all(0)
-    if np.count_nonzero(still) < _LEAST_PIXELS or len(light) < 3:
+    if np.count_nonzero(still) < _MIN_PIXELS or len(light) < 3:
         return none
     seen = light[:, still]
     mean = seen.mean(0)
@@ -139,7 +139,7 @@ def learn_shares(
         return np.concatenate([change.real.ravel(), change.imag.ravel()])
 
     moving = np.where(source, light, 0)
-    images = [np.stack([blurred(image, width)[still] for image in moving]) for width in widths]
+    images = [np.stack([blur(image, width)[still] for image in moving]) for width in widths]
     A = np.stack([own_change(image) for image in images], 1)
     b = own_change(seen)
     # einsum, not a matrix product: BLAS may sum differently with more threads.
@@ -147,9 +147,9 @@ def learn_shares(
     if not np.diag(H).all():
         return none
     scale = 1 / np.sqrt(np.diag(H))
-    shares = nnls(H * np.outer(scale, scale), g * scale)[0] * scale
-    explained = float(2 * (shares * g).sum() - shares @ H @ shares)
+    fractions = nnls(H * np.outer(scale, scale), g * scale)[0] * scale
+    explained = float(2 * (fractions * g).sum() - fractions @ H @ fractions)
     noise = float(np.einsum("n,n->", b, b)) - explained
-    if not explained * len(b) > _LEAST_CHI2 * noise or shares.sum() > _MOST_SHARE:
+    if not explained * len(b) > _MIN_CHI2 * noise or fractions.sum() > _MAX_FRACTION:
         return none
-    return np.asarray(shares)
+    return np.asarray(fractions)

@@ -33,13 +33,13 @@ from tofuse.kernels.unwrap import pass_messages
 _GLOSSY = 0.01
 # Slopes are told from blocks so far on either side, of a phase averaged over so many: far surfaces
 # are noisy. Less than the last cosine of incidence is not believed.
-_REACH, _WIDE, _STEEPEST = 2, 5, 0.25
-_MOVES = 100
+_REACH, _WIDE, _MIN_COSINE = 2, 5, 0.25
+_MAX_MOVES = 100
 # Neighbours on one surface differ by less than this share of the period, more than so many of the
 # eight: at random a pixel has so many once in a hundred times (binomial, chance 0.2 each).
-_BESIDE, _TOGETHER = 0.1, 0.5
+_SAME_SURFACE, _MIN_AGREEING = 0.1, 0.5
 # Fewer neighbours than this prove nothing.
-_LEAST_BESIDE = 3
+_MIN_NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
@@ -52,17 +52,17 @@ class UnwrapOptions:
         Most periods that a surface lies beyond the first.
     albedo, spread
         Albedos are log-normal about the first, with the second as the logarithm's deviation.
-    albedo_most
+    max_albedo_cost
         Most that the albedo of one block may cost.
-    nearness
+    wrap_cost
         What each period costs: without anything else nothing is moved.
-    alone
+    albedo_weight
         Share of these costs that counts: blocks of one surface are dark or bright together.
     scale
         Difference of neighbours that costs 1, as a share of the period.
-    difference_most
+    max_difference_cost
         Most that a difference may cost: that of a jump.
-    entry
+    min_entry
         Surfaces are moved only if at least this share of their rim goes on across the period:
         dark ones that nothing leads to stay.
     columns
@@ -74,12 +74,12 @@ class UnwrapOptions:
     periods: int = 2
     albedo: float = 0.5
     spread: float = 0.6
-    albedo_most: float = 4.0
-    nearness: float = 0.1
-    alone: float = 0.1
+    max_albedo_cost: float = 4.0
+    wrap_cost: float = 0.1
+    albedo_weight: float = 0.1
     scale: float = 0.05
-    difference_most: float = 3.0
-    entry: float = 0.05
+    max_difference_cost: float = 3.0
+    min_entry: float = 0.05
     columns: int = 88
     iterations: int = 60
 
@@ -87,7 +87,7 @@ class UnwrapOptions:
 _DEFAULT = UnwrapOptions()
 
 
-def white_light(light: Float32, radial_range: Float32, valid: Bool) -> float:
+def white_amplitude(light: Float32, radial_range: Float32, valid: Bool) -> float:
     """Return the raw light of a white surface at 1 m as the brightest of an image tell it, or 0.
 
     Wrapped pixels look too dark, not too bright, so they do no harm unless there is nothing else.
@@ -123,8 +123,10 @@ def on_surface(radial_range: Float32, period_m: float) -> Bool:
             away = ranges[at] - radial_range
             away -= period_m * np.rint(away / period_m)
             beside += known[at]
-            alike += known[at] & (np.abs(away) < _BESIDE * period_m)
-    return np.asarray(seen & (beside >= _LEAST_BESIDE) & (alike > _TOGETHER * beside), np.bool_)
+            alike += known[at] & (np.abs(away) < _SAME_SURFACE * period_m)
+    return np.asarray(
+        seen & (beside >= _MIN_NEIGHBOURS) & (alike > _MIN_AGREEING * beside), np.bool_
+    )
 
 
 def count_periods(
@@ -146,7 +148,7 @@ def count_periods(
     period_m
         Range after which the measurement repeats.
     white
-        Light of a white surface at 1 m, see `white_light`; 0 where that is not known.
+        Light of a white surface at 1 m, see `white_amplitude`; 0 where that is not known.
     pitch
         Angle between neighbouring pixels, rad.
     options
@@ -158,21 +160,21 @@ def count_periods(
     side = max(1, round(radial_range.shape[1] / options.columns))
     surfaces = np.where(on_surface(radial_range, period_m), radial_range, np.float32(0))
     blocks = _Blocks.of(surfaces, light, period_m, side)
-    unary = _unlikely(blocks, period_m, white, pitch * side, options)
+    unary = _albedo_cost(blocks, period_m, white, pitch * side, options)
     messages = np.zeros((4, *unary.shape), np.float32)
 
     def renew(start: int, stop: int, parity: int) -> None:
         pass_messages(
             blocks.range_m, blocks.valid, unary, period_m, options.scale * period_m,
-            options.difference_most, 1.0, start, stop, parity, messages,
+            options.max_difference_cost, 1.0, start, stop, parity, messages,
         )  # fmt: skip
 
     for step in range(2 * options.iterations):
         run_chunks(partial(renew, parity=step % 2), len(unary))
     best = np.argmin(unary + messages.sum(0), axis=2)
     best = _with_surfaces_moved(blocks, unary, best, period_m, options)
-    best = _entered(blocks, best, period_m, options)
-    return _of_pixels(surfaces, blocks, best, period_m, side, options.periods)
+    best = _without_unentered(blocks, best, period_m, options)
+    return _upsample(surfaces, blocks, best, period_m, side, options.periods)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,26 +212,26 @@ def _range_of(real: Float64, imaginary: Float64, period: float) -> Float32:
     return (angle * period / (2 * np.pi)).astype(np.float32)
 
 
-def _unlikely(
+def _albedo_cost(
     blocks: _Blocks, period: float, white: float, pitch: float, options: UnwrapOptions
 ) -> Float32:
     """Cost (h, w, K) of each number of periods by the albedo that it means."""
     phase = 2 * np.pi * blocks.range_m.astype(float) / period
     real = uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WIDE)
     imaginary = uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WIDE)
-    slope = _steps(_range_of(real, imaginary, period), period) / pitch
+    slope = _slope(_range_of(real, imaginary, period), period) / pitch
     cost = np.empty((*blocks.range_m.shape, options.periods + 1), np.float32)
     for k in range(options.periods + 1):
         beyond = np.maximum(blocks.range_m + k * period, 1e-6)
         # A slanted surface is darker; how slanted it is depends on how large its pixels are.
-        cosine = np.maximum(1 / np.sqrt(1 + (slope / beyond) ** 2), _STEEPEST)
+        cosine = np.maximum(1 / np.sqrt(1 + (slope / beyond) ** 2), _MIN_COSINE)
         albedo = np.maximum(blocks.light * beyond**2 / (white * cosine), 1e-6)
         unlikely = 0.5 * (np.log(albedo / options.albedo) / options.spread) ** 2
-        cost[..., k] = np.minimum(unlikely, options.albedo_most) + options.nearness * k
-    return np.float32(options.alone) * cost
+        cost[..., k] = np.minimum(unlikely, options.max_albedo_cost) + options.wrap_cost * k
+    return np.float32(options.albedo_weight) * cost
 
 
-def _steps(range_m: Float32, period: float) -> Float32:
+def _slope(range_m: Float32, period: float) -> Float32:
     """Change (h, w) of the range to the next block, over the period where that is the shorter."""
     squares = np.zeros(range_m.shape, np.float32)
     for axis in (0, 1):
@@ -265,13 +267,13 @@ def _with_surfaces_moved(
 
     def jump(difference: Float64) -> Float64:
         away = np.abs(difference) / (options.scale * period)
-        return np.minimum(away, options.difference_most)
+        return np.minimum(away, options.max_difference_cost)
 
-    for _ in range(_MOVES):
+    for _ in range(_MAX_MOVES):
         at = range_m + periods * period
         difference = at[b] - at[a]
         now = jump(difference)
-        held = now < options.difference_most
+        held = now < options.max_difference_cost
         graph = coo_array((np.ones(held.sum()), (a[held], b[held])), (index.size, index.size))
         count, piece = connected_components(graph, directed=False)
         cut = piece[a] != piece[b]
@@ -302,7 +304,7 @@ def _with_surfaces_moved(
     return periods.reshape(best.shape)
 
 
-def _entered(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
+def _without_unentered(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
     """Put back what was moved though no surface leads into it across the period."""
     moved = (best > 0) & blocks.valid
     pieces, count = label(moved)
@@ -316,11 +318,11 @@ def _entered(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions)
             goes_on = edge & (np.abs(far - near) < options.scale * period)
             rim += np.bincount(pieces[inside][edge], minlength=count + 1)
             entries += np.bincount(pieces[inside][goes_on], minlength=count + 1)
-    kept = entries > np.maximum(options.entry * rim, 2)
+    kept = entries > np.maximum(options.min_entry * rim, 2)
     return np.where(kept[pieces], best, 0)
 
 
-def _of_pixels(
+def _upsample(
     radial_range: Float32,
     blocks: _Blocks,
     best: Intp,
