@@ -1,4 +1,4 @@
-"""The interface of a correction: what changes a view before it is filtered."""
+"""The interface of corrections, which change measurements before they are filtered."""
 
 from __future__ import annotations
 
@@ -10,59 +10,60 @@ from tofuse.recordings.frames import Frame
 
 
 class Corrector(Protocol):
-    """A correction at work on one recording."""
+    """A correction in use on one recording."""
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
-        """Return the corrected view; the same one where there is nothing to correct it by.
+        """Return the corrected view, or the view itself if it can't be corrected.
 
-        Points stay where they are in the image: what is valid stays valid, and nothing else
-        becomes so.
-
-        Parameters
-        ----------
-        T_world_camera
-            (4, 4) where the camera is expected; None where that is not known.
-        """
-        ...
-
-    def is_independent(self, frame: Frame) -> bool:
-        """Whether `apply` asks for nothing but this frame: then it may come out of turn.
-
-        Neither frames before it nor where the camera is then play a part, and nothing is kept.
-        """
-        return False
-
-    def add_pose(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Hear where the view that was corrected last has been found to be.
+        The mask of valid pixels is unchanged.
 
         Parameters
         ----------
         frame
-            What the filters left of it: what stands still in the world.
+            The view.
         T_world_camera
-            (4, 4), in the same frame as what `apply` is given.
+            (4, 4) predicted pose; None if unknown.
+        """
+        ...
+
+    def is_independent(self, frame: Frame) -> bool:
+        """Whether `apply` depends on this frame only, neither on earlier ones nor on the pose.
+
+        Such frames may be corrected in any order.
+        """
+        return False
+
+    def add_pose(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Receive the estimated pose of the view that was corrected last.
+
+        Parameters
+        ----------
+        frame
+            The filtered view: points of the static scene.
+        T_world_camera
+            (4, 4), in the same world frame as in `apply`.
         """
         return
 
     def reset_poses(self) -> None:
-        """Hear that poses are in another frame from here on: where surfaces were is not known."""
+        """Forget positions of surfaces, as poses are in another world frame from here on."""
         return
 
 
 class Correction(Protocol):
-    """One way of making measurements better.
+    """Compensation of one systematic error of measurements.
 
     Attributes
     ----------
     takes
-        Kinds of view it works on, or passes through: "range", "cloud".
+        Kinds of view it accepts: "range", "cloud". It may pass some of them through unchanged.
     needs_fit
-        Whether it can learn from frames of the whole recording first.
+        Whether parameters are to be estimated from frames of the recording first.
     needs_trial
-        Whether it may bend what is straight where the error that it takes off is not there, so
-        that it stays only where views show this error.
+        Whether it introduces errors where the error that it models is absent, so that it is used
+        only if views show evidence of it.
     disabled
-        Whether a trial has found that it is better left out.
+        Whether a trial found no such evidence.
     """
 
     part_kind: ClassVar[str] = "correction"
@@ -70,36 +71,36 @@ class Correction(Protocol):
 
     @property
     def needs_fit(self) -> bool:
-        """Whether it can learn from frames of the whole recording, with `fit`, beforehand."""
+        """Whether `fit` is to be called with frames of the recording first."""
         return False
 
     @property
     def needs_trial(self) -> bool:
-        """Whether a trial on the recording (`pipeline.trial`) is to decide if it stays."""
+        """Whether a trial on the recording (`pipeline.trial`) decides if it is used."""
         return False
 
     @property
     def disabled(self) -> bool:
-        """Whether it changes nothing, as views did not show in a trial what it corrects."""
+        """Whether it changes nothing, as a trial found no evidence of the error."""
         return False
 
     def after_trial(
         self, helps: bool, strength: float = float("nan"), error: float = float("inf")
     ) -> Correction:
-        """Return the correction as it is after a trial.
+        """Return the correction with the outcome of a trial.
 
         Parameters
         ----------
         helps
-            Whether it is to be applied.
+            Whether it is to be used.
         strength, error
-            Share of the predicted error that views show, and its standard error; NaN or inf where
-            too little could be compared.
+            Fraction of the predicted error that is present, and its standard error; NaN and
+            infinity if too little could be compared.
         """
         return self
 
     def fit(self, frames: Sequence[Frame]) -> Correction:
-        """Return the correction with what it has learnt from frames spread over a recording.
+        """Return the correction with parameters estimated from frames sampled over a recording.
 
         Parameters
         ----------
@@ -109,5 +110,5 @@ class Correction(Protocol):
         return self
 
     def start(self) -> Corrector:
-        """Begin a recording, about which the correction may learn from its frames, in order."""
+        """Return a corrector for one recording, to be applied to its frames in order."""
         ...

@@ -1,4 +1,4 @@
-"""Correct errors of a camera that are known: its focal length, and an offset of its ranges."""
+"""Correct known errors of a camera: its focal length, and an offset of its ranges."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 
-# More is no error of a camera, but another camera.
+# Larger values indicate a wrong camera, not an error.
 _MOST_FOCAL, _MOST_OFFSET_M = 0.5, 1.0
 
 
 @part("correction", "camera-errors")
 @dataclass(frozen=True)
 class CameraErrors(Correction):
-    """Put points where they are, if the camera errs like this.
+    """Correct the focal length and the range offset of a camera.
 
     Attributes
     ----------
     focal
-        Share by which points are too near to the optical axis: the true focal length is
-        1 / (1 + focal) of the stated one.
+        Relative correction of the ray coordinates: the true focal length is 1 / (1 + focal) of the
+        stated one.
     offset_m
         Added to all ranges, m.
     """
@@ -49,15 +49,15 @@ class CameraErrors(Correction):
         return _Corrector(self)
 
     def and_then(self, other: CameraErrors) -> CameraErrors:
-        """Return what is wrong with the camera if this is, and `other` with what is left."""
+        """Return the composition of this correction with `other`, applied after it."""
         focal = self.focal + other.focal + self.focal * other.focal
         return CameraErrors(focal, self.offset_m + other.offset_m)
 
     @classmethod
     def made_with(cls, config: Mapping[str, Any]) -> tuple[Corrector, ...]:
-        """Return what put the camera of a result right, by its configuration as plain data.
+        """Return the camera corrections in a result's configuration (plain data).
 
-        Of all that is corrected it alone moves pixels over the surface.
+        They are the only corrections that change the rays of pixels.
         """
         return tuple(
             cls(item["focal"], item["offset_m"]).start()

@@ -1,4 +1,4 @@
-"""Take the light out of a view that came by way of other surfaces."""
+"""Compensation of multipath: light that reaches a pixel by way of other surfaces."""
 
 from __future__ import annotations
 
@@ -26,38 +26,38 @@ from tofuse.sensor.multipath_map import ReflectorMap
 @part("correction", "multipath", label="validated")
 @dataclass(frozen=True)
 class Multipath(Correction):
-    """Compensate the light that surfaces reflect onto each other (Fuchs 2010), see `sensor`.
+    """Compensate the light that surfaces reflect onto each other (Fuchs 2010).
 
-    Corners are no longer rounded, and floors and walls lie where they are. Works on cameras of
-    one modulation frequency that record amplitude; other views are passed on as they are.
+    See `tofuse.sensor.multipath`. Works on cameras with one modulation frequency that record
+    amplitude; other views are passed through.
 
     Attributes
     ----------
     gain
-        Counts of raw amplitude of a white wall (albedo 1) at 1 m in the image's centre; for
-        range-compensated amplitude, of a white wall anywhere. None: found from the recording.
+        Raw amplitude, in counts, of a white wall (albedo 1) at 1 m on the optical axis; for
+        range-compensated amplitude, of a white wall anywhere. None: estimated from the recording.
     period_m
-        Range after which the phase repeats; None: as the frame says.
+        Ambiguity range; None: that of the frame.
     bounces
-        "one": light by way of one other surface; "all": by way of any number.
+        "one": light reflected by one other surface; "all": by any number.
     iterations
-        Times that the light is computed, from surfaces corrected by the time before.
+        Number of fixed-point iterations of multipath and surfaces.
     columns
-        Blocks of pixels along the image's width for which the light is computed.
+        Blocks of pixels along the image's width for which multipath is computed.
     lamp
-        Angle up to which the lamp lights, relative to that of the image's corner. OffscreenCells the image
-        surfaces are taken to go on.
+        Illumination angle relative to that of the image's corner. Surfaces are extrapolated up to
+        there.
     relative_sigma
-        Standard deviation of the correction, as a share of it; neighbouring pixels share its
-        error.
+        Standard deviation of the correction, as a fraction of it; its error is correlated between
+        pixels.
     trial
-        Apply it only where overlapping views of the recording clearly disagree as it predicts:
-        where there is no such light, it bends what is straight. A gain that is given is trusted.
+        Whether it is applied only if overlapping views disagree as it predicts: without multipath
+        it bends flat surfaces. Not needed with a given gain.
     applied
-        Whether anything is corrected: what a trial decides.
+        Whether anything is corrected, as decided by the trial.
     seen
-        What a trial found: the share of the predicted disagreement that is there, and its standard
-        error; None where there was none, or too little to compare.
+        Outcome of the trial: the fraction of the predicted disagreement that was observed, and its
+        standard error; None without a trial, or if too little could be compared.
     """
 
     gain: float | None = None
@@ -100,9 +100,9 @@ class Multipath(Correction):
     ) -> Multipath:
         """See `Correction.after_trial`.
 
-        The strength itself is not scaled by: what is seen of it is diluted (`pipeline.trial`), and
-        the gain has been found from the recording already. But as far as it is not known, all
-        pixels are wrong by the same share of the correction; and so each of them is by more.
+        The correction is not scaled by the strength, whose estimate is biased low
+        (`pipeline.trial`), while the gain has been estimated from the recording. Its standard error
+        is added to `relative_sigma`.
         """
         if not np.isfinite([strength, error]).all():
             return replace(self, trial=False, applied=helps)
@@ -118,15 +118,14 @@ class Multipath(Correction):
 
 
 class MultipathCorrector(Corrector):
-    """Corrects the frames of one recording, with a gain that it needs_fit from them unless given.
+    """Corrects the frames of one recording, and estimates the gain from them unless it is given.
 
-    Surfaces that the image does not show are those that earlier views have, where it is known how
-    the camera has moved.
+    Surfaces outside the image are those of earlier views, if poses are known.
 
     Attributes
     ----------
     gain
-        As given, or as known so far; None before the first frame.
+        As given, or the current estimate; None before the first frame.
     """
 
     def __init__(self, options: Multipath) -> None:
@@ -140,7 +139,7 @@ class MultipathCorrector(Corrector):
         self._last: tuple[int, MultipathEstimate] | None = None
 
     def is_independent(self, frame: Frame) -> bool:
-        """See `Corrector.is_independent`: so are views that are passed on."""
+        """See `Corrector.is_independent`: true for views that are passed through."""
         if not isinstance(frame, RangeFrame) or not self._options.applied:
             return True
         return (
@@ -149,7 +148,7 @@ class MultipathCorrector(Corrector):
         )
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
-        """See `Corrector.apply`. The amplitude loses its indirect share as well."""
+        """See `Corrector.apply`. Indirect light is removed from the amplitude as well."""
         if not isinstance(frame, RangeFrame) or not self._options.applied:
             return frame
         image = tof_image(frame, self._options.period_m)

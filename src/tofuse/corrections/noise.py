@@ -1,4 +1,4 @@
-"""Tell each pixel's noise by what is known of the camera."""
+"""Assign each pixel the standard deviation of its range, by the camera's noise model."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from tofuse.sensor.noise import NoiseModel
 @part("correction", "noise")
 @dataclass(frozen=True)
 class Noise(Correction, Corrector):
-    """Give each frame the standard deviation of its range, for all that weighs by it.
+    """Assign the standard deviation of the range to each pixel, for all later weighting.
 
-    Depth itself is not changed. Frames that bring their camera's own sigma keep it; clouds are
-    passed on.
+    Depths are not changed. Frames with a sigma stated by the camera keep it; clouds are passed
+    through.
 
     Attributes
     ----------
     model
-        Noise of the camera. None: as the recording's `noise.json` says, else as is known of the
-        camera's family; where neither is there, nothing is told.
+        Noise of the camera. None: that of the recording's `noise.json`, else that of the camera's
+        family; without either, frames are passed through.
     """
 
     model: NoiseModel | None = None
@@ -32,7 +32,7 @@ class Noise(Correction, Corrector):
     takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def start(self) -> Noise:
-        """See `Correction.start`. Nothing is learnt from frames."""
+        """See `Correction.start`; there is no state."""
         return self
 
     def is_independent(self, frame: Frame) -> bool:

@@ -1,4 +1,4 @@
-"""Raw amplitude and phase of a frame, as corrections need them."""
+"""Raw amplitude and phase of frames, the input of corrections."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.sensor.multipath import ToFImage
 from tofuse.sensor.multipath_surfaces import FALLOFF
 
-# Cameras of one frequency measure with periods up to this. A longer ambiguity is a beat of several
-# frequencies, which says nothing about the phase that was measured.
+# Longest ambiguity range of cameras with a single frequency. Longer ones are the beat of several
+# frequencies, from which the measured phases can't be recovered.
 _LONGEST_PERIOD_M = 6.0
 
 
 def tof_image(frame: RangeFrame, period_m: float | None = None) -> ToFImage | None:
-    """Return the frame's depth and raw light; None if its light or its period is not known."""
+    """Return depth and raw amplitude of a frame; None without amplitude or ambiguity range.
+
+    `period_m` overrides the ambiguity range of the frame.
+    """
     period_m = modulation_period(frame, period_m)
     if period_m is None or frame.amplitude_image is None or not len(frame):
         return None
@@ -27,13 +30,13 @@ def tof_image(frame: RangeFrame, period_m: float | None = None) -> ToFImage | No
     light = np.where(fine, amplitude, np.float32(0))
     if frame.amplitude_kind == "range_compensated":
         square = np.where(fine, 1 + (rays * rays).sum(-1), np.float32(1))
-        # z squared times the square of the ray's length is the range's.
+        # The squared range is z^2 times the squared length of the ray.
         light = light / (np.where(fine, z * z, np.float32(1)) * square ** (FALLOFF / 2 + 1))
     return ToFImage(z, rays, light.astype(np.float32, copy=False), period_m)
 
 
 def modulation_period(frame: RangeFrame, given: float | None) -> float | None:
-    """Range after which the phase of a frame's one frequency repeats; None where not known."""
+    """Return the ambiguity range of a frame of one frequency, or `given`; None if unknown."""
     if given is not None:
         return given
     period_m = frame.ambiguity_m
@@ -43,16 +46,13 @@ def modulation_period(frame: RangeFrame, given: float | None) -> float | None:
 
 
 def frame_phasor(frame: RangeFrame, period_m: float | None = None) -> Complex128 | None:
-    """Return the light (H, W) of a frame, with its phase; 0 where there is none.
-
-    None where the light or the period is not known.
-    """
+    """Return the phasors (H, W) of a frame, see `phasor`; None as in `tof_image`."""
     image = tof_image(frame, period_m)
     return None if image is None else phasor(image)
 
 
 def phasor(image: ToFImage) -> Complex128:
-    """Phasor (H, W) of the raw light; 0 where there is none."""
+    """Return raw amplitude and phase as complex numbers (H, W); 0 where invalid."""
     seen = (image.z > 0) & (image.amplitude > 0)
     x, y = image.rays[..., 0], image.rays[..., 1]
     r = np.where(seen, image.z * np.sqrt(1 + x * x + y * y), np.float32(0))
@@ -66,7 +66,10 @@ def phasor(image: ToFImage) -> Complex128:
 def range_and_amplitude(
     frame: Frame, period_m: float | None
 ) -> tuple[Float32, Float32, float] | None:
-    """Return radial range and raw light with the falloff of lens and lamp taken off, and period."""
+    """Return radial range (H, W) in m, raw amplitude (H, W) without falloff, and ambiguity range.
+
+    None as in `tof_image`.
+    """
     if not isinstance(frame, RangeFrame):
         return None
     image = tof_image(frame, period_m)
@@ -81,7 +84,7 @@ def range_and_amplitude(
 
 
 def pixel_pitch(frame: Frame) -> float:
-    """Angle between neighbouring pixels in the middle of the image, rad."""
+    """Return the angle between neighbouring pixels at the centre of the image, rad."""
     assert isinstance(frame, RangeFrame)
     rays = frame.camera.rays()
     rows, columns = (slice(n // 4, max(n - n // 4, n // 4 + 2)) for n in rays.shape[:2])

@@ -1,4 +1,4 @@
-"""Take the light out of a view that the lens scattered over the image."""
+"""Compensation of light that the lens scatters over the image."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from tofuse.recordings.background import moving_object
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.scattering import Scattering, estimate_fractions
 
-# A pixel with less than this fraction of its light its own is measured too badly to be saved.
+# Smallest ratio of direct to measured light of a pixel that is corrected.
 _MIN_OWN = 0.5
-# OffscreenCells what moves, pixels that are neither still nor of the object: the lens blurs its outline.
+# Margin in pixels around moving objects that counts neither as moving nor as static.
 _RIM = 4
-# Share of the frames in which a still pixel must show its background.
+# Fraction of the frames in which a static pixel must show its background.
 _STILL = 0.9
 
 
 @part("correction", "scattering", label="validated")
 @dataclass(frozen=True)
 class LensScattering(Correction):
-    """Take off the light that the lens scatters (Mure-Dubois and Huegli 2007), see `sensor`.
+    """Compensate lens scattering (Mure-Dubois and Huegli 2007), see `tofuse.sensor.scattering`.
 
-    Works on cameras of one modulation frequency that record amplitude; other views are passed on
-    as they are, and all are where the fractions are neither given nor learnt.
+    Works on cameras with one modulation frequency that record amplitude. Other views are passed
+    through, as are all views if the fractions are neither given nor estimated.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class LensScattering(Correction):
         return self.fractions is None
 
     def fit(self, frames: Sequence[Frame]) -> LensScattering:
-        """See `Correction.fit`; no fraction where nothing moves before a still background."""
+        """See `Correction.fit`; 0 if nothing moves in front of a static background."""
         fractions = np.zeros(len(self.widths))
         images = [frame for frame in frames if isinstance(frame, RangeFrame)]
         light = [x for image in images if (x := frame_phasor(image, self.period_m)) is not None]
@@ -106,7 +106,7 @@ class ScatteringCorrector(Corrector):
         return True
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
-        """See `Corrector.apply`. The amplitude loses its scattered fraction as well."""
+        """See `Corrector.apply`. Scattered light is removed from the amplitude as well."""
         if self._model is None or not isinstance(frame, RangeFrame):
             return frame
         image = tof_image(frame, self._period_m)
@@ -132,7 +132,7 @@ class ScatteringCorrector(Corrector):
 
 
 def _moves_and_still(images: Sequence[RangeFrame]) -> tuple[Bool, Bool]:
-    """(H, W) masks: where something moves, and what is far from it and always shows itself."""
+    """Return masks (H, W) of moving pixels, and of static ones far from these."""
     found = moving_object(images)
     moves = found.own | np.any([found.mask(image.z) for image in images], axis=0)
     square = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)

@@ -1,4 +1,4 @@
-"""Bring back surfaces that lie beyond the camera's period."""
+"""Phase unwrapping of surfaces beyond the ambiguity range."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ _ROUNDS = 4
 @part("correction", "unwrap", label="validated")
 @dataclass(frozen=True)
 class Unwrap(Correction):
-    """Undo phase wraps by amplitude and neighbourhood, see `tofuse.sensor.unwrap`.
+    """Unwrap the phase by amplitude and continuity, see `tofuse.sensor.unwrap`.
 
-    Works on cameras of one modulation frequency that record amplitude; other views are passed on as
-    they are.
+    Works on cameras with one modulation frequency that record amplitude; other views are passed
+    through.
 
     Attributes
     ----------
     white
-        Raw amplitude of a white wall at 1 m in the image's centre; None: found from the recording.
+        Raw amplitude of a white wall at 1 m on the optical axis; None: estimated from the
+        recording.
     period_m
-        Range after which the phase repeats; None: as the frame says.
+        Ambiguity range; None: that of the frame.
     options
-        See there.
+        Of the unwrapping.
     """
 
     white: float | None = None
@@ -55,9 +56,9 @@ class Unwrap(Correction):
         return self.white is None
 
     def fit(self, frames: Sequence[Frame]) -> Self:
-        """Return the part with the amplitude of white that the brightest frames show."""
+        """Return the part with the amplitude of white estimated from the brightest frames."""
         white = 0.0
-        # Where most is beyond the period, white is known only once that has been brought back.
+        # Alternate with unwrapping, as most surfaces may be beyond the ambiguity range.
         for _ in range(_ROUNDS):
             found = [w for frame in frames if (w := self._white_of(frame, white)) > 0]
             if not found:
@@ -82,7 +83,7 @@ class Unwrap(Correction):
 
 
 class UnwrapCorrector(Corrector):
-    """Moves pixels of each frame by whole periods."""
+    """Adds whole periods to the ranges of each frame."""
 
     def __init__(self, part: Unwrap) -> None:
         self.part = part
@@ -92,7 +93,7 @@ class UnwrapCorrector(Corrector):
         return True
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
-        """See `Corrector.apply`. Range-compensated amplitude is that of the new range."""
+        """See `Corrector.apply`. Range-compensated amplitude is scaled to the new range."""
         known = range_and_amplitude(frame, self.part.period_m)
         if known is None or not isinstance(frame, RangeFrame):
             return frame

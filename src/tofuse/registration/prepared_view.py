@@ -1,4 +1,4 @@
-"""A view made ready for tracking: where its surfaces are, how they reflect, how well it knows."""
+"""A view prepared for alignment: local planes, albedo, and the uncertainty of both."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from tofuse.kernels.surface import (
 from tofuse.kernels.threads import run_chunks
 from tofuse.recordings.frames import SATURATED_AMPLITUDE, RangeFrame
 
-# Rows of a chunk: many, as each costs a hand-over between threads, and windows reach into the next;
-# fixed, so that the number of threads changes nothing.
+# Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
+# the result does not depend on the number of threads.
 _CHUNK_ROWS = 60
-# Depths within this share of each other are one surface when an image is halved.
+# Relative difference of depths up to which they belong to one surface when an image is halved.
 _HALVING_JUMP = 0.02
-# Levels of colour: below, the logarithm is noise; from the other on, a channel is saturated.
+# Range of usable colour levels: darker ones are noise, brighter ones saturated.
 _MIN_LEVEL, _MAX_LEVEL = 8, 254
-# m. Depths and sigmas beyond are no measurement, and their squares no float32.
+# m. Depths and sigmas beyond are invalid, and their squares exceed the range of float32.
 _MIN_DEPTH, _MAX_DEPTH = 1e-3, 1e3
 _MIN_SIGMA = 1e-6
-# Share of the depth below which no camera's errors are: a view without noise, averaged or made by
-# a program, is not known to a hundredth of a millimetre either.
+# Lower limit of the noise relative to the depth, for views that are averaged or simulated without
+# noise.
 _MIN_NOISE = 3e-4
-# An alignment takes pixels for independent. Where so many share an error, they tell together what
-# each of them would with that many times its variance.
+# Number of pixels assumed to share a correlated error: an alignment treats pixels as independent,
+# so its variance is multiplied by this.
 _CORRELATED_PIXELS = 100.0
-# The typical noise does not stand for pixels with so many times as much; to fit planes to them is
-# worth its time where they are this share of a view.
+# Pixels whose noise exceeds the typical one by this ratio get planes of their own, if they are at
+# least this fraction of a view.
 _NOISY_RATIO, _MIN_NOISY = 2.0, 0.02
-# A pixel within so many standard deviations of a plane has measured it.
+# Largest distance, in standard deviations, of a pixel that belongs to a plane.
 _MAX_PLANE_SIGMAS = 3.0
-# Of the absolute values of a normal distribution, in standard deviations.
+# Median of the absolute values of a standard normal distribution.
 _MEDIAN_OF_NORMAL = 0.6745
 
 
@@ -74,17 +74,17 @@ def _check_windows(options: _Windows) -> None:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """How views are prepared whose noise the camera has smoothed away: finely, as it can be.
+    """Preparation of views that the camera has smoothed, at a finer scale.
 
-    What is left there are shapes, and the few that hold the camera are small.
+    In such views noise is no limit, and the structures that constrain the pose may be small.
 
     Attributes
     ----------
     noise
-        A view is one of those if its neighbouring pixels differ by less noise than this share of
-        the depth.
+        Applies to views whose noise between neighbouring pixels is below this fraction of the
+        depth.
     radii, edge_margin, fill
-        Take the place of the fields of `SurfaceOptions`.
+        Replace the fields of `SurfaceOptions`.
     """
 
     noise: float = 0.001
@@ -108,26 +108,26 @@ class SurfaceOptions:
         Images are halved until they have at most this many columns.
     radii
         Half widths of the windows of the plane fits, pixels: the smallest gives the depth, the
-        widest that is one surface the slope.
+        widest one that contains a single surface gives the slope.
     edge_jump, edge_margin, edge_sigmas
-        Pixels this near (`edge_margin`, in pixels) to a jump in depth by this share are left out of
-        the fits: they mix light of both sides. No jump is what differs by less than so many sigmas
-        of the view's typical noise.
+        Pixels within `edge_margin` pixels of a depth edge are left out of the fits, as they mix
+        light of both sides. An edge is a relative difference above `edge_jump`, and above
+        `edge_sigmas` times the view's typical noise.
     misfit
-        How much larger than the noise shown by small windows the variance in wider ones may be.
+        Largest ratio of the residual variance of a window to that of the smallest windows.
     flatness
-        A surface that is this flat, as a share of its depth, is a plane, however little noise the
-        view shows: cameras that smooth their images hide it.
+        Deviations from a plane below this fraction of the depth are accepted whatever the noise of
+        the view, as cameras may smooth their images.
     fill, offset
-        Least share of a window that must be valid, and largest squared offset of its centre, as a
-        share of its squared spread.
+        Smallest valid fraction of a window, and largest squared offset of its valid pixels'
+        centroid relative to their variance.
     albedo_radius
-        Half width of the box that smooths the albedo, pixels.
+        Half width of the box filter of the albedo, pixels.
     falloff
-        Exponent of the cosine to the axis by which amplitude falls off towards the corners; None to
-        estimate it from the recording, 0 where there is none.
+        Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
+        None to estimate it from the recording.
     smoothed
-        What is different for views that have hardly any noise.
+        Options for views with hardly any noise.
     """
 
     columns: int = 320
@@ -162,7 +162,7 @@ class SurfaceOptions:
             raise ValueError(f"misfit is {self.misfit}, not above 0")
 
     def for_noise(self, noise: float) -> SurfaceOptions:
-        """Return what to do with a view whose neighbouring pixels differ by this share."""
+        """Return the options for a view with this noise between neighbours, relative to depth."""
         s = self.smoothed
         if noise >= s.noise:
             return self
@@ -171,16 +171,17 @@ class SurfaceOptions:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The rays of a grid of pixels, and where rays land on it, for any camera.
+    """Rays of a grid of pixels, and the projection of rays onto it, for any camera model.
 
     Attributes
     ----------
     rays
         (H, W, 2) float32 ray coordinates x/z, y/z of the pixels.
     lookup
-        (A, B, 2) float32 pixel (u, v) of each node, far outside the image where it sees nothing.
+        (A, B, 2) float32 pixel (u, v) of each node of a grid over ray coordinates; far outside the
+        image for rays that the camera does not see.
     frame
-        (x0, y0, 1/dx, 1/dy) of the nodes.
+        (4,) origin and inverse spacing of the nodes: x0, y0, 1/dx, 1/dy.
     """
 
     rays: Float32
@@ -190,7 +191,7 @@ class Projection:
 
     @cached_property
     def unknown(self) -> Bool | None:
-        """(H, W) whether a pixel's ray is unknown; None if no pixel's is."""
+        """(H, W) mask of pixels whose ray is unknown; None if there are none."""
         unknown: Bool = np.isnan(self.lengths2)
         return unknown if unknown.any() else None
 
@@ -206,7 +207,10 @@ class Projection:
 
     @classmethod
     def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:
-        """Make the lookup of a camera whose images are halved to every `step`-th pixel."""
+        """Make the projection of a camera whose images are downsampled by `step`.
+
+        `spacing` is the distance between nodes, in pixels of the full image.
+        """
         rays = camera.rays()
         low = np.nanmin(rays, axis=(0, 1)).astype(float)
         high = np.nanmax(rays, axis=(0, 1)).astype(float)
@@ -223,7 +227,7 @@ class Projection:
         return cls(_halve_rays(rays, step), lookup, scale)
 
     def subsampled(self, step: int) -> Projection:
-        """Every `step`-th pixel; one object for all views, which is soon found in the caches."""
+        """Return the projection of every `step`-th pixel, one object for all views."""
         if step not in self._subsampled:
             first = step // 2
             rays = np.ascontiguousarray(self.rays[first::step, first::step])
@@ -256,20 +260,22 @@ class PreparedView:
     z
         (H, W) measured z in m, 0 where invalid.
     sigma
-        (H, W) its standard deviation in m, as the view itself shows it.
+        (H, W) standard deviation of z in m, scaled to the noise observed in the view.
     planes
         (H, W, 4): a, b, c of the plane a X + b Y + c Z = 1 at the pixel, and 1/z on it; 0 where
         there is none.
     plane_variance
-        (H, W) variance of that 1/z, 1/m^2, as if pixels were independent.
+        (H, W) variance of 1/z on the plane, 1/m^2, for an alignment that treats pixels as
+        independent: it contains correlated errors multiple times.
     albedo
-        (H, W, 3) logarithm of the albedo (of amplitude, else of colour), smoothed, and its slopes
-        by x/z and y/z; NaN where unknown.
+        (H, W, 3) log albedo (from amplitude, else from colour), smoothed, and its slopes by x/z and
+        y/z; NaN where unknown.
     projection
-        Where points of this view's frame land.
+        Projection of points in this view's frame.
+    has_albedo
+        Whether `albedo` is known anywhere.
     pixel_variance
-        (H, W) the same as `plane_variance` for one pixel by itself: there errors that neighbours
-        share count once, and not as often as they are shared. None where nothing is shared.
+        (H, W) `plane_variance` with correlated errors contained once; None without such errors.
     """
 
     index: int
@@ -286,7 +292,7 @@ class PreparedView:
 
     @property
     def normals(self) -> Float32:
-        """(H, W, 3) unit normals away from the camera, 0 where unknown; made anew each time."""
+        """(H, W, 3) unit normals away from the camera, 0 where unknown; not cached."""
         abc = self.planes[..., :3]
         length = np.sqrt((abc * abc).sum(-1, keepdims=True))
         return np.where(self.planes[..., 3:] > 0, abc / np.maximum(length, 1e-12), 0).astype(
@@ -295,29 +301,29 @@ class PreparedView:
 
     @property
     def pixels(self) -> int:
-        """How many there are, valid or not."""
+        """Number of pixels, valid or not."""
         return self.z.size
 
     def with_pixel_variance(self) -> PreparedView:
-        """Return the view with `pixel_variance` for `plane_variance`, if it has both.
+        """Return the view with `plane_variance` replaced by `pixel_variance`, if it has both.
 
-        A single alignment can't but take an error that pixels share for the camera's motion, so it
-        must rely little on such pixels. Where each view is compared with many others, which saw
-        the same surfaces from elsewhere, they know more than that.
+        In a single alignment a correlated error is indistinguishable from motion, so such pixels
+        get a low weight. Joint refinement compares each view with many others, which observe the
+        same surfaces from other viewpoints, and can average such errors.
         """
         if self.pixel_variance is None:
             return self
         return replace(self, plane_variance=self.pixel_variance, pixel_variance=None)
 
     def without_caches(self) -> PreparedView:
-        """Return the view without what was derived from it, which takes as much memory again."""
+        """Return the view without its cached derived images, which double its memory."""
         return replace(self)
 
     def subsampled(self, columns: int) -> PreparedView:
-        """Return the view at every n-th pixel, so that it has at most so many columns.
+        """Return the view at every n-th pixel, so that it has at most `columns` columns.
 
-        A plane fits beyond its own pixel, so for comparing views few pixels are enough. All who
-        ask for as many get one object, so that it is kept once.
+        Planes extend beyond their pixel, so that comparing views needs few pixels. The result is
+        cached.
         """
         step = -(-self.z.shape[1] // columns)
         if step == 1:
@@ -352,28 +358,28 @@ class PreparedView:
 
     @cached_property
     def depth(self) -> float:
-        """Median z in m; 1 where nothing is valid."""
+        """Median z in m; 1 without valid pixels."""
         valid = self.z[self.z > 0]
         return median(valid) if len(valid) else 1.0
 
     @cached_property
     def target(self) -> Float32:
-        """(H, W, PIXEL_SIZE) what points of other views are compared with, see `make_target`."""
+        """(H, W, PIXEL_SIZE) target image for alignment, see `make_target`."""
         return make_target(self.rays, self.planes, self.plane_variance, self.albedo)
 
     @cached_property
     def planar_fraction(self) -> float:
-        """Share of the pixels at which a plane was fitted."""
+        """Fraction of the pixels that have a plane."""
         return float(np.count_nonzero(self.planes[..., 3] > 0)) / self.z.size
 
 
 def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
-    """Prepare a view.
+    """Prepare a frame for alignment.
 
-    The noise is taken from the frame's own `sigma_image` where it has one, else from a law of the
-    sensor family (one over the amplitude, or the square of the depth); its scale is measured on
-    the view itself, as the median misfit of small planes. What a frame states of its noise is not
-    made less: planes don't show noise that neighbouring pixels share.
+    The noise is the frame's own `sigma_image` if there is one, else a law of the sensor family
+    (inversely proportional to the amplitude, or quadratic in the depth). Its scale is estimated
+    from the view, as the median misfit of small planes; stated noise is never scaled down, as
+    planes do not reveal noise that is correlated between neighbours.
     """
     projection, z, light, own = _at_working_resolution(frame, options.columns)
     rays = projection.rays
@@ -427,17 +433,17 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
 
 @lru_cache(maxsize=16)
 def _no_albedo(rows: int, columns: int) -> Float32:
-    """NaN (H, W, 3), never written to: one image for all views, as there are many of them."""
+    """Return a NaN image (H, W, 3) that all views without albedo share; it must not be changed."""
     return np.full((rows, columns, 3), np.nan, np.float32)
 
 
 def with_extended_planes(
     surface: PreparedView, frame: RangeFrame, options: SurfaceOptions
 ) -> PreparedView:
-    """Return the view of `frame` with planes where the tracker does well to have none.
+    """Return the view of `frame` with more planes, for fusion: at noisy pixels and depth edges.
 
-    Where pixels are noisier than the typical one, and at outlines. Planes that were fitted before
-    stay; variances are those of `PreparedView.with_pixel_variance`.
+    They are left out for tracking. Existing planes stay; variances are those of
+    `PreparedView.with_pixel_variance`.
     """
     surface = surface.with_pixel_variance()
     known = (surface.z > 0) & (surface.sigma > 0)
@@ -463,11 +469,10 @@ def _with_planes_at_noisy_pixels(
     missing: Bool,
     options: SurfaceOptions,
 ) -> PreparedView:
-    """Return the view with planes where it is noisier than its typical pixel.
+    """Return the view with planes at pixels that are noisier than its typical pixel.
 
-    `prepare_view` takes what differs by more than the typical noise for a jump in depth. Here a
-    jump is what differs by more than the noise of the pixels next to it, unless one of these is
-    much noisier than the other. `noise` (H, W) is a share of the depth.
+    `prepare_view` detects depth edges by the typical noise. Here the noise (H, W), relative to the
+    depth, of the two adjacent pixels is used, unless one of them is much noisier than the other.
     """
     edge = _edge_pixels_by_noise(w, noise, options)
     missing = missing & ~edge
@@ -492,12 +497,11 @@ def _with_planes_of_neighbours(
     missing: Bool,
     options: SurfaceOptions,
 ) -> PreparedView:
-    """Return the view with the planes of their neighbours at pixels that have measured these.
+    """Return the view with the planes of neighbours at pixels whose depth agrees with these.
 
-    No window fits next to an outline. But a surface goes on up to there, and a pixel that mixes its
-    light with that of another one is on neither plane. Only planes (H, W, 4) of the `quiet` part of
-    the view are carried: of what is dark much of the light comes by other ways, so that it is wrong
-    by more than its noise tells.
+    No window fits next to a depth edge, yet the surface extends up to it; a pixel that mixes light
+    of both sides agrees with neither plane. Only the planes `quiet` (H, W, 4) of pixels with
+    typical noise are extended: dark surfaces are biased by multipath beyond their noise.
     """
     steps, growth = _steps(options.radii[0])
     planes, variance = surface.planes.copy(), surface.plane_variance.copy()
@@ -510,10 +514,11 @@ def _with_planes_of_neighbours(
 
 @lru_cache(maxsize=8)
 def _steps(radius: int) -> tuple[Int32, Float32]:
-    """Steps to the pixels near one, the nearest first, and the growth of variance on the way.
+    """Return offsets to the pixels around one, nearest first, and the growth of variance to them.
 
-    That of a plane fitted to a window of this radius: with the squared distance over the window's
-    mean square. They go one pixel beyond the window's radius, as edges are left out on either side.
+    The variance of a plane fitted to a window of this radius grows with the squared distance
+    relative to the window's mean square. Offsets reach two pixels beyond the window's radius, as
+    pixels on both sides of an edge are left out.
     """
     reach = radius + 2
     around = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
@@ -524,11 +529,11 @@ def _steps(radius: int) -> tuple[Int32, Float32]:
 
 
 def _edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
-    """As `_edge_pixels`, where each pixel has a noise (H, W) of its own, as a share of its depth."""
+    """Do the same as `_edge_pixels` with an individual noise (H, W), relative to the depth."""
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         n, m = noise[a] ** 2, noise[b] ** 2
-        # A quiet surface ends where a noisy one begins.
+        # A large change of the noise is an edge between surfaces.
         differs = np.float32(options.edge_sigmas) * np.sqrt(np.minimum(n + m, 4 * np.minimum(n, m)))
         share = np.minimum(np.maximum(differs, np.float32(options.edge_jump)), np.float32(0.9))
         across = np.abs(w[a] - w[b]) > share * np.maximum(w[a], w[b])
@@ -545,7 +550,7 @@ def _dilate(edge: UInt8, margin: int) -> Bool:
 def _add_shared_error(
     variance: Float32, planes: Float32, shared: Float32 | None
 ) -> tuple[Float32, Float32 | None]:
-    """Variances of planes where pixels also share errors: for alignments, and of one pixel."""
+    """Return `plane_variance` and `pixel_variance` with the shared sigma of z (H, W) in m added."""
     if shared is None:
         return variance, None
     once = (shared * planes[..., 3] ** 2) ** 2
@@ -553,7 +558,7 @@ def _add_shared_error(
 
 
 def _inverse(values: Float32, known: Bool) -> Float32:
-    """One over each value, 0 where it is not known: at once for all, which is faster."""
+    """Return the reciprocal of each value, 0 where it is not known."""
     return np.reciprocal(np.where(known, values, np.float32(np.inf)))
 
 
@@ -567,7 +572,7 @@ def _projection(camera: Camera, step: int) -> Projection:
 def _at_working_resolution(
     frame: RangeFrame, columns: int
 ) -> tuple[Projection, Float32, Float32 | None, Float32 | None]:
-    """Grid, z, amplitude (or colour's) and the frame's own sigma of z at the working resolution."""
+    """Return projection, z, amplitude (or luminance) and the frame's sigma of z, downsampled."""
     z = frame.z
     z = np.where(frame.valid & (z > _MIN_DEPTH) & (z < _MAX_DEPTH), z, np.float32(0))
     light = _amplitude(frame)
@@ -582,15 +587,15 @@ def _at_working_resolution(
         step *= 2
     projection = _projection(frame.camera, step)
     if step > 1 and projection.unknown is not None:
-        # The mean of a block of rays that holds an unknown one is unknown.
+        # The mean ray of a block with an unknown ray is unknown.
         z[projection.unknown] = 0
     return projection, z, light, sigma
 
 
 def _amplitude(frame: RangeFrame) -> Float32 | None:
-    """Amplitude, or without it the luminance of the colour; 0 where saturated or too dark.
+    """Return the amplitude, else the luminance of the colour; 0 where saturated or too dark.
 
-    Colour is coded by a power of the light, which its logarithm turns into a factor.
+    The gamma of colours becomes a constant factor of the log albedo.
     """
     light = frame.amplitude_image
     if light is not None:
@@ -603,23 +608,23 @@ def _amplitude(frame: RangeFrame) -> Float32 | None:
 
 
 def _own_sigma(frame: RangeFrame) -> Float32 | None:
-    """Sigma of z that the frame states, m; 0 where it does not."""
+    """Return the sigma of z (H, W) that the frame states, m; 0 where unknown."""
     if frame.sigma_image is None:
         return None
     known = (frame.sigma_image > _MIN_SIGMA) & (frame.sigma_image < _MAX_DEPTH)
-    # The noise is that of the range, along the ray.
+    # The stated noise is that of the radial range.
     sigma = np.where(known, frame.sigma_image / ray_lengths(frame.camera), np.float32(0))
     return np.asarray(sigma, np.float32)
 
 
 def _shared_sigma(frame: RangeFrame, lengths2: Float32) -> Float32 | None:
-    """Sigma of z (H, W) in m that pixels share, where rays have these squared lengths (H, W)."""
+    """Return the correlated sigma of z (H, W) in m, given the squared ray lengths (H, W)."""
     image = frame.shared_sigma_image
     if image is None:
         return None
     rows, columns = lengths2.shape
     step = image.shape[1] // columns
-    # It varies slowly: a pixel of each block will do.
+    # It varies slowly: one pixel per block is enough.
     picked = image[step // 2 :: step, step // 2 :: step][:rows, :columns]
     known = np.isfinite(picked) & (picked > 0)
     return np.asarray(np.where(known, picked, 0) / np.sqrt(lengths2), np.float32)
@@ -643,7 +648,7 @@ def _fit(
     limit: float,
     options: SurfaceOptions,
 ) -> tuple[Float32, Float32]:
-    """Planes (H, W, 4) and their quality (H, W, 2) where they are wanted, see `fit_planes`."""
+    """Return planes (H, W, 4) and quality (H, W, 2) at the wanted pixels, see `fit_planes`."""
     rows, columns = w.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)
@@ -664,9 +669,9 @@ def _chunks(rows: int) -> int:
 
 
 def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
-    """Pixels within `margin` of a jump in depth by a share `jump`, or of a missing pixel.
+    """Return the pixels within `margin` of a missing pixel or a relative depth difference of `jump`.
 
-    There a pixel mixes light of both sides, as far as the lens blurs.
+    Due to the blur of the lens they mix light of both sides.
     """
     edge = np.zeros(w.shape, np.uint8)
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
@@ -677,10 +682,9 @@ def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
 
 
 def _typical_noise(w: Float32, weight: Float32) -> float:
-    """Standard deviation of the difference of two neighbours, as a share of their depth.
+    """Return the standard deviation of the difference between neighbours, relative to their depth.
 
-    That of the typical pixel: its law's scale is the median of second differences along some of
-    the rows, as most pixels are on surfaces, and few of those are at edges.
+    A robust estimate from the median of second differences along some of the rows.
     """
     rows = np.s_[::4]
     some = [w[rows, k : w.shape[1] - 2 + k] for k in range(3)]
@@ -696,7 +700,7 @@ def _typical_noise(w: Float32, weight: Float32) -> float:
 def _noise_law(
     frame: RangeFrame, z: Float32, light: Float32 | None, projection: Projection
 ) -> Float32:
-    """Sigma of z in m up to a factor."""
+    """Return the sigma of z (H, W) in m up to a factor, by a law of the sensor family."""
     if light is None or frame.amplitude_kind == "ir":
         return np.float32(0.001) + np.float32(0.003) * z * z
     if frame.amplitude_kind == "raw":
@@ -709,13 +713,13 @@ def _noise_law(
     if len(lit) == 0:
         return np.float32(0.001) + np.float32(0.003) * z * z
     typical = np.float32(median(lit))
-    # The least that is above 0 stands for no light: the law ends far before.
+    # A tiny amplitude stands for none, far below the limit of the law.
     law = np.asarray(typical / np.fmax(raw, np.float32(1e-6) * typical), np.float32)
     return np.float32(0.01) * np.clip(law, np.float32(0.15), np.float32(20))
 
 
 def _scale_at(share: float, z: Float32, sigma: Float32) -> float:
-    """Scale of the variance at which a typical pixel's sigma is a share of its depth."""
+    """Return the variance scale at which a typical pixel's sigma is `share` times its depth."""
     z, sigma = z[::4, ::4], sigma[::4, ::4]
     known = (z > 0) & (sigma > 0)
     if not known.any():
@@ -724,7 +728,7 @@ def _scale_at(share: float, z: Float32, sigma: Float32) -> float:
 
 
 def _noise_scale(w: Float32, rays: Float32, weight: Float32, radius: int) -> float:
-    """Median misfit of the smallest windows on a sparse set of rows: the variance's true scale."""
+    """Estimate the variance scale: median misfit of the smallest windows on some of the rows."""
     rows, columns = w.shape
     planes = np.empty((rows, columns, 4), np.float32)
     quality = np.empty((rows, columns, 2), np.float32)

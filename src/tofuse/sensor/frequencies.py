@@ -1,4 +1,4 @@
-"""One range from phases at several frequencies: the periods are those at which all agree."""
+"""Multi-frequency phase unwrapping: the range at which all frequencies agree."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.arrays import Float32, Float64
 
-# Share of the shortest period by which frequencies may differ, rms, about one range.
+# Largest rms disagreement of the frequencies, as a fraction of the shortest period.
 DISAGREEMENT = 0.1
 
 
@@ -18,25 +18,24 @@ def combined(
     weights: Sequence[float] | None = None,
     longest_m: float | None = None,
 ) -> tuple[Float32, Float32]:
-    """Return the range that measurements at several frequencies agree on, and how well.
+    """Return the range on which measurements at several frequencies agree, and the disagreement.
 
     Parameters
     ----------
     ranges
         Radial ranges (H, W) in m, each in [0, its period), 0 where invalid.
     periods_m
-        Of each.
+        Ambiguity range of each frequency.
     weights
-        Of each in the mean, such as 1 / sigma^2; unless given those of equal phase noise,
+        Of each frequency in the mean, such as 1 / sigma^2; by default those of equal phase noise,
         1 / period^2.
     longest_m
-        Largest range to look at; unless given, up to where the first periods meet again, at most
-        40 m.
+        Largest range; by default the joint ambiguity range, at most 40 m.
 
     Returns
     -------
     combined
-        (H, W) in m, 0 where one measurement is missing.
+        (H, W) in m, 0 where a measurement is missing.
     disagreement
         (H, W) weighted rms of the measurements about it, m.
     """  # fmt: skip
@@ -45,7 +44,7 @@ def combined(
     w = w / w.sum()
     stack = np.stack([np.asarray(r, float) for r in ranges])
     valid = (stack > 0).all(0)
-    first = int(np.argmin(P))  # the finest leads: its periods are tried
+    first = int(np.argmin(P))  # the candidates are the wraps of the highest frequency
     limit = min(longest_m or _beat(P), 40.0)
     best = np.full(stack.shape[1:], np.inf)
     out = np.zeros(stack.shape[1:])
@@ -64,7 +63,7 @@ def combined(
 
 
 def _beat(periods: Float64) -> float:
-    """Range after which two or more periods meet again, to a percent of the shortest."""
+    """Return the joint ambiguity range of two or more periods, to 1 % of the shortest."""
     shortest = periods.min()
     for k in range(1, 1000):
         at = k * shortest

@@ -1,17 +1,15 @@
-"""The light that visible surfaces reflect onto each other, and the range bias that it makes.
+"""Multipath: the light that surfaces reflect onto each other, and the range bias it causes.
 
-The lamp sits at the camera and lights about what the camera sees, so the surfaces that reflect
-light onto each other are those that it measures (Fuchs 2010; Jimenez et al. 2012). What a pixel
-measures is ``M = D (1 + I / D)``: its surface's own light D, and the light I that came by way of
-other surfaces, on a longer path and so with a later phase. The angle of ``1 + I / D`` is the bias
-of the phase.
+The lamp is at the camera and illuminates about what the camera sees, so the reflecting surfaces are
+those that it measures (Fuchs 2010; Jimenez et al. 2012). A pixel measures ``M = D (1 + I / D)``:
+the direct light D, and the indirect light I, which arrives on longer paths with a later phase. The
+angle of ``1 + I / D`` is the bias of the phase.
 
-I is the sum over the other surfaces q of ``F L_q exp(i k d)``: the light L_q that q sends out,
-delayed by the way d from q to the pixel's surface, times the form factor F. L_q is the measured
-light of q less its own I ("one" bounce), or all of it, in which every further bounce is contained
-("all").
+I is the sum over the other surfaces q of ``F L_q exp(i k d)``, with the form factor F, the
+radiosity L_q of q, and the distance d from q to the pixel's surface. L_q is the measured light of q
+without its own I ("one" bounce), or all of it, which includes all further bounces ("all").
 
-The amplitude is the light but for the gain of the camera: the counts of a white wall at 1 m. It
+Amplitude is proportional to light by the gain of the camera: the counts of a white wall at 1 m. It
 is given, or estimated by `GainEstimator`.
 """
 
@@ -37,26 +35,26 @@ from tofuse.sensor.multipath_surfaces import (
 
 Bounces = Literal["one", "all"]
 
-# A pixel this share of its depth off a plane no longer belongs to it.
+# Relative distance from a plane at which a pixel no longer belongs to it.
 _OFF_PLANE = 0.03
-# Pixels with more indirect light than direct are measured too badly to be saved.
+# Upper limit of the ratio of indirect to direct light.
 _MAX_RATIO = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class ToFImage:
-    """What is known of an image.
+    """Depth and raw amplitude of a camera with one modulation frequency.
 
     Attributes
     ----------
     z
         (H, W) float32 z depth in m, 0 where invalid.
     rays
-        (H, W, 2) float32 of the pixels, x/z and y/z; may be NaN where z is 0.
+        (H, W, 2) float32 x/z and y/z of the pixels; may be NaN where z is 0.
     amplitude
-        (H, W) float32 raw amplitude in counts, as it fell on the sensor; 0 where there is none.
+        (H, W) float32 raw amplitude in counts, not range-compensated; 0 where invalid.
     period_m
-        Range after which the phase repeats, c / (2 f).
+        Ambiguity range, c / (2 f).
     """
 
     z: Float32
@@ -67,16 +65,16 @@ class ToFImage:
 
 @dataclass(frozen=True, eq=False)
 class MultipathEstimate:
-    """What indirect light does to an image.
+    """Effect of multipath on an image.
 
     Attributes
     ----------
     z
-        (H, W) float32 z depth in m without it; 0 where invalid.
+        (H, W) float32 corrected z depth in m; 0 where invalid.
     factor
-        (H, W) float32 by which it has raised the amplitude; 1 where nothing is known.
+        (H, W) float32 by which multipath has raised the amplitude; 1 where unknown.
     surfaces
-        What was found to reflect, at the nodes of a grid of blocks of `step` pixels.
+        The reflecting surfaces, at the nodes of a grid of blocks of `step` pixels.
     step
         Side of a block in pixels.
     """
@@ -89,16 +87,16 @@ class MultipathEstimate:
 
 @dataclass(frozen=True)
 class MultipathModel:
-    """How the indirect light of an image is computed.
+    """Computation of multipath in an image.
 
     Attributes
     ----------
     columns
-        Blocks of pixels along the image's width, for which the light is computed.
+        Blocks of pixels along the image's width for which multipath is computed.
     iterations
-        Times that the light is computed; each time from surfaces corrected by the one before.
+        Number of fixed-point iterations of multipath and surfaces.
     lamp
-        Angle up to which the lamp lights, relative to that of the image's corner.
+        Illumination angle relative to that of the image's corner.
     bounces
         "one" or "all", see above.
     """
@@ -115,16 +113,18 @@ class MultipathModel:
         known: ReflectorMap | None = None,
         T_world_camera: Float64 | None = None,
     ) -> MultipathEstimate | None:
-        """Find the indirect light in an image; None where there is nothing to compute it from.
+        """Compute the multipath in an image; None without surfaces.
 
         Parameters
         ----------
+        image
+            Depth and raw amplitude.
         gain
-            Counts of raw amplitude of a white wall (albedo 1) at 1 m on the axis.
+            Raw amplitude, in counts, of a white wall (albedo 1) at 1 m on the optical axis.
         known
-            What is known of the surfaces around the image, as seen by earlier ones.
+            Surfaces outside the image, seen by earlier views.
         T_world_camera
-            (4, 4) pose of the camera in the frame of `known`; without it, nothing is known.
+            (4, 4) pose of the camera in the frame of `known`, which is not used without it.
         """
         step = self._step(image)
         nodes = block_nodes(image.z, image.rays, image.amplitude, step)
@@ -146,18 +146,22 @@ class MultipathModel:
         return MultipathEstimate(z, factor, surfaces, step)
 
     def bright(self, image: ToFImage) -> float:
-        """Counts at 1 m that a tenth of the surfaces exceeds, faced head-on; 0 if none is seen."""
+        """Return the 90 % quantile of albedo in counts (facing the camera at 1 m); 0 if unknown."""
         nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         fit_planes(nodes)
         return Surfaces.of(nodes, np.ones(nodes.shape[:2])).bright()
 
     def flatness(self, image: ToFImage, gain: float, window: int = 4) -> float:
-        """How flat the surfaces become with a gain: the number of nodes on the plane around them.
+        """Return how flat surfaces are after correction with a gain: the number of coplanar nodes.
 
         Parameters
         ----------
+        image
+            Depth and raw amplitude.
+        gain
+            See `solve`.
         window
-            Radius in nodes around which planes are fitted.
+            Radius in nodes within which planes are fitted, see `kernels.multipath.flat_nodes`.
         """
         nodes = block_nodes(image.z, image.rays, image.amplitude, self._step(image))
         measured = ray_ranges(nodes)
@@ -181,13 +185,12 @@ class MultipathModel:
         *,
         at_edges: bool,
     ) -> tuple[Float64, Complex128, Surfaces] | None:
-        """Bias of the range (Hn, Wn) in m, I / D (Hn, Wn), and the surfaces that they are of.
+        """Return bias of the range (Hn, Wn) in m, I / D (Hn, Wn), and the surfaces.
 
-        Fits planes to the corrected nodes.
-
-        `W` of the nodes is the corrected inverse depth of the last but one iteration. `at_edges`
-        says whether nodes next to an edge are compared with planes as those are corrected: that
-        is more exact, but makes surfaces look flat with any gain.
+        Fits planes to the corrected nodes; `W` of the nodes becomes the corrected inverse depth of
+        the last iteration but one. `at_edges`: nodes next to an edge are compared with planes after
+        correction by the bias of those, which is more accurate, but makes surfaces flat with any
+        gain.
         """
         k = np.pi / period_m
         seen = nodes[..., W] > 0
@@ -203,7 +206,7 @@ class MultipathModel:
             surfaces = Surfaces.of(nodes, np.abs(1 + ratio))
             if not (surfaces.good & (surfaces.albedo > 0)).any():
                 return None
-            # Measured there and back; on leaving towards elsewhere the way back is not yet gone.
+            # The measured phase is that of the way there and back; light leaves after half of it.
             phase = 2 * k * measured - k * surfaces.range_m
             radiosity = surfaces.radiosity / gain * np.exp(1j * phase)
             if self.bounces == "one":
@@ -217,14 +220,14 @@ class MultipathModel:
 
 
 def _correct(nodes: Float64, measured: Float64, shift: Float64) -> None:
-    """Set the nodes' inverse depth to what is measured less the bias of the radial range."""
+    """Set the nodes' inverse depth to that of the measured radial range minus its bias."""
     seen = measured > 0
     length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
     nodes[..., W] = np.where(seen, length / np.where(seen, measured - shift, 1), 0)
 
 
 def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) -> Complex128:
-    """I / D (Hn, Wn) at the nodes of the sources' light; 0 where no plane fits."""
+    """Return I / D (Hn, Wn) at the nodes due to the sources (S, 9); 0 where no plane fits."""
     good = surfaces.good
     receivers = np.ascontiguousarray(
         np.concatenate([surfaces.points[good], surfaces.normals[good]], 1).T, np.float32
@@ -245,17 +248,17 @@ def _indirect_ratio(surfaces: Surfaces, sources: Float32, wave_number: float) ->
 
 @dataclass
 class GainEstimator:
-    """Finds the camera's gain from the images, as there is no way to read it off one pixel.
+    """Estimates the gain of the camera from its images.
 
-    Indirect light bends flat surfaces towards the edges in which they meet. Each image is corrected
-    with several gains, and the number of nodes that come to lie on a plane is counted for each; the
-    counts of the images add up. Where nothing bends, the assumption decides that the brightest
-    tenth of the surfaces has an albedo of 0.7, give or take 40 %.
+    Multipath bends flat surfaces towards the edges in which they meet. Each image is corrected with
+    several gains, and the coplanar nodes are counted for each; counts are summed over images. A
+    prior states that the brightest tenth of the surfaces has an albedo of 0.7, with a standard
+    deviation of 40 %.
 
     Attributes
     ----------
     reflections
-        How the light is computed; the estimate uses half as many columns.
+        The model; the estimate uses half as many columns.
     """
 
     reflections: MultipathModel
@@ -266,14 +269,14 @@ class GainEstimator:
 
     ALBEDO = 0.7
     SPREAD = 0.4
-    # Neighbouring nodes and images of the same view don't count in full.
+    # Weight of a coplanar node, as neighbouring nodes and similar images are correlated.
     TRUST = 0.05
-    # So many images are all looked at, then every so manieth, up to so many.
+    # The first images are all used, then every n-th one, up to a maximum number.
     FIRST, EVERY, MOST = 4, 8, 40
 
     @property
     def gain(self) -> float | None:
-        """The estimate; None before an image with surfaces."""
+        """Current estimate; None before the first image with surfaces."""
         if not self._bright:
             return None
         log = np.log(self._gains)
@@ -284,7 +287,7 @@ class GainEstimator:
         return float(np.exp((weight * log).sum() / weight.sum()))
 
     def add(self, image: ToFImage) -> None:
-        """Look at the next image of a recording, or pass it over."""
+        """Use the next image of a recording, or skip it."""
         turn = self._frames
         self._frames += 1
         if len(self._bright) >= self.MOST or (turn >= self.FIRST and turn % self.EVERY):
@@ -299,7 +302,7 @@ class GainEstimator:
         if not bright > 0:
             return
         if not self._bright:
-            # Brightest albedos of 1.4 (impossible, to be safe) down to 0.12.
+            # For albedos of the brightest surfaces from 1.4 (beyond the physical limit) to 0.12.
             self._gains = bright / np.geomspace(1.4, 0.12, 9)
             self._flat = np.zeros(len(self._gains))
         self._bright.append(bright)

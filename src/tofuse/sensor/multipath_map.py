@@ -1,4 +1,4 @@
-"""The surfaces that the lamp lights and the image does not show: remembered, or guessed."""
+"""Illuminated surfaces outside the image: mapped by earlier views, or extrapolated."""
 
 from __future__ import annotations
 
@@ -14,26 +14,23 @@ from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import PATCH
 from tofuse.sensor.multipath_surfaces import FALLOFF, LEAST_COSINE, Surfaces
 
-# The lamp is taken to light no wider than this.
+# Upper limit of the illumination angle, rad.
 _MAX_LAMP_ANGLE = np.pi / 3
-# Cells of the directions around the image, along its width.
+# Cells along the image's width of the grid around it.
 _CELLS = 12
-# Of the nodes along an image's border, this many rows and columns are taken to go on beyond it.
+# Rows and columns of nodes at the image's border that are extrapolated.
 _BORDER = 3
-# A plane that runs away, or into the camera, says nothing about what is there.
+# Range of the ratio of inverse depths up to which a plane is extrapolated.
 _GROWTH = np.array([0.3, 3.0])
-# Views are remembered when the camera has moved so far since the last that was: rad, and as a share
-# of the depth; and never more than so many.
+# A view is added when the camera has moved by this angle (rad), or distance relative to the depth,
+# since the last one; and the number of views that are kept.
 _ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
-# A surface is remembered where it was lit no more askance than this.
+# Smallest cosine of incidence of surfaces that are added.
 _MIN_INCIDENCE = 0.25
 
 
 class ReflectorMap:
-    """What a camera has seen of the surfaces around it, as sources of light.
-
-    Views are kept spaced by the motion of the camera, and the newest ones only.
-    """
+    """Map of the reflecting surfaces seen by recent views, spaced by the motion of the camera."""
 
     def __init__(self) -> None:
         self._views: deque[Float32] = deque(maxlen=_VIEWS)
@@ -46,12 +43,16 @@ class ReflectorMap:
         return self._patches
 
     def add(self, surfaces: Surfaces, trusted: Bool, T_world_camera: Float64) -> None:
-        """Remember the surfaces of a view at every other node, unless the last one was near.
+        """Add the surfaces of a view at every other node, unless the last view was near.
 
         Parameters
         ----------
+        surfaces
+            Of the view.
         trusted
-            (Hn, Wn) nodes at which there is a surface that stands still in the world.
+            (Hn, Wn) nodes that belong to the static scene.
+        T_world_camera
+            (4, 4) pose of the view.
         """
         lit = surfaces.good & (surfaces.albedo > 0)
         if not lit.any():
@@ -80,20 +81,20 @@ class ReflectorMap:
 
 @dataclass(eq=False)
 class OffscreenCells:
-    """The directions around an image that the lamp lights as well, in a grid of cells.
+    """Illuminated directions outside an image, as cells of the plane z = 1.
 
     Attributes
     ----------
     pitch
-        (2,) sides of a cell in the plane z = 1.
+        (2,) sides of a cell.
     rays
         (M, 2) x/z and y/z of the cells' centres.
     share
-        (M,) of a cell that the lamp lights.
+        (M,) illuminated fraction of a cell.
     planes
-        (M, 3) a, b, c of the plane 1/z = a x + b y + c that is known to be there; 0 where none is.
+        (M, 3) a, b, c of the mapped plane 1/z = a x + b y + c in the cell; 0 where unknown.
     albedo
-        (M,) in counts, as known of it.
+        (M,) its albedo in counts.
     """
 
     pitch: Float64
@@ -104,22 +105,24 @@ class OffscreenCells:
 
     @classmethod
     def of(cls, rays: Float32, lamp: float) -> OffscreenCells:
-        """Lay the grid around an image, whose rays (H, W, 2) are x/z and y/z, NaN where unknown.
+        """Make the cells around an image.
 
         Parameters
         ----------
+        rays
+            (H, W, 2) x/z and y/z of the image's pixels, NaN where unknown.
         lamp
-            Angle up to which the lamp lights, relative to that of the image's corner.
+            Illumination angle relative to that of the image's corner.
         """
         left, right, top, bottom = kernels.ray_bounds(rays).tolist()
-        # A ray is that of its pixel's middle.
+        # Rays are those of pixel centres.
         x = (right - left) / (2 * max(rays.shape[1] - 1, 1))
         y = (bottom - top) / (2 * max(rays.shape[0] - 1, 1))
         cells = _cells(left - x, top - y, right + x, bottom + y, lamp)
         return cls(*cells, np.zeros((len(cells[1]), 3)), np.zeros(len(cells[1])))
 
     def add_known(self, known: ReflectorMap, T_world_camera: Float64) -> None:
-        """Set the planes of the cells that show a surface of the map."""
+        """Set the planes of the cells that contain surfaces of a map."""
         if len(self.rays) and len(known.patches):
             kernels.project_patches(
                 known.patches,
@@ -131,13 +134,15 @@ class OffscreenCells:
             )
 
     def sources(self, surfaces: Surfaces, gain: float, wave_number: float) -> Float32:
-        """Sources (S, 9) as `kernels.multipath.exchange` takes them.
+        """Return the light sources (S, 9) outside the image, see `kernels.multipath.exchange`.
 
-        Where nothing is known, the plane of the nearest node at the image's border is taken to go
-        on, and its albedo.
+        Cells without a mapped surface extrapolate the plane and albedo of the nearest node at the
+        image's border.
 
         Parameters
         ----------
+        surfaces
+            Of the image.
         gain
             Counts of a white wall at 1 m.
         wave_number
@@ -166,7 +171,7 @@ class OffscreenCells:
 def _cells(
     left: float, top: float, right: float, bottom: float, lamp: float
 ) -> tuple[Float64, Float64, Float64]:
-    """Pitch (2,), rays (M, 2) and lit share (M,) of the cells: whole ones to the image."""
+    """Return pitch (2,), rays (M, 2) and illuminated fraction (M,) of the cells."""
     low, high = np.array([left, top]), np.array([right, bottom])
     width, height = high - low
     if not (width > 0 and height > 0):
@@ -180,6 +185,6 @@ def _cells(
     gi, gj = (g.ravel() for g in np.meshgrid(i, j))
     outside = (gi < 0) | (gi >= count[0]) | (gj < 0) | (gj >= count[1])
     rays = low + (np.stack([gi, gj], 1)[outside] + 0.5) * pitch
-    # A cell on the border of what is lit counts in part.
+    # Cells on the border of the illumination count in part.
     share = np.clip((limit - np.sqrt((rays**2).sum(1))) / pitch.mean() + 0.5, 0, 1)
     return pitch, rays[share > 0], share[share > 0]

@@ -1,4 +1,4 @@
-"""Surfaces and light at the nodes of a coarse grid, and the sources that they make."""
+"""Surfaces and their radiometry at the nodes of a coarse grid, for multipath."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from tofuse.arrays import Bool, Complex128, Float32, Float64
 from tofuse.kernels import multipath as kernels
 from tofuse.kernels.multipath import COLUMNS, A, W, X, Y
 
-# Light in a pixel falls as the cosine of its angle to the axis to this power, in the lens and from
-# the lamp together, and half of it in each.
+# Exponent of the cosine to the optical axis by which amplitude falls off: half of it is due to the
+# lens, half of it due to the lamp.
 FALLOFF = 4.0
 
-# Depths of a block further than this share from its median are another surface.
+# Relative distance from the median depth of a block at which a pixel is on another surface.
 _JUMP = 0.03
-# A plane fits where the misfit is below this share of the depth.
+# Largest rms misfit of a plane, relative to the depth.
 _FLAT = 0.006
-# The own light of slanter surfaces is too weak and too uncertain to divide by.
+# Lower limit of the cosine of incidence; the direct light of more oblique surfaces is too
+# uncertain.
 LEAST_COSINE = 0.12
 
 
 def block_nodes(z: Float32, rays: Float32, light: Float32, step: int) -> Float64:
-    """Nodes (Hn, Wn, COLUMNS) of an image, see `kernels.multipath`; planes are not yet fitted."""
+    """Return the nodes (Hn, Wn, COLUMNS) of an image without planes, see `kernels.multipath`."""
     size = -(-z.shape[0] // step), -(-z.shape[1] // step)
     nodes = np.empty((*size, COLUMNS))
     kernels.block_means(z, rays, light, step, _JUMP, nodes)
@@ -33,13 +34,15 @@ def block_nodes(z: Float32, rays: Float32, light: Float32, step: int) -> Float64
 def fit_planes(
     nodes: Float64, measured: Float64 | None = None, shift: Float64 | None = None
 ) -> None:
-    """Fit a plane to every node that lies on one, in windows of 5 and then of 3 nodes.
+    """Fit planes to the nodes, in windows of 5 x 5 and then of 3 x 3 nodes.
 
     Parameters
     ----------
+    nodes
+        (Hn, Wn, COLUMNS), updated.
     measured, shift
-        (Hn, Wn) radial range in m that was measured, and the bias by which the nodes' depth has
-        been corrected; none unless given.
+        (Hn, Wn) measured radial range in m, and the bias by which the nodes' depth has been
+        corrected; None if it has not been corrected.
     """
     if measured is None or shift is None:
         measured = ray_ranges(nodes)
@@ -52,7 +55,7 @@ def fit_planes(
 
 
 def ray_ranges(nodes: Float64) -> Float64:
-    """Radial range (Hn, Wn) in m of the nodes, 0 where there is none."""
+    """Return the radial range (Hn, Wn) in m of the nodes, 0 where invalid."""
     w = nodes[..., W]
     length = np.sqrt(1 + nodes[..., X] ** 2 + nodes[..., Y] ** 2)
     return np.where(w > 0, length / np.where(w > 0, w, 1), 0)
@@ -60,26 +63,26 @@ def ray_ranges(nodes: Float64) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Geometry and light at the nodes, all (Hn, Wn, ...).
+    """Geometry and radiometry at the nodes, all (Hn, Wn, ...).
 
     Attributes
     ----------
     nodes
         As of `block_nodes`, with planes.
     good
-        Where a plane fits; the others mean nothing elsewhere.
+        Whether a plane fits; the other attributes are undefined elsewhere.
     points, normals
         In m in the camera frame; unit, towards the camera.
     range_m
         Radial range in m.
     area
-        Of the block's piece of the surface, m^2.
+        Of the block on the surface, m^2.
     lit
-        Light of the lamp on the surface, relative to a surface that faces it 1 m away on the axis.
+        Direct irradiance, relative to a surface facing the lamp at 1 m on the axis.
     radiosity
-        What the surface was measured to send out, in counts: amplitude without the lens's falloff.
+        Measured radiosity in counts: amplitude without the falloff of the lens.
     albedo
-        Quotient of its own radiosity (without indirect light) and `lit`, in counts.
+        Direct radiosity (without indirect light) divided by `lit`, in counts.
     """
 
     nodes: Float64
@@ -99,7 +102,7 @@ class Surfaces:
         Parameters
         ----------
         factor
-            (Hn, Wn) by which indirect light has raised the amplitude, as far as known.
+            (Hn, Wn) current estimate of the factor by which multipath has raised the amplitude.
         """
         shape = nodes.shape[:2]
         good = np.empty(shape, bool)
@@ -111,7 +114,7 @@ class Surfaces:
         return cls(nodes, good, points, normals, *values)
 
     def bright(self) -> float:
-        """Albedo in counts that a tenth of the surface's area exceeds; 0 without light."""
+        """Return the area-weighted 90 % quantile of the albedo in counts; 0 if unknown."""
         pick = self.good & (self.albedo > 0)
         if not pick.any():
             return 0.0
@@ -122,12 +125,18 @@ class Surfaces:
 
 
 def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
-    """Sources (S, 9) as `kernels.multipath.exchange` takes them: 2 x 2 nodes, one where alike.
+    """Return the light sources (S, 9) of the surfaces, merging similar ones of 2 x 2 nodes.
 
     Parameters
     ----------
+    surfaces
+        Of the image.
     radiosity
-        (Hn, Wn) of the light that the nodes send out, with its phase on leaving.
+        (Hn, Wn) complex radiosity, with the phase on leaving.
+
+    Returns
+    -------
+    Sources as in `kernels.multipath.exchange`.
     """
     out = np.empty((surfaces.good.size, 9), np.float32)
     count = kernels.visible_sources(

@@ -1,14 +1,14 @@
-"""Light that the lens scatters over the image, and the range bias that it makes.
+"""Lens scattering: light that the lens spreads over the image, and the range bias it causes.
 
-Between lens and sensor a fraction of the light is reflected to and fro, and falls on other pixels:
-a bright, near object pulls the range of all others towards its own, in a pattern that is fixed to
-the image. What a pixel measures, as a phasor (amplitude and phase), is its own light plus a blur
-image of all light (Mure-Dubois and Huegli 2007, who take the blur for a sum of Gaussians, too)::
+Between lens and sensor a fraction of the light is reflected back and forth, and falls on other
+pixels: a bright, near object pulls the range of all others towards its own, in a pattern fixed to
+the image. A pixel measures, as a phasor (amplitude and phase), its own light plus a blurred image
+of all light, modelled by a sum of Gaussians (Mure-Dubois and Huegli 2007)::
 
     M = D + sum_i s_i G_i * D
 
-The fractions s_i can be seen where a thing moves before a background that stands still: whatever of
-the background's light follows the blur image of the thing was scattered.
+The fractions s_i are observable where an object moves in front of a static background: changes of
+the background that follow the blurred image of the object are due to scattering.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ from scipy.optimize import nnls
 
 from tofuse.arrays import Bool, Complex128, Float64
 
-# The blur is computed on an image of about so many columns.
+# Columns of the coarse image on which the blur is computed.
 _COLUMNS = 44
-# Fixed-point steps that take the scattered light off: each is right to one more power of its fraction.
+# Fixed-point iterations; each is accurate to one more power of the scattered fraction.
 _STEPS = 2
-# Fewest still pixels to learn from.
+# Smallest number of static pixels.
 _MIN_PIXELS = 200
-# Least chi^2 that scattering must explain to be believed: neighbouring pixels fraction some noise.
+# Smallest chi^2 that scattering must explain, as the noise of neighbouring pixels is correlated.
 _MIN_CHI2 = 50.0
-# Larger fractions than this in all are another effect.
+# Largest plausible total fraction.
 _MAX_FRACTION = 0.2
 
 
 @dataclass(frozen=True)
 class Scattering:
-    """How much light a lens scatters, and how far.
+    """Scattering model of a lens: a sum of Gaussian blurs.
 
     Attributes
     ----------
     widths
-        Standard deviations of the Gaussians, as fractions of the image's width.
+        Standard deviations of the Gaussians, relative to the image's width.
     fractions
-        Share of the light that goes into each.
+        Fraction of the light in each.
     """
 
     widths: tuple[float, ...]
     fractions: tuple[float, ...]
 
     def removed(self, measured: Complex128) -> Complex128:
-        """Return the measured light (H, W) without what was scattered onto each pixel.
+        """Return the measured phasors (H, W) without scattered light.
 
-        What is scattered varies slowly over the image, so it is computed on a coarse grid.
+        Scattered light varies slowly over the image, so it is computed on a coarse grid.
         """
         step = _coarse_step(measured.shape[1], min(self.widths))
         coarse = _reduce(measured, step)
@@ -66,9 +66,9 @@ class Scattering:
 
 
 def blur(light: Complex128, width: float) -> Complex128:
-    """Blur an image (H, W) by a Gaussian of `width` times its width; beyond it there is no light.
+    """Blur phasors (H, W) by a Gaussian of `width` times the image's width, padded by zeros.
 
-    Fine detail is lost in a wide blur, so that it is computed on a coarse grid.
+    Computed on a coarse grid.
     """
     step = _coarse_step(light.shape[1], width)
     small = _blur(_reduce(light, step), width * light.shape[1] / step)
@@ -106,24 +106,24 @@ def _enlarge(small: Float64, step: int, shape: tuple[int, ...]) -> Complex128:
 def estimate_fractions(
     light: Complex128, source: Bool, still: Bool, widths: tuple[float, ...]
 ) -> Float64:
-    """Find the fractions of light that a lens scatters from what moves onto what does not.
+    """Estimate the scattered fractions from moving objects in front of a static background.
 
-    Of each still pixel the change over time is compared with that of the blur images of what
-    moves (least squares, no fraction below 0). What changes all still pixels alike, the exposure or
-    the sensor's temperature, is taken off from both.
+    The change over time of static pixels is fitted by that of the blurred images of the moving
+    pixels (non-negative least squares). A change common to all static pixels, due to exposure or
+    temperature, is removed from both.
 
     Parameters
     ----------
     light
         (N, H, W) phasors.
     source, still
-        (H, W) where things move; where nothing does, in any of the images.
+        (H, W) masks of moving and of static pixels, over all images.
     widths
         See `Scattering`.
 
     Returns
     -------
-    The fraction of each width; all 0 where nothing is scattered, or nothing can be told.
+    The fraction of each width; all 0 if scattering is insignificant or not observable.
     """
     none = np.zeros(len(widths))
     still = still & (light != 0).all(0)
