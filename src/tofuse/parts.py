@@ -1,4 +1,4 @@
-"""Methods as small objects: named, configured by their fields, found without a list.
+"""Methods as small objects: named, configured by their fields, and discovered by import.
 
 A *part* is a frozen dataclass that implements one method of the literature behind one small
 interface (a filter, a matcher, an optimiser ...). Its fields are its options, so the object is

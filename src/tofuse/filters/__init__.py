@@ -1,1 +1,1 @@
-"""Filters: each looks at one view and says which of its points to keep (section 2.8)."""
+"""Filters: each computes a mask of the points of a view to keep (section 2.8)."""

@@ -1,4 +1,4 @@
-"""Keep points whose returned signal was neither too weak nor saturated."""
+"""Filter by amplitude: remove points with weak or saturated signals."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from tofuse.recordings.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 class Amplitude(Filter):
     """Keep points whose amplitude lies in a window (section 2.8).
 
-    Saturated pixels are removed whatever the window. A view without amplitude is kept whole.
+    Saturated pixels are always removed. Views without amplitude are unchanged.
 
     Attributes
     ----------
     minimum
         Lowest amplitude that is kept, in the recording's counts.
     maximum
-        Highest amplitude that is kept; None for no limit short of saturation.
+        Highest amplitude that is kept; None for no limit below saturation.
     """
 
     minimum: float = 0.0

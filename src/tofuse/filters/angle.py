@@ -1,4 +1,4 @@
-"""The neighbourhood angle of May et al. (2009), which tells jump edges from surfaces."""
+"""Jump-edge filter by the neighbourhood angle (May et al. 2009)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ from tofuse.recordings.frames import Frame, RangeFrame
 class NeighbourhoodAngle(Filter):
     """Remove points at jump edges by the neighbourhood angle (eq 2.6; May et al. 2009).
 
-    A point that mixes foreground and background, or lies on the rim of the foreground, has a
-    neighbour far behind it along nearly the same ray, so the angle at the point between the
-    camera and that neighbour approaches 180 degrees. On a surface seen at grazing angle g (0 when
-    seen edge on) it is at most about 180 degrees - g: the threshold is the tilt that is still
-    believed. The background beside an edge sees its neighbour in front (an angle near 0) and is
-    kept. Noise looks the same where it exceeds what the threshold lets pass between neighbours, at
-    170 degrees 5.7 times their spacing: on a camera as coarse and noisy as the SR4000 half of the
-    points go with it, so it belongs after a filter by confidence.
+    A flying pixel, or a point on the rim of the foreground, has a neighbour far behind it along
+    nearly the same ray, so the angle at the point between the camera and that neighbour approaches
+    180 degrees. On a surface seen at grazing angle g (0 when seen edge on) it is at most about 180
+    degrees - g, so the threshold sets the largest tilt that is kept. A background point next to an
+    edge has a neighbour in front of it (an angle near 0) and is kept. Noise has the same effect if
+    it exceeds, at 170 degrees, 5.7 times the spacing of neighbours: on a camera as coarse and noisy
+    as the SR4000 half of the points are removed, so this filter belongs after one by confidence.
 
     Attributes
     ----------
@@ -60,13 +59,13 @@ class NeighbourhoodAngle(Filter):
 
 
 def neighbourhood_angle(frame: RangeFrame) -> Float32:
-    """Neighbourhood angle xi (H, W) in rad; 0 at points without a valid neighbour.
+    """Return the neighbourhood angle xi (H, W) in rad; 0 at points without a valid neighbour.
 
     Eq 2.6 takes the arcsine of ``|p_n| sin(phi) / |p_n - p_i|``, by the law of sines the sine of
-    the angle at p_i in the triangle of the camera, p_i and a neighbour p_n of the eight. An
-    arcsine never exceeds 90 degrees and so can't tell an angle from its supplement, while the
-    method needs those near 180. The interior angle itself is computed here, from the sine and the
-    cosine, and the largest over the neighbours is returned.
+    the angle at p_i in the triangle of the camera, p_i and one of its eight neighbours p_n. An
+    arcsine does not distinguish an angle from its supplement, while the method needs those near 180
+    degrees. Therefore the interior angle is computed from its sine and cosine, and the largest over
+    the neighbours is returned.
     """
     out = np.zeros(frame.depth.shape, np.float32)
     points, valid = frame.point_image, frame.valid

@@ -1,4 +1,4 @@
-"""Keep what moves before a background that stands still, as it was learnt from the recording."""
+"""Background subtraction by depth, for moving objects in front of a static background."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from tofuse.recordings.frames import Frame, RangeFrame
 @part("filter", "background")
 @dataclass(frozen=True)
 class Background(Filter):
-    """Keep what lies before the background of a camera that stands still.
+    """Keep points in front of the background of a static camera.
 
     The background of a pixel is the farthest surface that it sees in several frames, sampled over
-    the whole recording. Where the object always hides it, that surface is the object's own: it
-    stands out in depth from what is around it, and continues what passes before its neighbours.
+    the whole recording. Where the object always occludes it, that surface belongs to the object: it
+    stands out in depth from its surroundings, and continues the object at neighbouring pixels.
 
     Attributes
     ----------
     sigmas, fraction
-        How far in front of the background a point must be: in standard deviations of the
-        background's depth, and as a fraction of it; both together.
+        Smallest distance of a point in front of the background: the sum of this number of standard
+        deviations of the background's depth, and this fraction of it.
     """
 
     sigmas: float = 4.0
@@ -46,7 +46,7 @@ class Background(Filter):
         return True
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
-        """See `Filter.mask`; InputError, as nothing has been learnt yet."""
+        """See `Filter.mask`; InputError, as the background has not been estimated."""
         raise InputError(
             "has not learnt the background",
             where="filter 'background'",
@@ -59,14 +59,14 @@ class Background(Filter):
         Raises
         ------
         InputError
-            If the camera moves, nothing moves, or the object can't be told from what it stands on.
+            If the camera moves, nothing moves, or the object can't be segmented from its support.
         """
         images = [frame for frame in frames if isinstance(frame, RangeFrame)]
         return FittedBackground(self, moving_object(images, self.sigmas, self.fraction))
 
 
 class FittedBackground(Background):
-    """A `Background` that knows what the background is."""
+    """A `Background` with an estimated background."""
 
     _found: MovingObject
 

@@ -1,4 +1,4 @@
-"""The interface of a filter, and applying a list of them."""
+"""The interface of filters, and the application of a list of them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tofuse.recordings.frames import Frame
 
 
 class Filter(Protocol):
-    """One way of telling good points from bad ones.
+    """A method that marks points of a view as invalid.
 
     Attributes
     ----------
     takes
-        Kinds of view it works on: "range", "cloud".
+        Kinds of view it accepts: "range", "cloud".
     window
-        How many frames it looks at, the current one included; 1 for all but temporal filters.
+        Number of frames it uses, the current one included; 1 for all but temporal filters.
     needs_fit
-        Whether it must see frames of the whole recording first.
+        Whether parameters are to be estimated from frames of the recording first.
     """
 
     part_kind: ClassVar[str] = "filter"
@@ -29,16 +29,16 @@ class Filter(Protocol):
 
     @property
     def window(self) -> int:
-        """How many frames it looks at, the current one included."""
+        """Number of frames it uses, the current one included."""
         return 1
 
     @property
     def needs_fit(self) -> bool:
-        """Whether it must see frames of the whole recording, with `fit`, before it works."""
+        """Whether `fit` must be called with frames of the recording before `mask`."""
         return False
 
     def fit(self, frames: Sequence[Frame]) -> Filter:
-        """Return the filter with what it has learnt from frames spread over a recording.
+        """Return the filter with parameters estimated from frames sampled over a recording.
 
         Parameters
         ----------
@@ -48,25 +48,25 @@ class Filter(Protocol):
         return self
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
-        """Say which points to keep.
+        """Return the mask of points to keep.
 
         Parameters
         ----------
         frame
-            The view, as the filters before this one left it.
+            The view, after the preceding filters.
         history
             Up to ``window - 1`` unfiltered frames just before it, oldest first.
 
         Returns
         -------
-        A mask of the shape of ``frame.valid``; only its value at valid points counts.
+        A mask of the shape of ``frame.valid``; its values at invalid points are ignored.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Removal:
-    """What one filter removed from one frame: `removed` of the `seen` points that reached it."""
+    """Statistics of one filter on one frame: it removed `removed` of `seen` points."""
 
     name: str
     seen: int
@@ -76,9 +76,9 @@ class Removal:
 def apply_filters(
     filters: Sequence[Filter], frame: Frame, history: Sequence[Frame] = ()
 ) -> tuple[Frame, list[Removal]]:
-    """Apply filters in order; each sees what the ones before it left.
+    """Apply filters in order, each to the result of the ones before.
 
-    Returns the filtered frame and what each filter removed.
+    Returns the filtered frame and the statistics of each filter.
     """
     removals = []
     for item in filters:

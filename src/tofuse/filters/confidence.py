@@ -1,4 +1,4 @@
-"""Keep what the camera itself is confident of."""
+"""Filter by the camera's confidence map."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tofuse.recordings.frames import Frame, RangeFrame
 class Confidence(Filter):
     """Keep points of at least a level of the camera's confidence map (section 2.8).
 
-    The SR4000 gives levels 0 to 7; chapter 4 keeps 7 alone. Other cameras count differently: see
-    `on_scale`. A view without a confidence map is kept whole.
+    The SR4000 gives levels 0 to 7; chapter 4 keeps level 7 only. For cameras with other levels see
+    `on_scale`. Views without a confidence map are unchanged.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Confidence(Filter):
             )
 
     def on_scale(self, highest: int) -> Confidence:
-        """Return the filter for a camera whose highest level is `highest`, as strict as this."""
+        """Return the equivalent filter for a camera whose highest level is `highest`."""
         return Confidence(-(-self.minimum * highest // self.highest), highest)
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:

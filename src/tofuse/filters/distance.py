@@ -1,4 +1,4 @@
-"""Keep points by where they are: within a distance of the camera, or within a box."""
+"""Filters by position: distance to the camera, and a box."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Distance(Filter):
     Attributes
     ----------
     minimum, maximum
-        Limits in m, both kept; None for no upper limit.
+        Limits in m, inclusive; None for no upper limit.
     measure
-        "z" for depth along the optical axis, "range" for the straight line to the camera. A cloud
-        has no optical axis: its distance is always the straight line to its origin.
+        "z" for depth along the optical axis, "range" for radial range. A cloud has no optical axis:
+        its distance is always that to its origin.
     """
 
     minimum: float = 0.0
@@ -63,7 +63,7 @@ class Box(Filter):
         Opposite corners (x, y, z) in m: x right, y down, z forward. Points on the faces are
         inside.
     remove
-        "outside" keeps what is in the box, "inside" cuts it away.
+        "outside" keeps the points in the box, "inside" removes them.
     """
 
     lower: tuple[float, float, float]

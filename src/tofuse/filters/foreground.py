@@ -1,4 +1,4 @@
-"""Keep an object in front of its background."""
+"""Segmentation of an object in front of its background by a depth threshold."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ _BINS = 256
 @part("filter", "foreground")
 @dataclass(frozen=True)
 class Foreground(Filter):
-    """Keep points nearer than a limit that the frame itself gives, or a given one.
+    """Keep points nearer than a limit, by default Otsu's threshold on the histogram of z.
 
-    For an object that turns before a background that does not: the limit is Otsu's threshold on
-    the histogram of z (Otsu 1979). A frame whose depths don't fall into two classes is kept whole,
-    as it shows one thing only.
+    For an object that turns in front of a static background (Otsu 1979). Frames whose depths don't
+    separate into two classes are unchanged.
 
     Attributes
     ----------
     limit
-        Farthest z that is kept, m; None to find it in each frame.
+        Largest z that is kept, m; None to estimate it in each frame.
     separability
-        Share of the variance of z that lies between the two classes (Otsu's eta), 0 to 1, that is
-        needed to believe in them. One evenly spread class gives 0.75, one bell curve 0.64.
+        Smallest fraction of the variance of z that lies between the two classes (Otsu's eta, 0 to
+        1). A uniform distribution has 0.75, a normal distribution 0.64.
     """
 
     limit: float | None = None
@@ -57,10 +56,10 @@ class Foreground(Filter):
 
 
 def otsu(values: Float32) -> tuple[float, float]:
-    """Find the threshold that parts values (N,) best into two classes (Otsu 1979, 256 bins).
+    """Return the threshold that best separates values (N,) into two classes (Otsu 1979, 256 bins).
 
-    Returns the threshold (the lower class is at most that) and Otsu's separability eta, 0 to 1:
-    the share of the variance that lies between the classes. (inf, 0) if all values are equal or
+    Returns the threshold (inclusive for the lower class) and Otsu's separability eta, 0 to 1: the
+    fraction of the variance that lies between the classes. (inf, 0) if all values are equal or
     there are none.
     """
     if len(values) == 0 or values.min() == values.max():
@@ -73,7 +72,7 @@ def otsu(values: Float32) -> tuple[float, float]:
     moment = np.cumsum(share * centre)[:-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         between = np.nan_to_num((mean * below - moment) ** 2 / (below * (1 - below)))
-    # Between two clusters any threshold is as good; the middle one leaves most room to both.
+    # Between two clusters all thresholds are equivalent; the central one has the largest margin.
     best = np.flatnonzero(between >= between.max() * (1 - 1e-9))
     first, last = int(best[0]), int(best[-1])
     total = (share * (centre - mean) ** 2).sum()

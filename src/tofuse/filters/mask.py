@@ -1,4 +1,4 @@
-"""Keep the pixels that an image marks."""
+"""Filter by a mask image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 @part("filter", "mask")
 @dataclass(frozen=True)
 class Mask(Filter):
-    """Keep the pixels at which a mask, one image for the whole recording, is not black.
+    """Keep the pixels at which a mask image, one for the whole recording, is not black.
 
     Attributes
     ----------

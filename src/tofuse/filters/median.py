@@ -1,4 +1,4 @@
-"""Remove pixels that stand out from those around them."""
+"""Outlier removal by the local median of the depth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 class Median(Filter):
     """Remove pixels whose z is further than a threshold from the local median (section 2.8).
 
-    Nothing is smoothed: what is kept is as it was measured.
+    Kept depths are not smoothed.
 
     Attributes
     ----------
@@ -50,9 +50,10 @@ class Median(Filter):
 
 
 def local_median(z: Float32, size: int) -> Float32:
-    """Median (H, W) of the valid (positive) pixels in the window around each; 0 if there is none.
+    """Return the median (H, W) of the valid (positive) pixels in the window around each pixel.
 
-    The window is cut at the image's border. Of an even number the two in the middle are averaged.
+    It is 0 without valid pixels. Windows of `size` x `size` are clipped at the border. Of an even
+    number of values the two central ones are averaged.
     """
     out = np.zeros_like(z)
     run_chunks(lambda a, b: window_median(z, size // 2, a, b, out), len(z))

@@ -1,4 +1,4 @@
-"""Remove points that are far from their nearest neighbours in space."""
+"""Outlier removal by the distance to the nearest neighbours in space."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tofuse.kernels.kdtree import KdTree
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 
-# More neighbours than this are no neighbourhood, and need memory for each of them and each point.
+# Upper limit of k, which bounds the memory.
 _MAX_NEIGHBOURS = 1000
 
 
@@ -29,7 +29,7 @@ class NeighbourDistance(Filter):
     threshold
         Largest mean distance that is kept, m.
     k
-        How many neighbours.
+        Number of neighbours.
     """
 
     threshold: float = 0.05
@@ -51,14 +51,15 @@ class NeighbourDistance(Filter):
 class NeighbourShare(Filter):
     """Remove a fraction of the points: those with the largest mean distance to their neighbours.
 
-    Chapter 4 removes half, by 3 neighbours. Of equal distances the later points go first.
+    Chapter 4 removes half of them, with 3 neighbours. Of equal distances later points are removed
+    first.
 
     Attributes
     ----------
     fraction
-        Share of the points to remove, 0 to 1, rounded down to whole points.
+        Fraction of the points to remove, 0 to 1, rounded down to whole points.
     k
-        How many neighbours.
+        Number of neighbours.
     """
 
     fraction: float = 0.5
@@ -81,21 +82,21 @@ class NeighbourShare(Filter):
 
 
 def mean_neighbour_distance(points: Float32, k: int) -> Float64:
-    """Mean distance (N,) in m of points (N, 3) to their k nearest others.
+    """Return the mean distance (N,) in m of points (N, 3) to their k nearest neighbours.
 
-    Of fewer than k others all count; a point alone is infinitely far from any.
+    If there are fewer than k other points, all are used; it is infinite for a single point.
     """
     n = len(points)
     if n < 2:
         return np.full(n, np.inf)
     k = min(k, n - 1)
-    # The nearest is the point itself, or one at the same place: either way at distance 0.
+    # The nearest neighbour is the point itself, or a duplicate of it, at distance 0.
     _, squares = KdTree(points).neighbours(points, k + 1)
     return np.sqrt(squares[:, 1:]).mean(1)
 
 
 def _spread(frame: Frame, keep: Bool) -> Bool:
-    """Put a value for each valid point where that point is in the frame."""
+    """Scatter the values of the valid points to the shape of the frame."""
     mask = np.zeros(frame.valid.shape, bool)
     mask[frame.valid] = keep
     return mask

@@ -1,4 +1,4 @@
-"""Keep points that hold still over time."""
+"""Outlier removal by the variation of depth over time."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tofuse.recordings.frames import Frame, RangeFrame
 class TemporalDeviation(Filter):
     """Remove pixels whose z varied too much over the last frames (section 2.8).
 
-    The thesis calls it a "z-variance threshold" and gives 25 mm, a length: here that is the
-    sample standard deviation of z at the pixel, over the frames in the window that measured it.
-    It means noise where the camera is still; while it moves, slopes and edges vary too. A pixel
-    that was measured only once is kept, as nothing is known against it.
+    The thesis calls it a "z-variance threshold" and gives a length, 25 mm: here that is the sample
+    standard deviation of z at the pixel, over the frames of the window in which it is valid. It
+    measures noise while the camera is static; while it moves, slopes and edges vary too. Pixels
+    with a single measurement are kept.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class TemporalDeviation(Filter):
 
 
 def z_deviation(z: Sequence[Float32]) -> Float64:
-    """Sample standard deviation (H, W) in m of z images (H, W), 0 = invalid left out.
+    """Return the sample standard deviation (H, W) in m of z images (H, W), ignoring invalid zeros.
 
     NaN where fewer than two images have a value.
     """

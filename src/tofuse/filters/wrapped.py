@@ -1,4 +1,4 @@
-"""Leave out surfaces beyond the camera's period, which it measures as near ones."""
+"""Removal of wrapped pixels: surfaces beyond the ambiguity range, measured as near ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.sensor.unwrap import UnwrapOptions, count_periods, white_amplitude
 
-# So many pixels of a view show how bright white is, and whether any are too dark.
+# Number of pixels of a view from which white is estimated, and dark pixels are counted.
 _ASKED = 10_000
 
 
@@ -25,23 +25,22 @@ _ASKED = 10_000
 class Wrapped(Filter):
     """Remove pixels whose phase wrapped, see `tofuse.sensor.unwrap`.
 
-    A view sees them where nothing is, and as the camera moves the same way as what it looks at
-    comes nearer, the next views see them at the same place: they are no outliers. What tells them
-    is their light, which is that of a far surface. Only views with pixels that are darker than any
-    matter would be at the range that was measured are looked at closely; there all goes that
-    `count_periods` puts beyond the period, with the white of the view itself.
+    Wrapped surfaces appear in free space, and consistently in consecutive views, so that they are
+    no outliers. They are detected by their amplitude, which is that of a far surface. Views are
+    examined only if some pixels are darker than any material would be at the measured range; then
+    these are removed, and all pixels that `count_periods` finds to be wrapped, with white estimated
+    from the view itself.
 
-    Works on cameras of one modulation frequency that record amplitude; others' views are kept
-    whole.
+    Works on cameras with one modulation frequency that record amplitude; other views are unchanged.
 
     Attributes
     ----------
     min_albedo
-        Least albedo that there is.
+        Lowest possible albedo.
     fraction
-        Fraction of the valid pixels that have to be darker than that.
+        Smallest fraction of the valid pixels that must be darker than that.
     options
-        How periods are counted.
+        Of the unwrapping.
     """
 
     min_albedo: float = 0.02

@@ -669,7 +669,7 @@ def _chunks(rows: int) -> int:
 
 
 def _edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
-    """Return the pixels within `margin` of a missing pixel or a relative depth difference of `jump`.
+    """Return the pixels within `margin` of an invalid pixel or a relative depth step of `jump`.
 
     Due to the blur of the lens they mix light of both sides.
     """

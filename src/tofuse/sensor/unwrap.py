@@ -1,16 +1,16 @@
-"""Whole periods of the phase, which a camera of one frequency can't measure.
+"""Phase unwrapping for cameras with a single modulation frequency.
 
-Beyond the ambiguity P a surface at r + P is measured at r. Two things tell it apart. Its light is
-that of a far surface: raw amplitude falls with the squared range, so that the albedo that its
-amplitude means at r is too small by (r / (r + P))^2, a factor of thirty at r = 1 m and P = 5 m.
-And it goes on in its neighbours: a floor that leaves one period enters the next.
+With the ambiguity range P, a surface at r + P is measured at r. Two cues identify it. Its amplitude
+is that of a far surface: raw amplitude falls with the squared range, so that the albedo implied at
+r is too small by (r / (r + P))^2, a factor of thirty at r = 1 m and P = 5 m. And it is continuous:
+a floor that leaves one period enters the next.
 
-What is too weak to be measured comes at any range, and would have any number of periods. A surface
-is what pixels measure together (`on_surface`); nothing else is moved, or tells of wraps.
+Pixels with a weak signal have random ranges, and would get random wraps. Therefore only pixels that
+measure a surface together with their neighbours (`on_surface`) are unwrapped and used.
 
-Both are costs of a random field over the image, whose most likely state is found by belief
-propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude). Several frequencies need
-none of that: see `tofuse.sensor.frequencies`.
+Both cues are costs of a Markov random field over the image, which is minimised by belief
+propagation (Droeschel et al. 2010; McClure et al. 2010 for the amplitude). For several frequencies
+see `tofuse.sensor.frequencies`.
 """
 
 from __future__ import annotations
@@ -29,46 +29,47 @@ from tofuse.arrays import Bool, Float32, Float64, Int32, Intp
 from tofuse.kernels.threads import run_chunks
 from tofuse.kernels.unwrap import pass_messages
 
-# Of an image's pixels so many are taken to be brighter than white: gloss, noise.
+# Fraction of pixels that may be brighter than white, due to gloss and noise.
 _GLOSSY = 0.01
-# Slopes are told from blocks so far on either side, of a phase averaged over so many: far surfaces
-# are noisy. Less than the last cosine of incidence is not believed.
+# Slopes are differences between blocks at this distance on either side, of the phase averaged over
+# windows of this size; and the lower limit of the cosine of incidence.
 _REACH, _WIDE, _MIN_COSINE = 2, 5, 0.25
 _MAX_MOVES = 100
-# Neighbours on one surface differ by less than this share of the period, more than so many of the
-# eight: at random a pixel has so many once in a hundred times (binomial, chance 0.2 each).
+# Neighbours on one surface differ by less than this fraction of the period, and more than this
+# fraction of the neighbours do: a random pixel has that many with a probability of 1 % (binomial,
+# 0.2 each).
 _SAME_SURFACE, _MIN_AGREEING = 0.1, 0.5
-# Fewer neighbours than this prove nothing.
+# Smallest number of valid neighbours.
 _MIN_NEIGHBOURS = 3
 
 
 @dataclass(frozen=True)
 class UnwrapOptions:
-    """What speaks for a number of periods, and how much.
+    """Costs and limits of phase unwrapping.
 
     Attributes
     ----------
     periods
-        Most periods that a surface lies beyond the first.
+        Largest wrap count.
     albedo, spread
-        Albedos are log-normal about the first, with the second as the logarithm's deviation.
+        Median of the log-normal albedo prior, and standard deviation of its logarithm.
     max_albedo_cost
-        Most that the albedo of one block may cost.
+        Upper limit of the albedo cost of a block.
     wrap_cost
-        What each period costs: without anything else nothing is moved.
+        Cost of each wrap, which favours unwrapped surfaces in the absence of evidence.
     albedo_weight
-        Share of these costs that counts: blocks of one surface are dark or bright together.
+        Weight of these costs, below 1 as the albedos of a surface's blocks are correlated.
     scale
-        Difference of neighbours that costs 1, as a share of the period.
+        Difference between neighbours that costs 1, relative to the period.
     max_difference_cost
-        Most that a difference may cost: that of a jump.
+        Upper limit of the cost of a difference, reached at depth edges.
     min_entry
-        Surfaces are moved only if at least this share of their rim goes on across the period:
-        dark ones that nothing leads to stay.
+        Smallest fraction of a wrapped surface's boundary that continues an unwrapped surface across
+        the period. Otherwise the surface is dark, not wrapped.
     columns
         Blocks along the image's width.
     iterations
-        Of the messages: about how many blocks one place can tell another.
+        Of the message passing: the distance in blocks over which information propagates.
     """
 
     periods: int = 2
@@ -88,9 +89,14 @@ _DEFAULT = UnwrapOptions()
 
 
 def white_amplitude(light: Float32, radial_range: Float32, valid: Bool) -> float:
-    """Return the raw light of a white surface at 1 m as the brightest of an image tell it, or 0.
+    """Estimate the raw amplitude of a white surface at 1 m from the brightest pixels; 0 if unknown.
 
-    Wrapped pixels look too dark, not too bright, so they do no harm unless there is nothing else.
+    Wrapped pixels appear too dark, so they have no effect unless most pixels are wrapped.
+
+    Parameters
+    ----------
+    light, radial_range, valid
+        (H, W) raw amplitude, radial range in m, and mask.
     """
     seen = valid & (light > 0)
     if not seen.any():
@@ -100,15 +106,17 @@ def white_amplitude(light: Float32, radial_range: Float32, valid: Bool) -> float
 
 
 def on_surface(radial_range: Float32, period_m: float) -> Bool:
-    """Tell which pixels (H, W) measure a surface together with their neighbours.
+    """Return the mask (H, W) of pixels that measure a surface together with their neighbours.
 
-    Whole periods between them don't count. Pixels without light to speak of are at random ranges,
-    and are on none.
+    Differences are taken modulo the period. Pixels with a weak signal have random ranges, and are
+    on no surface.
 
     Parameters
     ----------
     radial_range
         (H, W) in m, 0 where invalid.
+    period_m
+        Ambiguity range.
     """
     seen = radial_range > 0
     ranges, known = np.pad(radial_range, 1), np.pad(seen, 1)
@@ -137,7 +145,7 @@ def count_periods(
     pitch: float,
     options: UnwrapOptions = _DEFAULT,
 ) -> Int32:
-    """Return how many periods (H, W) each pixel is to be moved back by.
+    """Return the wrap count (H, W): the number of periods to add to each pixel's range.
 
     Parameters
     ----------
@@ -146,9 +154,9 @@ def count_periods(
     light
         (H, W) raw amplitude, not compensated for range; 0 where unknown.
     period_m
-        Range after which the measurement repeats.
+        Ambiguity range.
     white
-        Light of a white surface at 1 m, see `white_amplitude`; 0 where that is not known.
+        Raw amplitude of a white surface at 1 m, see `white_amplitude`; 0 if unknown.
     pitch
         Angle between neighbouring pixels, rad.
     options
@@ -179,7 +187,7 @@ def count_periods(
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Range (h, w) in [0, period) of the light of square blocks, its mean, and which have any."""
+    """Range (h, w) in [0, period), mean amplitude and validity of square blocks of pixels."""
 
     range_m: Float32
     light: Float32
@@ -196,7 +204,7 @@ class _Blocks:
             return whole.reshape(rows, side, columns, side).sum((1, 3))
 
         seen = radial_range > 0
-        # Its strength does not count in full, or bright surfaces would swallow dark ones beside.
+        # Weighted by the root of the amplitude, so that bright surfaces don't dominate dark ones.
         strength = np.where(seen, np.sqrt(np.maximum(light, 0)) + 1e-3, 0)
         phase = 2 * np.pi * radial_range.astype(float) / period
         range_m = _range_of(
@@ -215,7 +223,7 @@ def _range_of(real: Float64, imaginary: Float64, period: float) -> Float32:
 def _albedo_cost(
     blocks: _Blocks, period: float, white: float, pitch: float, options: UnwrapOptions
 ) -> Float32:
-    """Cost (h, w, K) of each number of periods by the albedo that it means."""
+    """Return the cost (h, w, K) of each wrap count by the albedo that it implies."""
     phase = 2 * np.pi * blocks.range_m.astype(float) / period
     real = uniform_filter(np.where(blocks.valid, np.cos(phase), 0), _WIDE)
     imaginary = uniform_filter(np.where(blocks.valid, np.sin(phase), 0), _WIDE)
@@ -223,7 +231,7 @@ def _albedo_cost(
     cost = np.empty((*blocks.range_m.shape, options.periods + 1), np.float32)
     for k in range(options.periods + 1):
         beyond = np.maximum(blocks.range_m + k * period, 1e-6)
-        # A slanted surface is darker; how slanted it is depends on how large its pixels are.
+        # The slope implied by neighbouring ranges depends on the size of a pixel at that range.
         cosine = np.maximum(1 / np.sqrt(1 + (slope / beyond) ** 2), _MIN_COSINE)
         albedo = np.maximum(blocks.light * beyond**2 / (white * cosine), 1e-6)
         unlikely = 0.5 * (np.log(albedo / options.albedo) / options.spread) ** 2
@@ -232,7 +240,7 @@ def _albedo_cost(
 
 
 def _slope(range_m: Float32, period: float) -> Float32:
-    """Change (h, w) of the range to the next block, over the period where that is the shorter."""
+    """Return the gradient magnitude (h, w) of the range per block, modulo the period."""
     squares = np.zeros(range_m.shape, np.float32)
     for axis in (0, 1):
         wide = [(_REACH, _REACH) if a == axis else (0, 0) for a in (0, 1)]
@@ -248,11 +256,11 @@ def _slope(range_m: Float32, period: float) -> Float32:
 def _with_surfaces_moved(
     blocks: _Blocks, unary: Float32, best: Intp, period: float, options: UnwrapOptions
 ) -> Intp:
-    """Move whole surfaces by periods while that makes the state likelier.
+    """Shift whole surfaces by periods while that decreases the cost.
 
-    Messages that go round in loops may settle with a part of a surface a period off. A surface is
-    what hangs together but for jumps; those that gain most are moved first, and none beside one
-    that has just been moved.
+    Loopy belief propagation may converge with a part of a surface a period off. Surfaces are the
+    components connected without jumps. Those with the largest gain are shifted first, and none that
+    is adjacent to one shifted in the same iteration.
     """
     height, width = best.shape
     index = np.arange(height * width).reshape(height, width)
@@ -292,7 +300,7 @@ def _with_surfaces_moved(
             gain[better], move[better] = -total[better], shift
         if not move.any():
             break
-        # Only those that no neighbour outbids; ties go to the first.
+        # Only those with a larger gain than their neighbours; ties go to the first.
         order = np.lexsort((np.arange(count), -gain))
         rank = np.empty(count, np.intp)
         rank[order] = np.arange(count)
@@ -305,7 +313,7 @@ def _with_surfaces_moved(
 
 
 def _without_unentered(blocks: _Blocks, best: Intp, period: float, options: UnwrapOptions) -> Intp:
-    """Put back what was moved though no surface leads into it across the period."""
+    """Reset wrapped components that no surface continues into across the period."""
     moved = (best > 0) & blocks.valid
     pieces, count = label(moved)
     rim = np.zeros(count + 1)
@@ -330,7 +338,7 @@ def _upsample(
     side: int,
     most: int,
 ) -> Int32:
-    """Periods (H, W) of pixels: those of the block around that they lie nearest to."""
+    """Return the wrap count (H, W) of pixels: that of the nearest block in range around them."""
     height, width = radial_range.shape
     rows, columns = best.shape
     out = np.zeros((height, width), np.int64)
@@ -343,7 +351,7 @@ def _upsample(
             )
             difference = blocks.range_m[here] - radial_range
             across = np.rint(difference / period)
-            # A pixel's own block is taken unless another one fits clearly better.
+            # A pixel's own block is preferred unless another one is clearly nearer.
             off = np.abs(difference - across * period) + (0.02 * period if down or right else 0)
             better = blocks.valid[here] & (off < nearest)
             out[better] = (best[here] + across.astype(np.int64))[better]
