@@ -7,7 +7,7 @@
 >>> result.mesh.save("model.glb")
 >>> T = tofuse.register(source, target).T_target_source
 
-Names are imported when they are first used, so that ``import tofuse`` is quick.
+Names are imported on first use, so that ``import tofuse`` is fast.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A reconstruction with what one does with it: `tofuse.reconstruct` and `tofuse.load`."""
+"""`tofuse.reconstruct`, `tofuse.merge` and `tofuse.load`, and the result that they return."""
 
 from __future__ import annotations
 
@@ -47,14 +47,22 @@ class Result(Reconstruction):
     Attributes
     ----------
     source
-        The recording that it was made of; None for one that was loaded.
+        The recording that it was made from; None for a result that was loaded.
     """
 
     source: Recording | None = None
 
     @classmethod
     def of(cls, found: Reconstruction, source: Recording | None = None) -> Self:
-        """Give a reconstruction, such as that of `Mapper.finish`, these methods."""
+        """Make a result of a reconstruction, such as that of `Mapper.finish`.
+
+        Parameters
+        ----------
+        found
+            The reconstruction.
+        source
+            The recording that it was made from, if known.
+        """
         own = {f.name: getattr(found, f.name) for f in fields(Reconstruction)}
         return cls(**own, source=source)
 
@@ -64,16 +72,23 @@ class Result(Reconstruction):
         return SEPARATOR.join(card(self))
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the output folder of ``tofuse run``; returns it.
+        """Write the files of ``tofuse run``, and return the folder.
 
-        The report of a result that was loaded shows nothing of its recording.
+        The report of a loaded result contains no images of its recording.
+
+        Parameters
+        ----------
+        folder
+            A new or empty folder, or one with an earlier result.
+        overwrite
+            Whether to replace an earlier result.
 
         Raises
         ------
         OutputError
-            If the folder holds something else, or a result and `overwrite` is not given.
+            If the folder contains anything but a result, or a result and `overwrite` is not set.
         """
-        # BLAS sums differ with its number of threads.
+        # BLAS results depend on its number of threads.
         with OutputFolder(folder, overwrite=overwrite) as out, threadpool_limits(1):
             write_result(self, out, self._write_report)
         return Path(folder)
@@ -107,23 +122,23 @@ class Result(Reconstruction):
         ----------
         reference
             A file, or (N, 4, 4) T_world_camera of the same frames, NaN where there is none. None:
-            the poses that came with the recording.
+            the reference poses of the recording.
         reference_error_m
-            By how much the reference may be off, rms.
+            Rms error of the reference itself, m.
 
         Raises
         ------
         InputError
-            If there is no reference, or it is of something else.
+            If there is no reference, or it does not match the frames.
         """
         known = reference
         if known is None:
             known = None if self.source is None else self.source.reference
         if known is None:
             raise InputError(
-                "came with no reference poses",
-                where="the recording" if self.source else "a result that was loaded",
-                remedy="give them as reference",
+                "has no reference poses",
+                where="the recording" if self.source else "the loaded result",
+                remedy="pass a reference",
             )
         given = known if isinstance(known, str | Path) else np.asarray(known, float)
         return evaluate(
@@ -137,9 +152,17 @@ class Result(Reconstruction):
     def view(
         self, *, port: int | None = None, open_browser: bool = True
     ) -> AbstractContextManager[ViserServer]:
-        """Show the result in the browser, as ``tofuse view`` does, until the server is stopped.
+        """Show the result in the browser, as ``tofuse view`` does, and return the server.
 
-        The page is served by threads of this process: a script that ends, ends it. Needs viser.
+        The page is served by threads of this process, until the server is stopped or the process
+        ends. Requires viser.
+
+        Parameters
+        ----------
+        port
+            Port of the server; None: 8080, or the next free one.
+        open_browser
+            Whether to open the page in the browser.
         """
         from tofuse.viewer.app import ResultView
         from tofuse.viewer.result import read_result
@@ -155,7 +178,7 @@ class Result(Reconstruction):
         return server
 
     def plot(self) -> Plot:
-        """Draw the model and the path of the camera from above and from the side."""
+        """Draw the model and the camera trajectory from above and from the side."""
         from tofuse.report import plots
 
         points = self.cloud.points.astype(float) + self.cloud.offset
@@ -176,18 +199,24 @@ class Result(Reconstruction):
 
         rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
         scene = make_scene(self, rows)
-        said = html.escape(self.accuracy)
-        word = html.escape(self.diagnostics.verdict.capitalize())
+        accuracy = html.escape(self.accuracy)
+        verdict = html.escape(self.diagnostics.verdict.capitalize())
         picture = ""
         if len(scene.points):
             source = images.data_uri(still(scene, _THUMBNAIL))
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
-        return f"<div>{picture}<b>{word}</b>: {said}</div>"
+        return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
 
 
 @dataclass(frozen=True, repr=False)
 class Plot:
-    """Drawings, each an SVG element; a notebook shows them side by side."""
+    """Drawings that a notebook shows side by side.
+
+    Attributes
+    ----------
+    drawings
+        SVG elements.
+    """
 
     drawings: tuple[str, ...]
 
@@ -200,7 +229,7 @@ class Plot:
         return f'<div style="display:flex;flex-wrap:wrap;gap:16px;{style}">{boxes}</div>'
 
     def save(self, path: str | Path) -> None:
-        """Write a page that shows them (.html)."""
+        """Write an HTML page with the drawings to a path."""
         from tofuse.files.atomic import write_text
 
         write_text(path, f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n')
@@ -222,23 +251,23 @@ def reconstruct(
     Parameters
     ----------
     recording
-        What `tofuse.open` or `tofuse.from_arrays` gives.
+        A recording of `tofuse.open` or `tofuse.from_arrays`.
     config
         A configuration or the name of one ("default", "thesis").
     seed
-        One seed, one result.
+        Random seed.
     threads
-        How many threads to use; None: all cores. The result does not depend on it.
+        Number of threads; None: all cores. The result does not depend on it.
     loops
-        Loops known beforehand, in frame indices.
+        Known loop closures, in frame indices.
     progress
-        True: bars on the terminal.
+        True: progress bars on the terminal.
 
     Raises
     ------
     InputError
         If no frame can be read, or none has enough valid points for a pose; or if a filter can't
-        learn what it has to.
+        estimate its parameters from the recording.
     """
     with _shown(progress) as seen:
         found = reconstruct_recording(
@@ -255,27 +284,27 @@ def merge(
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Result:
-    """Put the results of several runs into one map, in the world of the first.
+    """Merge the results of several runs into one map, in the world frame of the first.
 
     Parameters
     ----------
     results
         Output folders of ``tofuse run`` or ``tofuse merge``; at least two sessions. Their
-        recordings must be where they were.
+        recordings must still be at their paths.
     tolerance_m
-        As of `Config`; that of the first result unless given.
+        Accuracy required of a good map, m; by default that of the first result.
     seed, threads, progress
-        As of `reconstruct`.
+        As for `reconstruct`.
 
     Returns
     -------
-    A result as of a run, with `sessions` and `session_pairs`. What can't be joined to the first one
-    is a component with a model of its own.
+    A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
+    first one are components with their own models.
 
     Raises
     ------
     InputError
-        If something is no result, or its recording is gone or has changed.
+        If a folder is not a result, or its recording is missing or has changed.
     """
     with _shown(progress) as seen:
         found = merge_results(
@@ -289,12 +318,12 @@ def _shown(progress: Progress | bool | None) -> AbstractContextManager[Progress 
 
 
 def load(folder: str | Path) -> Result:
-    """Read the output folder of ``tofuse run`` or of `Result.save`.
+    """Read a result of ``tofuse run`` or `Result.save` from its folder.
 
     Raises
     ------
     InputError
-        If it is no such folder, or what it holds is damaged or of different runs.
+        If it is not an output folder, or its files are damaged or of different runs.
     """
     from tofuse.viewer.kept import read_kept
 

@@ -61,7 +61,7 @@ class Cloud:
         return GeometryRecord(points, normals=self.normals, color=self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
-        """Write it as .ply, .pcd, .las, .laz or .e57, see `exchange.save`."""
+        """Write the cloud to a path ending in .ply, .pcd, .las, .laz or .e57."""
         exchange.save(self.record(), path)
 
     def to_trimesh(self) -> Any:

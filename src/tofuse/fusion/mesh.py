@@ -68,7 +68,7 @@ class Mesh:
         return GeometryRecord(points, self.faces, self.normals, self.color, scalars=scalars)
 
     def save(self, path: str | Path) -> None:
-        """Write it as .glb, .gltf, .ply, .obj, .stl or .usdz, see `exchange.save`."""
+        """Write the mesh to a path ending in .glb, .gltf, .ply, .obj, .stl or .usdz."""
         exchange.save(self.record(), path)
 
     def to_trimesh(self) -> Any:
@@ -175,10 +175,16 @@ class Mesh:
             cell *= float(np.clip((len(left) / faces) ** 0.6, 1.02, 2.0))
 
     def simplified(self, cell_m: float) -> Mesh:
-        """Return the mesh with the vertices in each cube of a grid put together, on either side.
+        """Return the mesh simplified by clustering vertices in the cells of a grid.
 
-        The vertex clustering of Rossignac and Borrel (1993), at the place nearest to the planes of
-        the triangles around (Lindstrom 2000): edges and corners stay sharp.
+        Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
+        with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
+        that edges and corners stay sharp.
+
+        Parameters
+        ----------
+        cell_m
+            Edge of a cell, m.
         """
         if len(self) == 0:
             return self

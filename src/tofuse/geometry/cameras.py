@@ -92,7 +92,17 @@ def _zero_nan(a: Float32) -> Float32:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Pinhole camera (eq 2.1): u = fx x/z + cx, v = fy y/z + cy. Sizes in pixels."""
+    """Pinhole camera (eq 2.1): u = fx x/z + cx, v = fy y/z + cy.
+
+    Attributes
+    ----------
+    width, height
+        Size of the image, pixels.
+    fx, fy
+        Focal lengths, pixels.
+    cx, cy
+        Principal point, pixels; (0, 0) is the centre of the first pixel.
+    """
 
     width: int
     height: int
@@ -115,7 +125,7 @@ class Pinhole:
         return _frozen(self._undistort(_pixel_grid(self)).astype(np.float32))
 
     def project(self, points: ArrayLike) -> Float64:
-        """See `Camera.project`."""
+        """Project points (..., 3) in m; see `Camera.project`."""
         points = np.asarray(points, float)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         distorted = self._distort(points[..., :2] / z[..., None])
@@ -200,7 +210,7 @@ class Rational(BrownConrady):
 
 @dataclass(frozen=True)
 class Fisheye(Pinhole):
-    """Equidistant lens with k1 to k4 on the angle (Kannala and Brandt 2006, OpenCV's fisheye)."""
+    """Equidistant lens with k1, k2, k3, k4 on the angle (Kannala and Brandt 2006, OpenCV)."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -316,7 +326,7 @@ class RayTable:
         return np.where(np.isfinite(self.table), self.table, self.fit.rays()).astype(float)
 
     def project(self, points: ArrayLike) -> Float64:
-        """See `Camera.project`. Newton's method on the bilinearly interpolated table."""
+        """Project points by Newton's method on the interpolated table; see `Camera.project`."""
         points = np.asarray(points, float)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         target = points[..., :2] / z[..., None]

@@ -15,24 +15,26 @@ from tofuse.recordings.recording import Recording
 
 @dataclass
 class Player:
-    """Gives each frame when its time has come, and drops those that nobody asked for in time.
+    """Plays a recording in real time, dropping frames that were not requested in time.
 
-    A camera does not wait: whoever comes back late gets the newest frame. Iterate over it, and push
-    the frames into a `Mapper`.
+    Like a live camera, it yields the newest frame to a late caller. Iterate over it, and push the
+    frames into a `Mapper`.
 
     Attributes
     ----------
     recording
-        What to play. Its timestamps must not go back.
+        The recording. Its timestamps must not decrease.
     speed
-        How many times faster than it was recorded.
+        Playback speed relative to real time.
+    clock, sleep
+        Functions that return the time in s, and that wait for a number of s.
     dropped
-        Indices (in the source) of the frames dropped so far, those that can't be read among them.
+        Indices (in the source) of the frames dropped so far, including unreadable ones.
 
     Raises
     ------
     InputError
-        If the timestamps or the speed can't be played by.
+        If timestamps decrease, or the speed is not positive.
     """
 
     recording: Recording

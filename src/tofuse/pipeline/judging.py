@@ -116,23 +116,27 @@ def judge(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Judgement:
-    """Say how accurate poses from anywhere are, without a reference.
+    """Assess the accuracy of poses from any source, without a reference.
 
     Parameters
     ----------
     recording
-        What `tofuse.open` gives; images of a camera.
+        Range images, as of `tofuse.open`.
     trajectory
         A file of any format of `files.trajectory_formats`, the folder of a result, or (N, 4, 4)
-        T_world_camera of the frames, NaN where there is none. Poses with times belong to the frames
-        that are nearest in time, within 20 ms.
+        T_world_camera of the frames, NaN where there is none. Poses with times are assigned to the
+        frames that are nearest in time, within 20 ms.
     tolerance_m
-        As of `Config`.
+        Accuracy required of good poses, m; see `Config`.
+    threads
+        Number of threads; None: all cores. The result does not depend on it.
+    progress
+        Shows the progress.
 
     Raises
     ------
     InputError
-        If fewer than two frames have a pose, or the recording holds clouds.
+        If fewer than two frames have a pose, or the recording contains clouds.
     """
     progress = progress or Silent()
     poses = poses_for(recording, trajectory)

@@ -216,12 +216,24 @@ class Optimiser(Protocol):
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """A candidate for a loop, and what was decided; `i` < `j` are frame indices.
+    """A candidate for a loop closure, and the decision about it; None where not computed.
 
-    `overlap` is the share of points with a partner, `rms_m` their rms distance,
-    `free_space_violation` the share of points that one view put where the other saw through,
-    `margin` by what share of the points the pose that a search found leads its best rival (None
-    where not computed).
+    Attributes
+    ----------
+    i, j
+        Frame indices, i < j.
+    accepted
+        Whether it is in the pose graph.
+    reason
+        Why it was rejected; may be empty.
+    overlap
+        Fraction of points with a correspondence, 0 to 1.
+    rms_m
+        Rms distance of the correspondences, m.
+    free_space_violation
+        Fraction of points of one view in the free space of the other, 0 to 1.
+    margin
+        Lead of the pose found by a search over its best rival, as a fraction of the points.
     """
 
     i: int

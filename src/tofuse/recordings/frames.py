@@ -227,7 +227,25 @@ class RangeFrame:
 
 @dataclass(frozen=True, eq=False)
 class CloudFrame:
-    """A view without a camera: N points, see `View`; `of` drops non-finite ones."""
+    """A view without a camera model: N points.
+
+    Attributes
+    ----------
+    index, timestamp
+        Frame index in the recording, and s.
+    points
+        (N, 3) m, finite, in the sensor frame.
+    normals
+        (N, 3) unit normals; None where not known.
+    sigma
+        (N,) standard deviation of the range, m; None where not known.
+    amplitude
+        (N,) amplitude or intensity; None where not recorded.
+    color
+        (N, 3) RGB; None where not recorded.
+    origin
+        (3,) position of the sensor in the frame of the points, m.
+    """
 
     index: int
     timestamp: float
@@ -248,7 +266,15 @@ class CloudFrame:
 
     @classmethod
     def of(cls, points: ArrayLike, *, index: int = 0, timestamp: float = 0.0) -> Self:
-        """Return a cloud of an (N, 3) array in m, without non-finite points."""
+        """Make a view of points (N, 3) in m, dropping non-finite ones.
+
+        Parameters
+        ----------
+        points
+            (N, 3) m.
+        index, timestamp
+            Frame index, and s.
+        """
         array = np.asarray(points)
         if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
             raise InputError(

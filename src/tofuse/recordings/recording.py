@@ -98,7 +98,17 @@ class Recording:
 
     @classmethod
     def of(cls, source: Source, path: str | Path, format: str) -> Recording:  # noqa: A002
-        """Make a recording of all frames of a source."""
+        """Make a recording of all frames of a source.
+
+        Parameters
+        ----------
+        source
+            Reads the frames.
+        path
+            Where they come from, for messages.
+        format
+            Name of the reader.
+        """
         return cls(source, str(path), format, np.arange(len(source.timestamps)))
 
     def __repr__(self) -> str:
@@ -179,11 +189,11 @@ class Recording:
         return items
 
     def readable(self, count: int) -> list[Frame]:
-        """Read as `sample` does, without what can't be read."""
+        """Read the readable frames among `count` evenly spaced ones; see `sample`."""
         return [item for item in self.sample(count) if not isinstance(item, UnreadableFrameError)]
 
     def images(self, count: int) -> list[RangeFrame]:
-        """Read as `readable` does; raise InputError where there are clouds among the frames."""
+        """Read the readable images among `count` evenly spaced frames; InputError for clouds."""
         out: list[RangeFrame] = []
         for frame in self.readable(count):
             if not isinstance(frame, RangeFrame):
@@ -213,9 +223,17 @@ class Recording:
     def read_with(
         self, work: Callable[[Frame], R], ahead: int = 8, *, first: int = 0
     ) -> Iterator[tuple[Frame | UnreadableFrameError, R | None]]:
-        """Iterate as `read_all` does, and give what `work` makes of each frame, where it was read.
+        """Iterate as `read_all` does, with the result of a function of each frame.
 
-        None stands beside a frame that can't be read. Frames are not worked on in order.
+        Parameters
+        ----------
+        work
+            Called with each frame on the thread that read it, in no particular order. The result
+            is None for frames that can't be read.
+        ahead
+            Maximum number of frames that are read in advance.
+        first
+            Position of the first frame.
         """
 
         def read(index: int) -> tuple[Frame | UnreadableFrameError, R | None]:
