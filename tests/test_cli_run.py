@@ -37,7 +37,7 @@ from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.results.folder import LOCK, STAGING
 from tofuse.results.types import Component, Reason, Reconstruction
 from tofuse.results.verdict import ADVICE, REASONS
-from tofuse.viewer.result import read_result
+from tofuse.viewer.content import read_content
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
 FILES = {*SAME, "report.html", "view.npz", "run.json"}
@@ -508,7 +508,7 @@ def test_a_part_that_nothing_connects_has_its_own_result(
     assert {p.name for p in out.iterdir()} == FILES | {"component-1"}
     assert {p.name for p in (out / "component-1").iterdir()} == FILES
     for folder, frames in ((out, range(4)), (out / "component-1", range(4, 8))):
-        shown = read_result(folder)
+        shown = read_content(folder)
         assert list(shown.after) == list(frames)
         np.testing.assert_allclose(shown.after[frames[0]], np.eye(4), atol=1e-12)
     assert [f["component"] for f in run_json(out)["frames"]] == [0] * 4 + [1] * 4

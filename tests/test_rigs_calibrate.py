@@ -23,7 +23,7 @@ from tofuse.report.scene import CAMERA_COLORS
 from tofuse.report.section_rig import upright
 from tofuse.rigs.calibrate import calibrate_cameras, moves
 from tofuse.rigs.inputs import Camera, unique_names
-from tofuse.viewer.result import read_result
+from tofuse.viewer.content import read_content
 
 # A room: floor, three walls, and boards in front of these.
 ROOM = (
@@ -146,7 +146,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert re.findall(r'background:(rgb\(.*?\))"></i>(cam\d)', page) == [
         (f"rgb{color}".replace(" ", ""), f"cam{k}") for k, color in enumerate(CAMERA_COLORS[:3])
     ]
-    shown = read_result(tmp_path / "model").rig
+    shown = read_content(tmp_path / "model").rig
     assert shown is not None
     assert shown.names == ("cam0", "cam1", "cam2")
     assert shown.of_frames.tolist() == told["of_frames"]

@@ -30,11 +30,11 @@ from tofuse.report.images import viridis
 from tofuse.report.pictures import draw
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
+from tofuse.viewer.content import Layer, colorings, layer_colors, read_content
 from tofuse.viewer.coverage import Coverage
-from tofuse.viewer.kept import NAME, read_kept, write_kept
-from tofuse.viewer.measure import picked
-from tofuse.viewer.result import Layer, colorings, painted, read_result
+from tofuse.viewer.picking import pick
 from tofuse.viewer.server import serve, stop
+from tofuse.viewer.view_file import NAME, read_view_file, write_view_file
 
 needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed"
@@ -71,13 +71,13 @@ def folder(tmp_path_factory) -> Path:
     )
     out = tmp_path_factory.mktemp("view") / "out"
     pictures = draw(result.diagnostics.samples)
-    write_result(result, OutputFolder(out), lambda r, f: write_kept(r, pictures, f / NAME))
+    write_result(result, OutputFolder(out), lambda r, f: write_view_file(r, pictures, f / NAME))
     return out
 
 
 def test_result_is_what_the_run_wrote(folder):
     made, _ = make_room()
-    found = read_result(folder)
+    found = read_content(folder)
     posed = np.flatnonzero(made.has_pose)
     assert sorted(found.after) == sorted(found.before) == posed.tolist()
     for k in posed:
@@ -94,7 +94,7 @@ def test_result_is_what_the_run_wrote(folder):
 def test_without_what_only_the_viewer_needs_the_rest_is_shown(folder, tmp_path):
     out = shutil.copytree(folder, tmp_path / "out")
     (out / NAME).unlink()
-    found = read_result(out)
+    found = read_content(out)
     assert len(found.after) == 21
     assert found.before == {}
     assert found.pictures == ()
@@ -129,9 +129,11 @@ def test_kept_file_has_the_same_bytes_for_the_same_result(tmp_path):
     pictures = draw(made.diagnostics.samples)
     for name in "ab":
         (tmp_path / name).mkdir()
-        write_kept(made, pictures, tmp_path / name / NAME)
+        write_view_file(made, pictures, tmp_path / name / NAME)
     assert (tmp_path / "a" / NAME).read_bytes() == (tmp_path / "b" / NAME).read_bytes()
-    assert [p.images for p in read_kept(tmp_path / "a").pictures] == [p.images for p in pictures]
+    assert [p.images for p in read_view_file(tmp_path / "a").pictures] == [
+        p.images for p in pictures
+    ]
 
 
 def test_a_missing_package_is_said_in_one_line(folder, monkeypatch, capsys):
@@ -156,18 +158,20 @@ def test_options_of_the_page_need_the_page(tmp_path, capsys):
 
 
 def test_colours_follow_what_they_stand_for(folder):
-    found = read_result(folder)
+    found = read_content(folder)
     assert colorings([found.mesh, found.cloud]) == [
         "colour", "height", "accuracy", "view count"
     ]  # fmt: skip
-    bright = {by: painted(found.mesh, by, found.up)[0].astype(int).sum(1) for by in ("height",)}
+    bright = {
+        by: layer_colors(found.mesh, by, found.up)[0].astype(int).sum(1) for by in ("height",)
+    }
     heights = found.mesh.points @ found.up
     assert np.corrcoef(bright["height"], heights)[0, 1] > 0.9
-    colors, bar = painted(found.mesh, "accuracy", found.up)
+    colors, bar = layer_colors(found.mesh, "accuracy", found.up)
     assert np.corrcoef(colors.astype(int).sum(1), found.mesh.sigma)[0, 1] > 0.9
     assert bar.label == "Accuracy (95 %)"
     assert bar.ticks[0].startswith("±")
-    shaded = painted(found.mesh, "colour", found.up)[0].astype(float)
+    shaded = layer_colors(found.mesh, "colour", found.up)[0].astype(float)
     assert np.all(shaded >= 0.6 * found.mesh.color - 1)
     assert np.all(shaded <= found.mesh.color)
 
@@ -175,14 +179,14 @@ def test_colours_follow_what_they_stand_for(folder):
 def test_the_nearest_point_on_the_ray_is_picked():
     points = np.array([[0, 0, 4], [0.001, 0, 2], [0, 0, -1], [0.5, 0, 2]], np.float32)
     cloud = Layer(points, None, None, None, np.array([0.001, 0.002, 0.003, 0.004]), None)
-    found = picked([cloud], [0, 0, 0], [0, 0, 2])
+    found = pick([cloud], [0, 0, 0], [0, 0, 2])
     np.testing.assert_array_equal(found.point, points[1])
     assert found.sigma == 0.002
-    np.testing.assert_array_equal(picked([cloud], [0, 0, 3], [0, 0, 1]).point, points[0])
-    assert picked([cloud], [0, 0, 0], [1, 1, 0]) is None
+    np.testing.assert_array_equal(pick([cloud], [0, 0, 3], [0, 0, 1]).point, points[0])
+    assert pick([cloud], [0, 0, 0], [1, 1, 0]) is None
     # From behind a surface shows nothing, so it can't be picked.
     faces, away = np.array([[0, 1, 3]], np.int32), np.tile(np.float32([0, 0, 1]), (4, 1))
-    assert picked([Layer(points, away, faces, None, None, None)], [0, 0, 0], [0, 0, 1]) is None
+    assert pick([Layer(points, away, faces, None, None, None)], [0, 0, 0], [0, 0, 1]) is None
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +227,7 @@ def test_page_shows_switches_slides_and_measures(folder, browser, tmp_path):
 
     server = serve()
     try:
-        result = read_result(folder)
+        result = read_content(folder)
         view = ResultView(server, result)
         place = address(server)
         size = {"width": 860, "height": 560}
@@ -322,7 +326,7 @@ class Heard(Silent):
 @needs_viser
 def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, browser):
     from tofuse.pipeline.progress import Both
-    from tofuse.viewer.live import LiveView
+    from tofuse.viewer.live_view import LiveView
     from tofuse.viewer.server import address
 
     same = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply")
@@ -345,7 +349,7 @@ def test_a_watched_run_grows_and_gives_the_same_bytes(room_recording, tmp_path, 
             seen.page.screenshot(path=tmp_path / "growing.png")
             seen.page.get_by_label("Colour by").click()
             seen.page.get_by_role("option", name="accuracy").click()
-            seen.page.get_by_text("Where to go next").wait_for(timeout=15_000)
+            seen.page.get_by_text("Go to bright places next").wait_for(timeout=15_000)
             assert changed(growing, drawn(seen)) > 0.01
             seen.page.screenshot(path=tmp_path / "accuracy.png")
             live.finish(tmp_path / "a")
@@ -378,7 +382,7 @@ def test_places_are_better_known_the_nearer_and_the_more_often_they_are_seen():
 
 @needs_viser
 def test_views_of_a_long_run_are_thinned():
-    from tofuse.viewer import live as live_module
+    from tofuse.viewer import live_view as live_module
 
     server = serve()
     try:

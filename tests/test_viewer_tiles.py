@@ -1,4 +1,4 @@
-"""Surfaces in tiles in the viewer: which are chosen, what they hold, and what the page shows."""
+"""Tiled surfaces in the viewer: which tiles are selected, their content, and the page."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from tofuse.report.pictures import draw
 from tofuse.results import tiles
 from tofuse.results.folder import OutputFolder
 from tofuse.results.output import write_result
-from tofuse.viewer.detail import Eye, chosen
-from tofuse.viewer.kept import NAME, write_kept
-from tofuse.viewer.result import TiledLayer, painted, read_result
+from tofuse.viewer.content import TiledLayer, layer_colors, read_content
+from tofuse.viewer.level_of_detail import Eye, select_tiles
 from tofuse.viewer.server import serve, stop
+from tofuse.viewer.view_file import NAME, write_view_file
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def folder(tmp_path_factory) -> Iterator[Path]:
         write_result(
             replace(result, mesh=flipped),
             OutputFolder(out),
-            lambda r, f: write_kept(r, pictures, f / NAME),
+            lambda r, f: write_view_file(r, pictures, f / NAME),
         )
         yield out
 
@@ -79,37 +79,37 @@ def covered(root, shown):
 def test_each_part_is_shown_once_within_the_budget(layer, budget) -> None:
     whole = finest(layer.root)
     for at in (None, eye(layer, [0, 0, 1.9], [0.5, 0.4, 2.0]), eye(layer, [0, 0, -9], [0, 0, 2])):
-        shown = chosen(layer.root, at, budget)
+        shown = select_tiles(layer.root, at, budget)
         covered(layer.root, shown)
         faces = sum(tile.faces for tile in shown)
         assert faces <= max(budget, layer.root.faces)
-    assert sum(t.faces for t in chosen(layer.root, None, 10**9)) == whole
+    assert sum(t.faces for t in select_tiles(layer.root, None, 10**9)) == whole
 
 
 def test_what_is_near_is_fine_and_what_is_far_or_behind_is_coarse(layer) -> None:
-    near = chosen(layer.root, eye(layer, [-0.7, -0.7, 1.8], [-0.8, -0.8, 2.0]), 10**9)
+    near = select_tiles(layer.root, eye(layer, [-0.7, -0.7, 1.8], [-0.8, -0.8, 2.0]), 10**9)
     at = layer.R_up_world @ [-0.8, -0.8, 2.0]
     here = [t for t in near if (t.low <= at + 0.1).all() and (t.high >= at - 0.1).all()]
     assert min(t.error_m for t in here) == 0
-    away = chosen(layer.root, eye(layer, [0, 0, -0.5], [0, 0, -4.0]), 10**9)
+    away = select_tiles(layer.root, eye(layer, [0, 0, -0.5], [0, 0, -4.0]), 10**9)
     assert [t.content for t in away] == [layer.root.content]  # it is all behind
-    far = chosen(layer.root, eye(layer, [0, 0, -200.0], [0, 0, 2.0]), 10**9)
+    far = select_tiles(layer.root, eye(layer, [0, 0, -200.0], [0, 0, 2.0]), 10**9)
     assert [t.content for t in far] == [layer.root.content]
     steps = [
-        sum(t.faces for t in chosen(layer.root, eye(layer, [0, 0, z], [0, 0, 2]), 10**9))
+        sum(t.faces for t in select_tiles(layer.root, eye(layer, [0, 0, z], [0, 0, 2]), 10**9))
         for z in (-60.0, -20.0, -6.0, -1.0)
     ]
     assert steps == sorted(steps)
     assert steps[-1] > 4 * steps[0]
     # No error is larger than 2 pixels where triangles are not short.
     here_eye = eye(layer, [0, 0, -3.0], [0, 0, 2])
-    shown = chosen(layer.root, here_eye, 10**9)
+    shown = select_tiles(layer.root, here_eye, 10**9)
     assert max((here_eye.pixels(t) for t in shown if t.children), default=0) <= 2
 
 
 def test_the_budget_goes_to_what_is_largest_on_the_screen(layer) -> None:
     at = eye(layer, [-0.7, -0.7, 1.7], [0.2, 0.2, 2.0])
-    shown = chosen(layer.root, at, 20_000)
+    shown = select_tiles(layer.root, at, 20_000)
     worst = max(at.pixels(t) for t in shown if t.children)
     refined = {t.content for t in layer.root.walk() if t.children} - {t.content for t in shown}
     done = [
@@ -130,14 +130,14 @@ def test_empty_tiles_are_passed_through() -> None:
     leaf = Tile(low, high, 0.0, "0-0-0-0.glb", 5)
     nothing = Tile(low, high, 0.0, None, 0)
     root = Tile(low, high, 2.0, None, 0, [Tile(low, high, 1.0, None, 0, [leaf, nothing])])
-    assert chosen(root, None, 1) == [leaf]
+    assert select_tiles(root, None, 1) == [leaf]
     coarse = Tile(low, high, 1.0, "1-0-0-0.glb", 9, [nothing])
-    assert chosen(coarse, None, 100) == []  # finely, it is elsewhere
-    assert chosen(coarse, Eye(np.full(3, 90.0), np.ones(3), 1.0, 1.0, 100), 100) == [coarse]
+    assert select_tiles(coarse, None, 100) == []  # finely, it is elsewhere
+    assert select_tiles(coarse, Eye(np.full(3, 90.0), np.ones(3), 1.0, 1.0, 100), 100) == [coarse]
 
 
 def test_a_tiled_result_is_read_by_its_overview(folder, layer) -> None:
-    result = read_result(folder)
+    result = read_content(folder)
     mesh = waves(origin=(-0.9, -0.9, 2.0))
     assert result.tiles is not None
     assert result.mesh is not None
@@ -154,11 +154,11 @@ def test_a_tiled_result_is_read_by_its_overview(folder, layer) -> None:
     assert part.sigma is not None
     assert set(np.round(part.sigma, 7)) <= set(np.round(mesh.sigma.astype(float), 7))
     # One scale for all tiles.
-    lone, _ = painted(part, "accuracy", result.up)
-    scaled, words = painted(part, "accuracy", result.up, result.mesh)
-    assert words == painted(result.mesh, "accuracy", result.up)[1]
+    lone, _ = layer_colors(part, "accuracy", result.up)
+    scaled, words = layer_colors(part, "accuracy", result.up, result.mesh)
+    assert words == layer_colors(result.mesh, "accuracy", result.up)[1]
     assert (lone != scaled).any()
-    same, _ = painted(part, "accuracy", result.up, part)
+    same, _ = layer_colors(part, "accuracy", result.up, part)
     np.testing.assert_array_equal(same, lone)
 
 
@@ -179,7 +179,7 @@ def test_damaged_tiles_are_told_in_one_line(folder, tmp_path, how) -> None:
         document["extras"]["T_up_world"] = [[1]]
         path.write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
-        read_result(out)
+        read_content(out)
     assert "\n" not in str(caught.value)
 
 
@@ -197,7 +197,7 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser, tmp_path) -> N
 
     server = serve()
     try:
-        result = read_result(folder)
+        result = read_content(folder)
         view = ResultView(server, result)
         surface = view._model["surface"]
         assert isinstance(surface, TiledSurface)
@@ -223,7 +223,7 @@ def test_page_loads_tiles_as_somebody_comes_near(folder, browser, tmp_path) -> N
             assert {t.content for t in tiles_near} != {t.content for t in result.tiles.root.walk()}
             assert far > 0
             # What is picked is on the finest surface that is there.
-            point = surface.seen_along([-0.5, -0.5, 1.5], [0.0, 0.0, 1.0])
+            point = surface.layer_along([-0.5, -0.5, 1.5], [0.0, 0.0, 1.0])
             assert len(point.points) > 0
             page.get_by_label("Colour by").click()
             page.get_by_role("option", name="height").click()

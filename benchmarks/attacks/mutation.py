@@ -290,10 +290,10 @@ def _result(out: Path) -> None:
 
 def _load(out: Path) -> None:
     from tofuse.results.loading import load_result
-    from tofuse.viewer.kept import read_kept
+    from tofuse.viewer.view_file import read_view_file
 
     load_result(out)
-    read_kept(out)
+    read_view_file(out)
 
 
 def _stopped(out: Path) -> None:

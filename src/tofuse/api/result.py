@@ -96,14 +96,14 @@ class Result(Reconstruction):
     def _write_report(self, result: Reconstruction, folder: Path) -> None:
         from tofuse.report.extras import ReportExtras
         from tofuse.report.html import write_report
-        from tofuse.viewer.kept import NAME, write_kept
+        from tofuse.viewer.view_file import NAME, write_view_file
 
         if self.source is not None:
             write_report_files(self.source, self._configuration(self.source), result, folder)
             return
         title = Path(str(result.recording["path"])).name
         write_report(result, folder / "report.html", ReportExtras(title))
-        write_kept(result, (), folder / NAME)
+        write_view_file(result, (), folder / NAME)
 
     def _configuration(self, source: Recording) -> Config:
         method = self.config["method"]
@@ -165,12 +165,12 @@ class Result(Reconstruction):
             Whether to open the page in the browser.
         """
         from tofuse.viewer.app import ResultView
-        from tofuse.viewer.result import read_result
+        from tofuse.viewer.content import read_content
         from tofuse.viewer.server import address, serve
 
         with tempfile.TemporaryDirectory(prefix="tofuse-") as folder:
             self.save(Path(folder) / "result")
-            shown = read_result(Path(folder) / "result")
+            shown = read_content(Path(folder) / "result")
         server = serve(port)
         ResultView(server, shown)
         if open_browser:
@@ -325,10 +325,10 @@ def load(folder: str | Path) -> Result:
     InputError
         If it is not an output folder, or its files are damaged or of different runs.
     """
-    from tofuse.viewer.kept import read_kept
+    from tofuse.viewer.view_file import read_view_file
 
     found = load_result(folder)
-    kept = read_kept(Path(folder))
+    kept = read_view_file(Path(folder))
     if kept is not None:
         before = found.diagnostics.sequential
         for k, frame in enumerate(found.diagnostics.frames):

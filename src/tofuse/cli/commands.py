@@ -168,7 +168,7 @@ def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
     from tofuse.pipeline.progress import Both
     from tofuse.pipeline.run import exit_status
     from tofuse.pipeline.run import run as run_pipeline
-    from tofuse.viewer.live import LiveView
+    from tofuse.viewer.live_view import LiveView
 
     with _page(arguments) as server:
         live = LiveView(server)
@@ -183,9 +183,9 @@ def _run_in_view(arguments: argparse.Namespace, options: Options) -> int:
 def view(arguments: argparse.Namespace) -> int:
     """``tofuse view``."""
     from tofuse.viewer.app import ResultView
-    from tofuse.viewer.result import read_result
+    from tofuse.viewer.content import read_content
 
-    result = read_result(arguments.result)
+    result = read_content(arguments.result)
     with _page(arguments) as server:
         ResultView(server, result)
         _wait()

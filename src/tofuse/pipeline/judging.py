@@ -293,7 +293,7 @@ def _write(found: Judgement, trajectory: Path, recording: Recording, folder: Out
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
     from tofuse.report.pictures import draw
-    from tofuse.viewer.kept import NAME, write_kept
+    from tofuse.viewer.view_file import NAME, write_view_file
 
     def report(result: Reconstruction, here: Path) -> None:
         pictures = draw(result.diagnostics.samples)
@@ -301,7 +301,7 @@ def _write(found: Judgement, trajectory: Path, recording: Recording, folder: Out
         title = f"{trajectory.name} on {Path(recording.path).name}"
         extras = ReportExtras(title=title, headline=headline, pictures=pictures)
         write_report(result, here / "report.html", extras)
-        write_kept(result, pictures, here / NAME)
+        write_view_file(result, pictures, here / NAME)
         if result is found.refined:
             text = json.dumps(plain(found.to_dict()), indent=1, allow_nan=False)
             (here / "judge.json").write_text(text + "\n", encoding="utf-8")

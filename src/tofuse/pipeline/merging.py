@@ -328,7 +328,7 @@ def _report(result: Reconstruction, folder: Path) -> None:
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
     from tofuse.report.pictures import draw
-    from tofuse.viewer.kept import NAME, write_kept
+    from tofuse.viewer.view_file import NAME, write_view_file
 
     pictures = draw(result.diagnostics.samples)
     names = ", ".join(session.name for session in result.sessions)
@@ -338,4 +338,4 @@ def _report(result: Reconstruction, folder: Path) -> None:
         pictures=pictures,
     )
     write_report(result, folder / "report.html", extras)
-    write_kept(result, pictures, folder / NAME)
+    write_view_file(result, pictures, folder / NAME)

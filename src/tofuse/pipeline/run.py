@@ -350,7 +350,7 @@ def write_report_files(
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
     from tofuse.report.pictures import draw
-    from tofuse.viewer.kept import NAME, write_kept
+    from tofuse.viewer.view_file import NAME, write_view_file
 
     title = _title(Path(recording.path)) or recording.path
     truth = truth_points(recording)
@@ -371,7 +371,7 @@ def write_report_files(
         clouds=tuple(item for item in clouds if isinstance(item, CloudFrame)),
     )
     write_report(result, folder / "report.html", extras)
-    write_kept(result, pictures, folder / NAME)
+    write_view_file(result, pictures, folder / NAME)
 
 
 def _frames_of(recording: Recording, result: Reconstruction) -> Recording:

@@ -264,7 +264,7 @@ def _write(found: RigResult, recording: Recording, folder: OutputFolder) -> None
     from tofuse.report.extras import ReportExtras
     from tofuse.report.html import write_report
     from tofuse.report.pictures import draw
-    from tofuse.viewer.kept import NAME, write_kept
+    from tofuse.viewer.view_file import NAME, write_view_file
 
     def report(result: Reconstruction, here: Path) -> None:
         pictures = draw(result.diagnostics.samples)
@@ -273,7 +273,7 @@ def _write(found: RigResult, recording: Recording, folder: OutputFolder) -> None
         cameras = ", ".join(camera.name for camera in source.rig.cameras)
         extras = ReportExtras(title=f"rig of {cameras}", pictures=pictures, rig=found.rig)
         write_report(result, here / "report.html", extras)
-        write_kept(result, pictures, here / NAME)
+        write_view_file(result, pictures, here / NAME)
         if result is found.result:
             known = np.isfinite(found.poses[:, 0, 0])
             write_tum(here / TRAJECTORY, found.times[known], found.poses[known])

@@ -1,4 +1,4 @@
-"""The page of a result: the model, the cameras, the frames, and distances."""
+"""The page of a result: model, cameras, frames, and distance measurement."""
 
 from __future__ import annotations
 
@@ -20,20 +20,27 @@ from tofuse.report.scene import MAX_CAMERAS, RigCameras, camera_lines
 from tofuse.report.words import frame_range
 from tofuse.results.card import length
 from tofuse.results.folder import component_name, is_result
-from tofuse.viewer.measure import picked
-from tofuse.viewer.result import Bar, Layer, Result, colorings, painted, read_result
+from tofuse.viewer.content import (
+    ColorBar,
+    Layer,
+    ViewContent,
+    colorings,
+    layer_colors,
+    read_content,
+)
+from tofuse.viewer.picking import pick
 from tofuse.viewer.tiled import TiledSurface
-from tofuse.viewer.tone import before_tone_mapping
+from tofuse.viewer.tone_mapping import inverse_tone_mapping
 
 if TYPE_CHECKING:
     from viser import GuiEvent, SceneClickEvent, ViserServer
 
 
 BEFORE, AFTER, LOOPS, CHOSEN = (240, 160, 60), (90, 176, 245), (95, 208, 138), (255, 225, 90)
-FOV = 2 * float(np.arctan(0.5))  # of the cameras as they are drawn
+FOV = 2 * float(np.arctan(0.5))  # of camera frusta as drawn
 _TITLES = {"color": "Colour", "range": "Range", "amplitude": "Amplitude", "fate": "Use of pixels"}
 _REASONS = 4
-_FAR = 1.8  # times the size of the model: then it is shown without the cameras
+_FAR = 1.8  # cameras are not framed if that enlarges the model's box by more
 
 
 class ResultView:
@@ -42,13 +49,13 @@ class ResultView:
     Attributes
     ----------
     ends
-        The points (3,) that were picked, at most two.
+        The picked points (3,), at most two.
     distance, error
-        Between the two points that were picked last, and its 95 % bound by their errors, m; None
-        before there are two, and NaN where nothing is known of them.
+        Distance between the last two picked points, and the 95 % bound of its error, m; None
+        before there are two, NaN where the errors of the points are unknown.
     """
 
-    def __init__(self, server: ViserServer, result: Result) -> None:
+    def __init__(self, server: ViserServer, result: ViewContent) -> None:
         self.ends: list[Float64] = []
         self.distance: float | None = None
         self.error: float | None = None
@@ -62,7 +69,7 @@ class ResultView:
         self._model: dict[str, Any] = {}
         server.gui.main_panel.dock_right()
         with server.atomic():
-            self._say_verdict()
+            self._show_verdict()
             self._add_models()
             self._add_lines()
             self._add_toggles(colorings(layers))
@@ -70,17 +77,17 @@ class ResultView:
             self._add_measure()
             self._paint()
 
-    def _say_verdict(self) -> None:
+    def _show_verdict(self) -> None:
         run = self._result.run
         lines = [f"**{str(run['verdict']).capitalize()}**"]
-        told = list(dict.fromkeys(r["text"] for r in run["reasons"]))
-        lines += [f"- {_plain(text)}" for text in told[:_REASONS]]
-        if len(told) > _REASONS:
-            lines.append(f"- {len(told) - _REASONS} more in report.html")
+        reasons = list(dict.fromkeys(r["text"] for r in run["reasons"]))
+        lines += [f"- {_escape_markdown(text)}" for text in reasons[:_REASONS]]
+        if len(reasons) > _REASONS:
+            lines.append(f"- {len(reasons) - _REASONS} more in report.html")
         self._server.gui.add_markdown("\n".join(lines))
 
     def _add_models(self) -> None:
-        """Offer the models of components that nothing connects to the main one."""
+        """Add a choice of models, if components have their own."""
         folder, gui = self._result.folder, self._server.gui
         main = folder.parent if folder.name.startswith("component-") else folder
         if not is_result(main):
@@ -104,9 +111,9 @@ class ResultView:
         def _(event: GuiEvent[Any]) -> None:
             path = models[str(event.target.value)]
             try:
-                other = read_result(path)
+                other = read_content(path)
             except InputError as error:
-                self._legend.content = _plain(str(error))
+                self._legend.content = _escape_markdown(str(error))
                 return
             with self._server.atomic():
                 self._server.scene.reset()
@@ -123,7 +130,7 @@ class ResultView:
         ):
             if not poses:
                 continue
-            ends, colors = _drawn(poses, edge, color, result if name == "after" else None)
+            ends, colors = _camera_segments(poses, edge, color, result if name == "after" else None)
             self._lines[name] = scene.add_line_segments(
                 f"/cameras/{name}",
                 ends,
@@ -165,7 +172,7 @@ class ResultView:
                     self._drawn[name] = box
             rig = result.rig
             if rig is not None:
-                gui.add_html(_cameras_of(rig))
+                gui.add_html(_rig_legend(rig))
             if len(choices) > 1:
                 self._choice = gui.add_dropdown("Colour by", choices, initial_value=self._by)
                 self._choice.on_update(self._recolor)
@@ -190,7 +197,7 @@ class ResultView:
             self._paint()
 
     def _visible(self) -> dict[str, Layer]:
-        """What of the model is shown, by name."""
+        """The visible layers of the model, by name."""
         layers = {
             "surface": self._result.mesh,
             "points": self._result.cloud,
@@ -203,25 +210,25 @@ class ResultView:
         }
 
     def _paint(self) -> None:
-        """Show what is asked for; what was sent before is only shown again."""
+        """Show the chosen layers; those that clients already have are not sent again."""
         visible = self._visible()
         for name, handle in self._model.items():
             handle.visible = name in visible
-        scale: Bar | None = None
+        scale: ColorBar | None = None
         for name, layer in visible.items():
             by = "colour" if name == "model before" else self._by
-            colors, bar = painted(layer, by, self._result.up)
+            colors, bar = layer_colors(layer, by, self._result.up)
             scale = bar or scale
             if name not in self._model and len(layer.points):
-                self._model[name] = self._sent(name, layer, colors)
+                self._model[name] = self._add_layer(name, layer, colors)
         self._legend.content = "" if scale is None else color_bar(scale)
 
-    def _sent(self, name: str, layer: Layer, colors: UInt8) -> Any:
+    def _add_layer(self, name: str, layer: Layer, colors: UInt8) -> Any:
         scene = self._server.scene
         if name == "surface" and self._result.tiles is not None:
             by, up = self._by, self._result.up
             return TiledSurface(
-                self._server, self._result.tiles, lambda part: painted(part, by, up, layer)[0]
+                self._server, self._result.tiles, lambda part: layer_colors(part, by, up, layer)[0]
             )
         if layer.faces is None:
             return scene.add_point_cloud(
@@ -233,7 +240,7 @@ class ResultView:
                 point_shape="circle",
                 point_shading="flat",
             )
-        surface = unlit_glb(layer.points, layer.faces, before_tone_mapping(colors))
+        surface = unlit_glb(layer.points, layer.faces, inverse_tone_mapping(colors))
         return scene.add_glb(f"/model/{name}", surface, cast_shadow=False, receive_shadow=False)
 
     def _add_frames(self) -> None:
@@ -244,14 +251,14 @@ class ResultView:
         with gui.add_folder("Frame"):
             last = max(len(result.frames) - 1, 1)
             self._slider = gui.add_slider("Frame", 0, last, 1, 0)
-            self._slider.on_update(self._go)
-            self._told = gui.add_markdown("")
+            self._slider.on_update(self._on_slider)
+            self._status = gui.add_markdown("")
             look = gui.add_button("Look through this camera")
-            look.on_click(self._look)
+            look.on_click(self._look_through)
             self._images = gui.add_html("")
         self._show_frame(0)
 
-    def _go(self, event: GuiEvent[Any]) -> None:
+    def _on_slider(self, event: GuiEvent[Any]) -> None:
         with self._lock, self._server.atomic():
             self._show_frame(int(event.target.value))
 
@@ -261,13 +268,13 @@ class ResultView:
         index = frame["index"]
         words = f"Frame {index}: **{frame['status']}**"
         if frame["reason"]:
-            words += f" – {_plain(frame['reason'])}"
+            words += f" – {_escape_markdown(frame['reason'])}"
         picture = _nearest(result.pictures, index)
         if picture is not None:
-            self._images.content = _shown(picture)
+            self._images.content = _images_html(picture)
             if picture.index != index:
-                words += f"\n\nThe images are of frame {picture.index}, the nearest that was kept."
-        self._told.content = words
+                words += f"\n\nThe images are of frame {picture.index}, the nearest one stored."
+        self._status.content = words
         if self._camera is not None:
             self._camera.remove()
             self._camera = None
@@ -292,12 +299,12 @@ class ResultView:
             receive_shadow=False,
         )
 
-    def _look(self, event: GuiEvent[Any]) -> None:
+    def _look_through(self, event: GuiEvent[Any]) -> None:
         row = min(int(self._slider.value), len(self._result.frames) - 1)
         T = self._result.after.get(self._result.frames[row]["index"])
         if T is None or event.client is None:
             return
-        # Nothing stands between who looks through a camera and the model.
+        # Camera frusta would occlude the model.
         if self._camera is not None:
             self._camera.visible = False
         for box in self._drawn.values():
@@ -330,8 +337,8 @@ class ResultView:
             layers = self._visible()
             tiled = self._model.get("surface")
             if "surface" in layers and isinstance(tiled, TiledSurface):
-                layers["surface"] = tiled.seen_along(event.ray_origin, event.ray_direction)
-            found = picked(list(layers.values()), event.ray_origin, event.ray_direction)
+                layers["surface"] = tiled.layer_along(event.ray_origin, event.ray_direction)
+            found = pick(list(layers.values()), event.ray_origin, event.ray_direction)
             if found is None:
                 self._measured.content = "No surface there: click the model."
                 return
@@ -366,17 +373,17 @@ class ResultView:
             self._measured.content = f"**{text}**"
 
 
-def _drawn(
-    poses: dict[int, Float64], edge: float, color: tuple[int, int, int], of: Result | None
+def _camera_segments(
+    poses: dict[int, Float64], edge: float, color: tuple[int, int, int], of: ViewContent | None
 ) -> tuple[Float32, Any]:
-    """Ends (L, 2, 3) of the lines of cameras, and their colours: of a rig one for each camera."""
+    """Line segments (L, 2, 3) of camera frusta, and their colours; for a rig, one per camera."""
     rig = None if of is None else of.rig
     if of is None or rig is None:
         stack = np.stack([poses[k] for k in sorted(poses)])
         step = -(-len(stack) // MAX_CAMERAS)
         return camera_lines(stack, edge, step).reshape(-1, 2, 3).astype(np.float32), color
     camera = dict(zip((f["index"] for f in of.frames), rig.of_frames.tolist(), strict=True))
-    # Colours of ends are taken for light, and single ones for what is shown on a screen.
+    # viser expects linear colours per vertex, but sRGB for a single colour.
     light = (linear(np.array(rig.colors, np.uint8))[:, :3] // 257).astype(np.uint8)
     ends, colors = [], []
     for number in range(len(rig.names)):
@@ -390,8 +397,8 @@ def _drawn(
     return np.concatenate(ends).astype(np.float32), np.concatenate(colors)
 
 
-def _cameras_of(rig: RigCameras) -> str:
-    """The names of a rig's cameras beside their colours, as HTML."""
+def _rig_legend(rig: RigCameras) -> str:
+    """The names of a rig's cameras with their colours, as HTML."""
     square = "display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px"
     rows = (
         f'<div style="overflow-wrap:anywhere"><i style="{square};background:rgb{color}"></i>'
@@ -401,7 +408,7 @@ def _cameras_of(rig: RigCameras) -> str:
     return f'<div style="padding:0 0.8em 0.5em;font-size:0.85em">{"".join(rows)}</div>'
 
 
-def _place_camera(server: ViserServer, result: Result) -> float:
+def _place_camera(server: ViserServer, result: ViewContent) -> float:
     """Look at the model from above and to the side; return its size in m."""
     layer = result.mesh if result.mesh is not None and len(result.mesh.points) else result.cloud
     points = layer.points if len(layer.points) else np.zeros((1, 3), np.float32)
@@ -409,7 +416,7 @@ def _place_camera(server: ViserServer, result: Result) -> float:
     if result.after:
         centers = np.stack([T[:3, 3] for T in result.after.values()])
         wide = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
-        # Cameras that go around an object would make it small.
+        # Cameras far around an object would make it small.
         if np.linalg.norm(wide[1] - wide[0]) <= _FAR * np.linalg.norm(high - low):
             low, high = wide
     size = max(float(np.linalg.norm(high - low)), 1e-2)
@@ -424,7 +431,7 @@ def _place_camera(server: ViserServer, result: Result) -> float:
     server.scene.set_up_direction(result.up)
     server.initial_camera.look_at = middle
     server.initial_camera.position = place
-    for client in server.get_clients().values():  # who watched the run
+    for client in server.get_clients().values():  # those that watched the run
         client.camera.up_direction = result.up
         client.camera.position = place
         client.camera.look_at = middle
@@ -456,7 +463,7 @@ def decoded(data: bytes) -> UInt8:
 
 
 def wxyz(T: Float64) -> Float64:
-    """Return the quaternion (4,) of a pose, in the order that viser wants."""
+    """Return the quaternion (4,) of a pose (4, 4), in viser's order w, x, y, z."""
     x, y, z, w = from_matrix(T[:3, :3])
     return np.array([w, x, y, z])
 
@@ -465,8 +472,8 @@ def _length(metres: float) -> str:
     return f"{1000 * metres:.1f} mm" if metres < 1 else f"{metres:.3f} m"
 
 
-def color_bar(bar: Bar) -> str:
-    """Return a colour bar as HTML, with what is written at its ends and in its middle."""
+def color_bar(bar: ColorBar) -> str:
+    """Return a colour bar with its ticks as HTML."""
     stops = ", ".join(f"rgb{tuple(c)}" for c in viridis(np.linspace(0, 1, 9)).tolist())
     ticks = "".join(f"<span>{tick}</span>" for tick in bar.ticks)
     return (
@@ -476,13 +483,13 @@ def color_bar(bar: Bar) -> str:
     )
 
 
-def _plain(text: str) -> str:
-    """Words from a file, without what Markdown or HTML would make of them."""
+def _escape_markdown(text: str) -> str:
+    """Text with the special characters of Markdown and HTML escaped."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>()#+!|$~" else c for c in text)
 
 
-def _shown(picture: Pictures) -> str:
-    """The images of a frame; as data in the page, as files made by a page may be gone too soon."""
+def _images_html(picture: Pictures) -> str:
+    """The images of a frame as HTML, embedded as data URIs."""
     cells = []
     for kind, data in picture.images.items():
         name, title = ("png" if kind == "fate" else "jpeg"), _TITLES[kind]
@@ -493,10 +500,10 @@ def _shown(picture: Pictures) -> str:
             f'<figcaption style="font-size:0.8em">{title}</figcaption></figure>'
         )
     grid = "display:grid;grid-template-columns:1fr 1fr;gap:6px;padding:0 0.6em 0.4em"
-    return f'<div style="{grid}">{"".join(cells)}</div>{_fates()}'
+    return f'<div style="{grid}">{"".join(cells)}</div>{_fate_legend()}'
 
 
-def _fates() -> str:
+def _fate_legend() -> str:
     cells = (
         f'<span style="white-space:nowrap;margin-right:10px"><i style="display:inline-block;'
         f'width:10px;height:10px;background:rgb{color}"></i> {words}</span>'

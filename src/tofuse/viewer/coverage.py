@@ -1,4 +1,4 @@
-"""How well each place has been seen so far, while a recording goes on: where to go next."""
+"""The accuracy of each place during a recording, to show where to go next."""
 
 from __future__ import annotations
 
@@ -10,10 +10,15 @@ _REACH = 1 << 20  # cells to each side of the origin
 
 
 class Coverage:
-    """Cubes of space, and what the views' noise leaves uncertain about the surface in each.
+    """A grid of cells with the standard deviation of the surface in each, from measurement noise.
 
-    Every view that sees a cube adds the information of one measurement, as errors of its pixels
-    there are alike. Errors of the poses are known only in the end, and are not in it.
+    Every view that sees a cell adds the information of one measurement, as the errors of its pixels
+    there are correlated. Pose errors are known only at the end, and are not included.
+
+    Parameters
+    ----------
+    cell_m
+        Edge of a cell, m.
     """
 
     def __init__(self, cell_m: float) -> None:
@@ -22,7 +27,7 @@ class Coverage:
         self._information: Float64 = np.zeros(0)
 
     def add(self, points: Float32, sigma: Float64) -> None:
-        """Take a view: points (N, 3) in the world and their standard deviations (N,), m."""
+        """Add a view: points (N, 3) in the world frame and their standard deviations (N,), m."""
         keys, cell = np.unique(self._key(points), return_inverse=True)
         count = np.bincount(cell, minlength=len(keys))
         mean = np.bincount(cell, sigma, len(keys)) / np.maximum(count, 1)
@@ -33,7 +38,7 @@ class Coverage:
         self._information = np.bincount(place, more, len(self._keys)).astype(float)
 
     def sigma(self, points: Float32) -> Float64:
-        """Return the standard deviation (N,) of the surface at points, m; inf where never seen."""
+        """Return the standard deviation (N,) of the surface at points (N, 3), m; inf if unseen."""
         if not len(self._keys):
             return np.full(len(points), np.inf)
         keys = self._key(points)
@@ -43,7 +48,7 @@ class Coverage:
 
     @property
     def sigmas(self) -> Float64:
-        """(C,) of all cubes."""
+        """(C,) standard deviations of all cells, m."""
         return 1 / np.sqrt(self._information)
 
     def _key(self, points: Float32) -> Int64:

@@ -1,7 +1,7 @@
-"""The server behind the page: on this machine alone, and found missing in one line.
+"""The server of the page, reachable from this machine only.
 
-It answers only who came here by this machine's own name: a page of somebody else, whose name was
-made to lead here (DNS rebinding), is told from ours by the names that its browser sends along.
+It answers only requests whose Host and Origin are this machine's own names, which excludes pages
+of other sites whose name resolves to this machine (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 HOST, PORT = "127.0.0.1", 8080
-# The script in viser's page makes another one of what is packed in it: of version 1.1.1.
+# The script in the page of viser 1.1.1 unpacks another script.
 _UNPACKED = {
     "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='": (
         "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='"
     )
 }
-_NAMES = ("127.0.0.1", "localhost")  # by which a browser on this machine finds it
-_TRIED = 100  # ports, where none is asked for
+_NAMES = ("127.0.0.1", "localhost")  # of this machine, in a browser on it
+_MAX_PORTS = 100  # that are tried if none is given
 
 
 def serve(port: int | None = None) -> ViserServer:
-    """Start the server; it works on threads of its own until it is stopped.
+    """Start the server, which runs on its own threads until it is stopped.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def serve(port: int | None = None) -> ViserServer:
     Raises
     ------
     InputError
-        If viser is not installed, or the port is taken.
+        If viser is not installed, or the port is in use.
     """
     try:
         import viser
@@ -54,7 +54,7 @@ def serve(port: int | None = None) -> ViserServer:
         ) from error
     chosen = _free_port() if port is None else port
     if port is not None and not _is_free(port):
-        raise InputError("is taken", where=f"--port {port}", remedy="give another, or none")
+        raise InputError("is in use", where=f"--port {port}", remedy="use another, or none")
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     # Standard output is for results.
     with redirect_stdout(io.StringIO()), _guarded() as guards:
@@ -62,7 +62,7 @@ def serve(port: int | None = None) -> ViserServer:
     if not guards:
         stop(server)
         raise InputError(
-            f"can't be guarded with viser {viser.__version__}",
+            f"can't be secured with viser {viser.__version__}",
             where="the viewer",
             remedy="pip install 'viser==1.1.1'",
         )
@@ -77,10 +77,10 @@ def serve(port: int | None = None) -> ViserServer:
 
 @contextmanager
 def _guarded() -> Iterator[list[int]]:
-    """Let the server that is made in the block look at each request first.
+    """Check each request to a server that is created in the block.
 
-    viser has no place for that, so it is put between it and its library. Gives a list that is not
-    empty when it was.
+    viser has no hook for that, so its call of the websockets library is wrapped. Yields a list that
+    is not empty once that has happened.
     """
     import websockets.asyncio.server as library
     from websockets.datastructures import Headers
@@ -129,7 +129,7 @@ def is_ours(hosts: Sequence[str], origins: Sequence[str]) -> bool:
 
 
 def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
-    """Return headers that keep a page from running what is not its own, for an answer."""
+    """Return the headers of a response that keep its page from running foreign scripts."""
     found = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
     if not headers.get("Content-Type", "").startswith("text/html"):
         return found
@@ -137,26 +137,26 @@ def page_headers(headers: Mapping[str, str], body: bytes) -> dict[str, str]:
         body = gzip.decompress(body)
     hashes = script_hashes(body.decode("utf-8", "replace"))
     unpacked = [_UNPACKED[outer] for outer in hashes if outer in _UNPACKED]
-    # The script of other versions unpacks one that we do not know.
+    # The hash of the script that other versions unpack is not known.
     scripts = " ".join([*hashes, *unpacked]) if unpacked else "'unsafe-inline'"
     policy = (
         f"default-src 'self'; script-src 'self' blob: 'unsafe-eval' {scripts}; "
         "worker-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; "
         "object-src 'none'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # a notebook beside it
+        "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks
     )
     return {**found, "Content-Security-Policy": policy}
 
 
 def stop(server: ViserServer) -> None:
-    """End it, and all pages with it."""
+    """Stop the server."""
     with redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def address(server: ViserServer) -> str:
-    """Return where the page is."""
+    """Return the address of the page."""
     return f"http://{HOST}:{server.get_port()}"
 
 
@@ -171,7 +171,7 @@ def _is_free(port: int) -> bool:
 
 
 def _free_port() -> int:
-    for port in range(PORT, PORT + _TRIED):
+    for port in range(PORT, PORT + _MAX_PORTS):
         if _is_free(port):
             return port
-    raise InputError(f"no port from {PORT} on is free", where="the viewer", remedy="give --port")
+    raise InputError(f"no port from {PORT} on is free", where="the viewer", remedy="use --port")

@@ -1,4 +1,4 @@
-"""A surface in tiles on the page: who looks at it gets those that are to be seen from there."""
+"""A tiled surface on the page: each client gets the tiles for its own view."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tofuse.arrays import Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.files.glb import unlit_glb
 from tofuse.geometry.quaternion import to_matrix
-from tofuse.viewer.detail import MOST_FACES, Eye, chosen
-from tofuse.viewer.result import Layer, TiledLayer, joined
-from tofuse.viewer.tone import before_tone_mapping
+from tofuse.viewer.content import Layer, TiledLayer, merge_layers
+from tofuse.viewer.level_of_detail import MAX_SHOWN_FACES, Eye, select_tiles
+from tofuse.viewer.tone_mapping import inverse_tone_mapping
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
@@ -24,23 +24,35 @@ if TYPE_CHECKING:
     from tofuse.files.tileset import Tile
 
 
-# Something is seen at once, and gets finer.
-_SHARES = (0.1, 0.3, 1.0)
-_SLACK = 0.01  # of a tile's size: a ray that passes by so near still hits it
+# Fractions of the budget of faces: a coarse surface is shown first, and then refined.
+_BUDGETS = (0.1, 0.3, 1.0)
+_MARGIN = 0.01  # of a tile's size, within which a ray still hits it
 
 
 class TiledSurface:
-    """Shows a surface to everybody who opens the page; it can be hidden and removed as a handle."""
+    """Shows a tiled surface to all clients; can be hidden and removed like a handle of viser.
+
+    Parameters
+    ----------
+    server
+        The server.
+    layer
+        The surface.
+    paint
+        Returns the colours (N, 3) of a tile.
+    max_faces
+        Maximum number of triangles that a client shows.
+    """
 
     def __init__(
         self,
         server: ViserServer,
         layer: TiledLayer,
         paint: Callable[[Layer], UInt8],
-        most_faces: int = MOST_FACES,
+        max_faces: int = MAX_SHOWN_FACES,
     ) -> None:
         self._server, self._layer, self._paint = server, layer, paint
-        self._most = most_faces
+        self._max_faces = max_faces
         self._visible = True
         self._removed = False
         self._clients: dict[int, _Client] = {}
@@ -62,7 +74,7 @@ class TiledSurface:
             client.show(value)
 
     def remove(self) -> None:
-        """Take it off all pages."""
+        """Remove it from all clients."""
         self._removed = True
         with self._lock:
             clients, self._clients = list(self._clients.values()), {}
@@ -70,18 +82,18 @@ class TiledSurface:
             client.stop(remove=True)
 
     def shown(self) -> list[list[Tile]]:
-        """The tiles on each page."""
+        """The tiles that each client shows."""
         return [client.tiles() for client in self._now()]
 
-    def seen_along(self, origin: ArrayLike, direction: ArrayLike) -> Layer:
-        """What of the shown tiles a ray passes, in the world frame."""
+    def layer_along(self, origin: ArrayLike, direction: ArrayLike) -> Layer:
+        """Return the shown tiles that a ray hits, in the world frame."""
         R = self._layer.R_up_world
         o, d = R @ np.asarray(origin, float), R @ np.asarray(direction, float)
-        hit = {t.content: t for tiles in self.shown() for t in tiles if _passes(t, o, d)}
+        hit = {t.content: t for tiles in self.shown() for t in tiles if _hits(t, o, d)}
         if not hit:
             nothing = np.zeros((0, 3), np.float32)
             return Layer(nothing, None, np.zeros((0, 3), np.int32), None, None, None)
-        return joined([self._layer.layer(hit[name]) for name in sorted(hit, key=str)])
+        return merge_layers([self._layer.layer(hit[name]) for name in sorted(hit, key=str)])
 
     def _now(self) -> list[_Client]:
         with self._lock:
@@ -92,7 +104,7 @@ class TiledSurface:
             if self._removed or client.client_id in self._clients:
                 return
             self._clients[client.client_id] = _Client(
-                client, self._layer, self._paint, self._most, self._visible
+                client, self._layer, self._paint, self._max_faces, self._visible
             )
 
     def _leave(self, client: ClientHandle) -> None:
@@ -103,17 +115,17 @@ class TiledSurface:
 
 
 class _Client:
-    """One page: a thread that follows its camera."""
+    """One client: a thread that follows its camera."""
 
     def __init__(
         self,
         client: ClientHandle,
         layer: TiledLayer,
         paint: Callable[[Layer], UInt8],
-        most_faces: int,
+        max_faces: int,
         visible: bool,
     ) -> None:
-        self._client, self._layer, self._paint, self._most = client, layer, paint, most_faces
+        self._client, self._layer, self._paint, self._max_faces = client, layer, paint, max_faces
         self._visible = visible
         self._nodes: dict[str, tuple[Tile, Any]] = {}
         self._lock = threading.Lock()
@@ -124,7 +136,7 @@ class _Client:
         threading.Thread(target=self._follow, name="tofuse-tiles", daemon=True).start()
 
     def tiles(self) -> list[Tile]:
-        """Those that are on the page."""
+        """The tiles that are shown."""
         with self._lock:
             return [tile for tile, _ in self._nodes.values()]
 
@@ -149,16 +161,18 @@ class _Client:
         while True:
             self._moved.wait()
             self._moved.clear()
-            for share in _SHARES:
+            for fraction in _BUDGETS:
                 if self._stopped:
                     return
-                wanted = chosen(self._layer.root, self._eye(), int(share * self._most))
+                wanted = select_tiles(
+                    self._layer.root, self._eye(), int(fraction * self._max_faces)
+                )
                 try:
                     self._exchange(wanted)
-                except InputError as error:  # somebody has changed the folder
+                except InputError as error:  # the folder has changed
                     print(f"tofuse: {error}", file=sys.stderr, flush=True)
                     return
-                if self._moved.is_set():  # what is missing now is of other places
+                if self._moved.is_set():  # start again for the new view
                     break
 
     def _eye(self) -> Eye:
@@ -174,7 +188,7 @@ class _Client:
         )
 
     def _exchange(self, wanted: list[Tile]) -> None:
-        """Show these tiles and no others; new ones are there before old ones go."""
+        """Show these tiles and no others; new ones are added before old ones are removed."""
         names = {str(tile.content) for tile in wanted}
         new = [tile for tile in wanted if tile.content not in self._nodes]
         ready = [(tile, self._packed(tile)) for tile in new]
@@ -197,12 +211,12 @@ class _Client:
     def _packed(self, tile: Tile) -> bytes:
         part = self._layer.layer(tile)
         assert part.faces is not None
-        return unlit_glb(part.points, part.faces, before_tone_mapping(self._paint(part)))
+        return unlit_glb(part.points, part.faces, inverse_tone_mapping(self._paint(part)))
 
 
-def _passes(tile: Tile, origin: Float64, direction: Float64) -> bool:
-    """Whether a ray passes a tile."""
-    slack = _SLACK * float(np.linalg.norm(tile.high - tile.low))
+def _hits(tile: Tile, origin: Float64, direction: Float64) -> bool:
+    """Whether a ray hits the box of a tile."""
+    slack = _MARGIN * float(np.linalg.norm(tile.high - tile.low))
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = (np.stack([tile.low - slack, tile.high + slack]) - origin) / direction
     near, far = np.nanmin(ends, 0).max(), np.nanmax(ends, 0).min()

@@ -1,8 +1,7 @@
-"""Colours that look as they are meant to behind the tone mapping of viser's page.
+"""Inverse of the tone mapping in viser's page.
 
-The page shows surfaces through the filmic curve of ACES (S. Hill's fit, as three.js has it), which
-makes colours paler and darker; colours of a map would not be those of its bar. Points are shown as
-they are.
+The page shows surfaces through the filmic curve of ACES (S. Hill's fit, as in three.js), which
+desaturates and darkens: colours of values would differ from the colour bar. Points are unaffected.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ _OUT = np.array(
     [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]
 )
 _EXPOSURE = 0.6
-_BRIGHTEST = 0.995  # the curve never reaches much more
+_BRIGHTEST = 0.995  # hardly more can be reached
 
 
-def before_tone_mapping(color: UInt8) -> Float32:
-    """Return linear light (N, 3) that the page shows as sRGB colours (N, 3).
+def inverse_tone_mapping(color: UInt8) -> Float32:
+    """Return linear RGB (N, 3) that the page shows as the given sRGB colours (N, 3).
 
-    Of saturated colours some of it is negative, and of bright ones more than 1.
+    Components can be negative for saturated colours, and above 1 for bright ones.
     """
     s = np.arange(256) / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)

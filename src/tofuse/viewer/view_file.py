@@ -1,4 +1,4 @@
-"""`view.npz`: what the viewer shows that no other file of a result holds."""
+"""`view.npz`: data of the viewer that is in no other file of a result."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from tofuse.report.pictures import KINDS, Pictures
 from tofuse.results.types import Reconstruction
 
 NAME = "view.npz"
-_POINTS = 60_000  # of the model before
+_POINTS = 60_000  # of the model before loop closure
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
-    """What `view.npz` holds.
+class ViewFile:
+    """The content of `view.npz`.
 
     Attributes
     ----------
     before
-        T_world_camera (4, 4) before loops were closed, by frame index.
+        T_world_camera (4, 4) before loop closure, by frame index.
     points, color
-        (K, 3) m and (K, 3) of the model before, thinned; empty where nothing moved it.
+        (K, 3) m and (K, 3) RGB of the model before loop closure, subsampled; empty where
+        optimisation changed nothing.
     pictures
         Images of some frames.
     """
@@ -39,8 +40,17 @@ class Kept:
     pictures: tuple[Pictures, ...]
 
 
-def write_kept(result: Reconstruction, pictures: Sequence[Pictures], path: Path) -> None:
-    """Write it; the same result gives the same bytes.
+def write_view_file(result: Reconstruction, pictures: Sequence[Pictures], path: Path) -> None:
+    """Write `view.npz`; the same result gives the same bytes.
+
+    Parameters
+    ----------
+    result
+        The result.
+    pictures
+        Images of some frames.
+    path
+        The file.
 
     Raises
     ------
@@ -77,13 +87,13 @@ def _model_before(result: Reconstruction) -> tuple[Float32, UInt8]:
     return points[good], (grey if cloud.color is None else cloud.color[::step])[good]
 
 
-def read_kept(folder: Path) -> Kept | None:
-    """Read it from a result's folder; None where there is none.
+def read_view_file(folder: Path) -> ViewFile | None:
+    """Read `view.npz` of a result; None where there is none.
 
     Raises
     ------
     InputError
-        If it is no such file.
+        If it is damaged.
     """
     path = folder / NAME
     if not path.is_file():
@@ -101,7 +111,7 @@ def read_kept(folder: Path) -> Kept | None:
                     images[k][kind] = whole[start : start + size]
                 start += size
         if before.shape != (len(index), 4, 4) or points.shape != color.shape:
-            raise ValueError("its arrays do not fit each other")
+            raise ValueError("its arrays have inconsistent shapes")
         if points.shape != (len(points), 3):
             raise ValueError("its points are not (N, 3)")
     except (ValueError, TypeError, KeyError, IndexError) as error:
@@ -109,4 +119,4 @@ def read_kept(folder: Path) -> Kept | None:
             f"can't be read ({error})", where=path, remedy="remove it, or run again"
         ) from error
     pictures = tuple(Pictures(k, found) for k, found in zip(frames, images, strict=True))
-    return Kept(dict(zip(index, before, strict=True)), points, color, pictures)
+    return ViewFile(dict(zip(index, before, strict=True)), points, color, pictures)

@@ -1,4 +1,4 @@
-"""A run while it works: the model grows in the browser."""
+"""A run in the browser while it works: the growing model and the current frame."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tofuse.report.images import data_uri, depth_image, depth_limits, shrink, vi
 from tofuse.report.words import length
 from tofuse.results.types import FrameRecord
 from tofuse.viewer.app import AFTER, CHOSEN, FOV, ResultView, color_bar, wxyz
+from tofuse.viewer.content import ColorBar, read_content
 from tofuse.viewer.coverage import Coverage
-from tofuse.viewer.result import Bar, read_result
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,20 +26,25 @@ if TYPE_CHECKING:
 
 
 _POINTS = 4000  # of each view shown
-_CLOUDS = 120  # views shown; then every second one goes
-_MOVED, _TURNED = 0.15, np.radians(8.0)  # m and rad between views that are shown
-_PERIOD = 0.3  # s between updates of what is seen now
+_CLOUDS = 120  # views shown; beyond, every second one is removed
+_MIN_DISTANCE, _MIN_ANGLE = 0.15, np.radians(8.0)  # m and rad between views that are shown
+_PERIOD = 0.3  # s between updates of the current frame
 _WIDTH = 240  # px
-_RECOLORED = 2.0  # s between new colours of all that is shown
-_CELL = 0.015  # edge of the cubes of the coverage, of the depth of the first view
-_SPREAD = 10.0  # the colour bar's end is so many times what is usual
+_RECOLOR_PERIOD = 2.0  # s between updates of all colours
+_CELL = 0.015  # edge of a coverage cell, as a fraction of the first view's distance
+_SPREAD = 10.0  # ratio of the colour bar's ends to its middle, the median
 
 
 class LiveView:
-    """Hears a job's progress, and shows the views where they lie by what is known so far.
+    """A `Progress` that shows the views at their current poses.
 
-    What is shown is copied, and so little that the job is hardly slower; nothing of it comes back.
-    It is called from one thread at a time, and never raises because of what a browser does.
+    It copies a small part of each view, so that the job is hardly slowed down and not influenced.
+    It is called from one thread at a time, and raises no error because of a browser.
+
+    Attributes
+    ----------
+    first_seconds
+        Time until the first view was shown, s; None before.
     """
 
     def __init__(self, server: ViserServer) -> None:
@@ -54,7 +59,7 @@ class LiveView:
         self._last = -1.0
         self.first_seconds: float | None = None
         self._began = perf_counter()
-        self._apart = (_MOVED, _TURNED)
+        self._spacing = (_MIN_DISTANCE, _MIN_ANGLE)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction("-y")
         server.initial_camera.position = (0.6, -1.2, -2.2)
@@ -69,14 +74,14 @@ class LiveView:
         """See `Progress`."""
         with self._lock:
             self._stage, self._done, self._total = name, 0, total or 0
-            self._say()
+            self._show_status()
 
     def advance(self, record: FrameRecord | None = None) -> None:
         """See `Progress`."""
         with self._lock:
             self._done += 1
             if record is not None and record.status == "lost":
-                self._say(f"frame {record.index} is lost: {record.reason}")
+                self._show_status(f"frame {record.index} is lost: {record.reason}")
 
     def note(self, text: str) -> None:
         """See `Progress`."""
@@ -87,19 +92,19 @@ class LiveView:
             T = np.array(T_world_camera, float)
             self._path.append(T[:3, 3])
             seen = {handle.name for _, handle in self._shown}
-            if f"/live/{frame.index}" in seen or self._is_new(T):
+            if f"/live/{frame.index}" in seen or self._is_far(T):
                 self._add(frame, T)
             now = perf_counter()
-            if self._by.value == "accuracy" and now - self._recolored > _RECOLORED:
+            if self._by.value == "accuracy" and now - self._recolored > _RECOLOR_PERIOD:
                 self._recolor()
             if now - self._last > _PERIOD:
                 self._last = now
-                self._show_now(frame, T)
-                self._say()
+                self._show_current(frame, T)
+                self._show_status()
 
     def finish(self, folder: Path) -> ResultView:
-        """Show the result in place of what was seen on the way."""
-        result = read_result(folder)
+        """Show the result in place of the live view."""
+        result = read_content(folder)
         with self._lock, self._server.atomic():
             self._server.scene.reset()
             self._server.gui.reset()
@@ -107,18 +112,18 @@ class LiveView:
             self._seen.clear()
             return ResultView(self._server, result)
 
-    def _say(self, more: str = "") -> None:
+    def _show_status(self, more: str = "") -> None:
         words = f"**{self._stage}**"
         if self._total:
             words += f" {self._done} of {self._total}"
         self._words.content = f"{words}\n\n{more}" if more else words
 
-    def _is_new(self, T: Float64) -> bool:
+    def _is_far(self, T: Float64) -> bool:
         if not self._shown:
             return True
         moves = se3.inverse(T) @ np.stack([known for known, _ in self._shown])
-        far = np.linalg.norm(moves[:, :3, 3], axis=1) > self._apart[0]
-        return bool((far | (se3.angle(moves) > self._apart[1])).all())
+        far = np.linalg.norm(moves[:, :3, 3], axis=1) > self._spacing[0]
+        return bool((far | (se3.angle(moves) > self._spacing[1])).all())
 
     def _add(self, frame: Frame, T: Float64) -> None:
         points = frame.points
@@ -137,7 +142,7 @@ class LiveView:
         else:
             low, high = np.percentile(world[:, 1], [2, 98])
             tint = viridis((high - world[:, 1].astype(float)) / max(float(high - low), 1e-6))
-        self._cover(frame, world, chosen)
+        self._add_coverage(frame, world, chosen)
         handle = self._server.scene.add_point_cloud(
             f"/live/{frame.index}",
             world,
@@ -156,15 +161,15 @@ class LiveView:
                 del self._seen[old.name]
                 old.remove()
             del self._shown[1::2]
-            self._apart = (1.5 * self._apart[0], 1.5 * self._apart[1])
+            self._spacing = (1.5 * self._spacing[0], 1.5 * self._spacing[1])
 
-    def _cover(self, frame: Frame, world: Float32, chosen: slice) -> None:
-        """Count a view for the accuracy of what it sees."""
+    def _add_coverage(self, frame: Frame, world: Float32, chosen: slice) -> None:
+        """Add a view to the coverage."""
         far = np.linalg.norm(frame.points[chosen], axis=1)
         if self._coverage is None:
             self._coverage = Coverage(max(_CELL * float(np.median(far)), 1e-4))
         known = frame.sigma
-        # Without a noise model only the distances tell: noise grows with their square.
+        # Without a noise model: noise grows with the square of the distance.
         sigma = 0.001 * far**2 if known is None else known[chosen].astype(float)
         self._coverage.add(world, sigma)
 
@@ -173,7 +178,7 @@ class LiveView:
             self._recolor()
 
     def _recolor(self) -> None:
-        """Give all that is shown the colours of what is known by now."""
+        """Update the colours of all views."""
         self._recolored = perf_counter()
         coverage = self._coverage
         if self._by.value == "colour" or coverage is None:
@@ -181,19 +186,19 @@ class LiveView:
             for _, handle in self._shown:
                 handle.colors = self._seen[handle.name][1]
             return
-        usual = OF_95_PERCENT * float(np.median(coverage.sigmas))
+        median = OF_95_PERCENT * float(np.median(coverage.sigmas))
         for _, handle in self._shown:
-            ratio = OF_95_PERCENT * coverage.sigma(self._seen[handle.name][0]) / usual
-            share = 0.5 + 0.5 * np.log(np.minimum(ratio, _SPREAD)) / np.log(_SPREAD)
-            handle.colors = viridis(share)
-        ticks = tuple(f"±{length(usual * times)}" for times in (1 / _SPREAD, 1.0, _SPREAD))
-        bar = Bar("Accuracy so far (95 %), noise only", (ticks[0], ticks[1], ticks[2]))
+            ratio = OF_95_PERCENT * coverage.sigma(self._seen[handle.name][0]) / median
+            level = 0.5 + 0.5 * np.log(np.minimum(ratio, _SPREAD)) / np.log(_SPREAD)
+            handle.colors = viridis(level)
+        ticks = tuple(f"±{length(median * times)}" for times in (1 / _SPREAD, 1.0, _SPREAD))
+        bar = ColorBar("Accuracy so far (95 %), noise only", (ticks[0], ticks[1], ticks[2]))
         self._legend.content = color_bar(bar) + (
-            '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Where to go next: what is bright '
-            "was seen from too far or too seldom.</div>"
+            '<div style="padding:0 0.8em 0.6em;font-size:0.85em">Go to bright places next: they '
+            "were seen from too far away or too rarely.</div>"
         )
 
-    def _show_now(self, frame: Frame, T: Float64) -> None:
+    def _show_current(self, frame: Frame, T: Float64) -> None:
         scene = self._server.scene
         image = None
         if isinstance(frame, RangeFrame):

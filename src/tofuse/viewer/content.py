@@ -1,4 +1,4 @@
-"""What an output folder holds, gathered for the viewer."""
+"""The content of an output folder for the viewer."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from tofuse.report.scene import RigCameras
 from tofuse.report.words import length
 from tofuse.results.folder import TILES, TILESET, finish_interrupted, is_result
 from tofuse.results.output import main_poses, read_run_json
-from tofuse.viewer.detail import OVERVIEW_FACES, chosen
-from tofuse.viewer.kept import read_kept
+from tofuse.viewer.level_of_detail import OVERVIEW_FACES, select_tiles
+from tofuse.viewer.view_file import read_view_file
 
-MAX_FACES = 500_000  # of a surface that a browser turns smoothly
+MAX_FACES = 500_000  # that a browser renders smoothly
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Points, or a surface, and what they can be coloured by.
+    """Points, or a surface, with the values that they can be coloured by.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Layer:
         )
 
     def simplified(self, faces: int) -> Layer:
-        """Return a surface with about `faces` triangles at most; of a cloud there is no less."""
+        """Return a surface simplified to about `faces` triangles at most; a cloud as it is."""
         if self.faces is None or self.normals is None or len(self.faces) <= faces:
             return self
         n = len(self.points)
@@ -96,12 +96,12 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class TiledLayer:
-    """A surface in tiles, which are read when they are asked for.
+    """A surface in tiles, which are read on demand.
 
     Attributes
     ----------
     folder, root
-        Where they are, and their tree.
+        The folder of the tiles, and the root of their tree.
     R_up_world
         (3, 3) from the world into the axes of the tiles.
     """
@@ -112,7 +112,7 @@ class TiledLayer:
 
     @classmethod
     def read(cls, folder: Path) -> TiledLayer:
-        """Read the tree of a folder; InputError if it is damaged."""
+        """Read the tree of tiles in a folder; InputError if it is damaged."""
         path = folder / TILESET
         root, extras = read_tileset(path)
         T = np.array(extras.get("T_up_world", np.eye(4)), float)
@@ -121,7 +121,7 @@ class TiledLayer:
         return cls(folder, root, T[:3, :3])
 
     def layer(self, tile: Tile) -> Layer:
-        """Read a tile that has a file, into the world frame."""
+        """Read a tile with content, in the world frame."""
         assert tile.content is not None
         glb = read_glb(self.folder / tile.content)
         R = self.R_up_world.astype(np.float32)
@@ -136,12 +136,14 @@ class TiledLayer:
         )
 
     def overview(self) -> Layer:
-        """All of it, with few triangles."""
-        return joined([self.layer(tile) for tile in chosen(self.root, None, OVERVIEW_FACES)])
+        """The whole surface with few triangles."""
+        return merge_layers(
+            [self.layer(tile) for tile in select_tiles(self.root, None, OVERVIEW_FACES)]
+        )
 
 
-def joined(layers: Sequence[Layer]) -> Layer:
-    """Put layers with faces into one; it has what all of them have."""
+def merge_layers(layers: Sequence[Layer]) -> Layer:
+    """Merge layers with faces; the result has the values that all of them have."""
 
     def column(values: list[NDArray[Any] | None]) -> Any:
         known = [each for each in values if each is not None]
@@ -164,21 +166,25 @@ def joined(layers: Sequence[Layer]) -> Layer:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """A result, as the viewer shows it.
+class ViewContent:
+    """A result as the viewer shows it.
 
     Attributes
     ----------
-    run
-        `run.json`.
+    folder, run
+        The output folder and its `run.json`.
+    cloud, mesh
+        The model.
     after, before
-        T_world_camera (4, 4) by frame index, with loops closed and before.
+        T_world_camera (4, 4) by frame index, after and before loop closure.
     model_before
-        Points as they lay before, or None.
+        Points of the model before loop closure, or None.
+    pictures
+        Images of some frames.
     up
-        (3,) unit vector in the world.
+        (3,) unit vector in the world frame.
     tiles
-        Of a surface that is too large to be shown at once; `mesh` and `cloud` are an overview then.
+        The tiles of a large surface, of which `mesh` and `cloud` are an overview; else None.
     """
 
     folder: Path
@@ -194,18 +200,18 @@ class Result:
 
     @property
     def frames(self) -> list[dict[str, Any]]:
-        """What `run.json` says of each frame."""
+        """The entries of `run.json` for the frames."""
         frames: list[dict[str, Any]] = self.run["frames"]
         return frames
 
     @property
     def rig(self) -> RigCameras | None:
-        """The cameras of a rig; None where there is one camera."""
+        """The cameras of a rig; None for a single camera."""
         return RigCameras.of(self.run.get("rig"), len(self.frames))
 
     @property
     def loops(self) -> Float64:
-        """(L, 2, 3) ends of the accepted loops whose frames have a pose."""
+        """(L, 2, 3) camera centres of accepted loop closures, m."""
         pairs = [(p["i"], p["j"]) for p in self.run["loops"] if p["accepted"]]
         ends = [
             [self.after[i][:3, 3], self.after[j][:3, 3]]
@@ -215,20 +221,20 @@ class Result:
         return np.array(ends, float).reshape(-1, 2, 3)
 
 
-def read_result(folder: Path) -> Result:
-    """Read the output folder of a run.
+def read_content(folder: Path) -> ViewContent:
+    """Read the output folder of a run for the viewer.
 
     Raises
     ------
     InputError
-        If it is no such folder, or what it holds is damaged or of different runs.
+        If it is not an output folder, or its files are damaged or of different runs.
     """
     if not folder.exists():
-        raise InputError("doesn't exist", where=folder, remedy="give the --out of `tofuse run`")
+        raise InputError("doesn't exist", where=folder, remedy="pass the --out of `tofuse run`")
     finish_interrupted(folder)
     if not folder.is_dir() or not is_result(folder):
         raise InputError(
-            "holds no result (no run.json)", where=folder, remedy="give the --out of `tofuse run`"
+            "is not a result (no run.json)", where=folder, remedy="pass the --out of `tofuse run`"
         )
     run = read_run_json(folder / "run.json")
     posed, poses = main_poses(folder, run)
@@ -243,11 +249,11 @@ def read_result(folder: Path) -> Result:
         mesh = None
         if (folder / "mesh.ply").is_file():
             mesh = Layer.of(read_ply(folder / "mesh.ply")).simplified(MAX_FACES)
-    kept = read_kept(folder)
+    kept = read_view_file(folder)
     model_before = None
     if kept is not None and len(kept.points):
         model_before = Layer(kept.points, None, None, kept.color, None, None)
-    return Result(
+    return ViewContent(
         folder,
         run,
         cloud,
@@ -283,7 +289,7 @@ COLORINGS = ("colour", "height", "accuracy", "view count")
 
 
 def colorings(layers: Sequence[Layer]) -> list[str]:
-    """Return what at least one of the layers can be coloured by."""
+    """Return the colourings that at least one of the layers has values for."""
     needs: dict[str, list[NDArray[Any] | None]] = {
         "colour": [la.color for la in layers],
         "height": [la.points for la in layers],
@@ -294,34 +300,43 @@ def colorings(layers: Sequence[Layer]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Bar:
-    """A colour bar: what it is of, and what is written at its ends and in its middle."""
+class ColorBar:
+    """A colour bar: its label, and the ticks at its ends and in its middle."""
 
     label: str
     ticks: tuple[str, str, str]
 
 
-def painted(
+def layer_colors(
     layer: Layer, by: str, up: Float64, scale_of: Layer | None = None
-) -> tuple[UInt8, Bar | None]:
-    """Return colours (N, 3) of a layer, and their bar; grey if it has no such values.
+) -> tuple[UInt8, ColorBar | None]:
+    """Return colours (N, 3) of a layer, and their colour bar; grey if it has no such values.
 
-    The scale is that of another layer where one is given, of which this one is a part.
+    Colours of values are exactly those of the bar. The layer's own colours are shaded by a fixed
+    light from above and from one side, since the page is unlit.
 
-    Colours of values are exactly those of the bar. The layer's own are shaded, from above and from
-    one side, as no light of the page changes them.
+    Parameters
+    ----------
+    layer
+        The layer.
+    by
+        One of `COLORINGS`.
+    up
+        (3,) unit vector in the world frame.
+    scale_of
+        The layer whose range of values defines the scale; by default the same layer.
     """
     if by == "colour" and layer.color is not None:
         return _shaded(seen_colors(layer.color), layer, up), None
     values = _values(layer, by, up)
     if values is not None:
         known = None if scale_of is None else _values(scale_of, by, up)
-        return _mapped(values, values if known is None else known, by)
+        return _map_colors(values, values if known is None else known, by)
     return np.full((len(layer.points), 3), 170, np.uint8), None
 
 
 def _values(layer: Layer, by: str, up: Float64) -> Float64 | None:
-    """What a layer is coloured by; None if it does not have it."""
+    """The values of a layer for a colouring; None if it has none."""
     if by == "height":
         return np.asarray(layer.points @ up, np.float64)
     if by == "accuracy" and layer.sigma is not None:
@@ -336,18 +351,18 @@ _LABELS: dict[str, tuple[str, Callable[[float], str]]] = {
 }
 
 
-def _mapped(values: Float64, scale: Float64, by: str) -> tuple[UInt8, Bar]:
-    """Colours of values on the scale of others, and the bar; accuracies by their ratios."""
-    label, say = _LABELS[by]
+def _map_colors(values: Float64, scale: Float64, by: str) -> tuple[UInt8, ColorBar]:
+    """Colours of values on the scale of others, and the bar; accuracies on a logarithmic scale."""
+    label, text = _LABELS[by]
     ratio = by == "accuracy"
     shown, known = (np.log(np.maximum(v, 1e-6)) if ratio else v for v in (values, scale))
     good = known[np.isfinite(known)]
     low, high = np.percentile(good, [2, 98]).tolist() if len(good) else (0.0, 1.0)
     back: Callable[[float], float] = (lambda v: float(np.exp(v))) if ratio else float
     zero = low if by == "height" else 0.0
-    ticks = tuple(say(back(v) - zero) for v in (low, (low + high) / 2, high))
+    ticks = tuple(text(back(v) - zero) for v in (low, (low + high) / 2, high))
     colors = viridis((np.nan_to_num(shown, nan=high) - low) / max(high - low, 1e-9))
-    return colors, Bar(label, (ticks[0], ticks[1], ticks[2]))
+    return colors, ColorBar(label, (ticks[0], ticks[1], ticks[2]))
 
 
 def _shaded(color: UInt8, layer: Layer, up: Float64) -> UInt8:

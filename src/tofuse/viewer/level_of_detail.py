@@ -1,4 +1,4 @@
-"""Which tiles of a surface are to be seen from somewhere: fine ones near by, coarse ones far."""
+"""Selection of tiles for a view: fine ones near the camera, coarse ones far away."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.files.tileset import Tile
 
-# 60 million triangles a second at 30 pictures a second: by their data sheets a tenth or less of
-# what the graphics inside of processors draw.
-MOST_FACES = 2_000_000
+# 60 million triangles per second at 30 frames per second: a tenth or less of what integrated
+# graphics render by their data sheets.
+MAX_SHOWN_FACES = 2_000_000
 OVERVIEW_FACES = 250_000
-# Errors that are smaller on the screen are not worth more triangles. A cube of vertices that were
-# put together is then hardly larger than what a triangle needs to be seen.
-_PIXELS = 2.0
-_NEAREST_M = 0.01
+# Smaller errors on the screen need no more triangles: a cluster of merged vertices is then hardly
+# larger than a visible triangle.
+_MAX_ERROR_PIXELS = 2.0
+_MIN_DISTANCE_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """Who looks, in the axes of the tiles.
+    """The camera of a client, in the axes of the tiles.
 
     Attributes
     ----------
     position, forward
-        (3,) m, and a unit vector.
+        (3,) m, and (3,) unit vector of the viewing direction.
     fov
-        Height of the picture, rad.
+        Vertical field of view, rad.
     aspect, height
-        Width over height, and pixels.
+        Width over height, and height in pixels.
     """
 
     position: Float64
@@ -41,15 +41,15 @@ class Eye:
     height: int
 
     def pixels(self, tile: Tile) -> float:
-        """How large the error of a tile is on the screen; 0 outside of it."""
+        """Return the geometric error of a tile on the screen in pixels; 0 outside the view."""
         if not self._sees(tile):
             return 0.0
         off = np.maximum(np.maximum(tile.low - self.position, self.position - tile.high), 0)
-        distance = max(float(np.linalg.norm(off)), _NEAREST_M)
+        distance = max(float(np.linalg.norm(off)), _MIN_DISTANCE_M)
         return float(tile.error_m * self.height / (2 * np.tan(self.fov / 2) * distance))
 
     def _sees(self, tile: Tile) -> bool:
-        """Whether the ball around a tile is in the cone around the picture."""
+        """Whether the bounding sphere of a tile intersects the cone around the view frustum."""
         middle, radius = (tile.low + tile.high) / 2, float(np.linalg.norm(tile.high - tile.low)) / 2
         to = middle - self.position
         distance = float(np.linalg.norm(to))
@@ -60,21 +60,29 @@ class Eye:
         return bool(angle <= half + np.arcsin(radius / distance))
 
 
-def chosen(root: Tile, eye: Eye | None, most_faces: int) -> list[Tile]:
-    """Return the tiles to be shown: each part of the surface once, in tiles that have a file.
+def select_tiles(root: Tile, eye: Eye | None, max_faces: int) -> list[Tile]:
+    """Return the tiles to be shown: each part of the surface once, in tiles with content.
 
-    The tile whose error is largest on the screen is replaced by its children, as long as there are
-    no more triangles than `most_faces`, and until no error is worth it. Without an `eye` the errors
-    themselves count.
+    The tile with the largest error on the screen is replaced by its children, until every error is
+    small enough or the budget is used up.
+
+    Parameters
+    ----------
+    root
+        Root of the tree of tiles.
+    eye
+        The camera; None: geometric errors count instead of those on the screen.
+    max_faces
+        Maximum number of triangles.
     """
     shown: list[Tile] = []
     faces = root.faces
     waiting = [(-_urgency(root, eye), 0, root)]
-    number = 0  # equal ones in the order in which they came
+    number = 0  # breaks ties in the order of insertion
     while waiting:
         urgency, _, tile = heapq.heappop(waiting)
         more = sum(child.faces for child in tile.children) - tile.faces
-        if tile.content is None or (urgency < 0 and faces + more <= most_faces):
+        if tile.content is None or (urgency < 0 and faces + more <= max_faces):
             faces += more
             for child in tile.children:
                 number += 1
@@ -85,7 +93,7 @@ def chosen(root: Tile, eye: Eye | None, most_faces: int) -> list[Tile]:
 
 
 def _urgency(tile: Tile, eye: Eye | None) -> float:
-    """0 for what needs no more detail."""
+    """Priority of a tile for refinement; 0 if it needs no more detail."""
     if tile.content is None:
         return float(np.inf)
     if not tile.children:
@@ -93,4 +101,4 @@ def _urgency(tile: Tile, eye: Eye | None) -> float:
     if eye is None:
         return tile.error_m
     pixels = eye.pixels(tile)
-    return pixels if pixels > _PIXELS else 0.0
+    return pixels if pixels > _MAX_ERROR_PIXELS else 0.0

@@ -1,4 +1,4 @@
-"""Which point of the model a click means."""
+"""The point of the model that a click refers to."""
 
 from __future__ import annotations
 
@@ -9,24 +9,31 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.arrays import Float64
-from tofuse.viewer.result import Layer
+from tofuse.viewer.content import Layer
 
-_NEAR, _FAR = 0.006, 0.02  # rad off the ray: as good as on it, and too far
+_NEAR, _FAR = 0.006, 0.02  # angle to the ray in rad: as good as on it, and too far
 
 
 @dataclass(frozen=True, eq=False)
-class Picked:
+class PickedPoint:
     """A point (3,) of the model, and its standard deviation in m, NaN where it is not known."""
 
     point: Float64
     sigma: float
 
 
-def picked(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> Picked | None:
-    """Return the point of the layers that lies on a ray in front, or None.
+def pick(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> PickedPoint | None:
+    """Return the point of the layers on a ray, or None.
 
-    Of the points that are as good as on the ray the nearest counts; without any, the one that is
-    least off. What a surface shows from behind is not drawn, so it is not picked.
+    The closest of the points that are as good as on the ray; without any, that with the smallest
+    angle to it. Back faces are not drawn, and so not picked.
+
+    Parameters
+    ----------
+    layers
+        The visible layers.
+    origin, direction
+        (3,) of the ray, world frame.
     """
     o, d = np.asarray(origin, float), np.asarray(direction, float)
     d = d / np.linalg.norm(d)
@@ -48,5 +55,5 @@ def picked(layers: Sequence[Layer], origin: ArrayLike, direction: ArrayLike) -> 
         if off[k] < _FAR and (best is None or rank < best):
             row = rows[k]
             sigma = float("nan") if layer.sigma is None else float(layer.sigma[row])
-            best, found = rank, Picked(layer.points[row].astype(float), sigma)
+            best, found = rank, PickedPoint(layer.points[row].astype(float), sigma)
     return found
