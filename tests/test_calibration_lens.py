@@ -118,7 +118,7 @@ def _bare(frame: RangeFrame) -> RangeFrame:
         (lambda: frames()[:4], Board(9, 7, 0.1), "shows no board of 9 x 7"),
         (lambda: frames()[:4], Board(5, 4, 0.1), "check --board"),
         (lambda: [_bare(frames()[0])], BOARD, "--image color"),
-        (lambda: [CloudFrame.of(np.eye(3))], BOARD, "holds clouds"),
+        (lambda: [CloudFrame.of(np.eye(3))], BOARD, "contains clouds"),
     ],
 )
 def test_what_tells_no_lens_is_refused(chosen, board: Board, message: str) -> None:

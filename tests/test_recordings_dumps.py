@@ -131,7 +131,7 @@ def changed(folder: Path, **changes: object) -> None:
         ({"fl_x": "wide"}, "fl_x: is 'wide'"),
         ({"camera_model": "EQUIRECTANGULAR"}, "use one of PERSPECTIVE"),
         ({"k4": 0.1}, "k4: is not 0"),
-        ({"w": 100}, "another shape"),
+        ({"w": 100}, "another aspect ratio"),
         ({"depth_unit_scale_factor": -1}, "is -1"),
         ({"frames": []}, "has no frames with depth_file_path"),
         ({"frames": {}}, "has no list of frames"),

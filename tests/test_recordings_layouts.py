@@ -118,7 +118,7 @@ def test_open3d_is_read_back(tmp_path: Path) -> None:
 
 def test_what_can_not_be_converted(tmp_path: Path) -> None:
     cloud = Recording.of(ArraySource([CloudFrame.of(np.ones((5, 3)))]), "made", "made")
-    with pytest.raises(InputError, match="holds clouds"):
+    with pytest.raises(InputError, match="contains clouds"):
         convert_to(cloud, tmp_path / "a", "tum")
     assert not list(tmp_path.iterdir())
     (tmp_path / "a").mkdir()

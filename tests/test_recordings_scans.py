@@ -146,7 +146,7 @@ def test_coordinates_of_maps_keep_their_millimetres(tmp_path: Path) -> None:
     frame = recording[0]
     assert isinstance(frame, CloudFrame)
     assert np.allclose(frame.points + shift, POINTS + where, atol=2e-3)
-    assert any("less (453000, 5412000, 0) m" in w for w in recording.warnings)
+    assert any("minus (453000, 5412000, 0) m" in w for w in recording.warnings)
 
 
 def test_las_that_claims_too_much(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_names_of_cameras_lead_nowhere(name, tmp_path) -> None:
               [0, 0, 1, 0], [0, 0, 0, 1]]}  # fmt: skip
     path = tmp_path / "rig.json"
     path.write_text(json.dumps({"schema": 1, "cameras": [camera, camera | {"name": "b"}]}))
-    with pytest.raises(InputError, match="which is no name of a folder"):
+    with pytest.raises(InputError, match="which is not a folder name"):
         read_rig(path)
 
 

@@ -1,4 +1,4 @@
-"""A recording made of arrays: `tofuse.from_arrays`."""
+"""A recording of arrays in memory: `tofuse.from_arrays`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tofuse.geometry.cameras import Camera, Pinhole, RayTable
 from tofuse.recordings.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.recordings.recording import ArraySource, Recording
 
-# Of whole numbers of depth nearly all cameras mean millimetres.
+# The unit of integer depth for nearly all cameras.
 _MILLIMETRES = 1e-3
-# Depth in metres has its median below; beyond it, it must be in millimetres.
-_FARTHEST_M = 200.0
+# A larger median of depth can't be in metres.
+_MAX_MEDIAN_M = 200.0
 
 
 def from_arrays(
@@ -34,43 +34,45 @@ def from_arrays(
     depth_unit_m: float | None = None,
     amplitude_kind: AmplitudeKind = "raw",
 ) -> Recording:
-    """Make a recording of images that are in memory.
+    """Return a recording of images in memory.
 
     Parameters
     ----------
     depth
-        (N, H, W), or N images (H, W); 0 or NaN where there is none. Floats are metres and whole
-        numbers millimetres, unless `depth_unit_m` says otherwise.
+        (N, H, W), or N images (H, W); 0 or NaN where invalid. Floats are in metres and integers in
+        millimetres, unless `depth_unit_m` is given.
     camera
         A camera, or the matrix K (3, 3) of a pinhole camera without distortion, in pixels of the
         depth images.
     color
         (N, H, W, 3) uint8 RGB at the pixels of depth.
     amplitude
-        (N, H, W) counts; what they count says `amplitude_kind`, see `RangeFrame`.
+        (N, H, W) counts, of the kind `amplitude_kind`.
     confidence
         (N, H, W) uint8, higher is better.
     timestamps
-        (N,) s; 30 images a second unless given.
+        (N,) s; 30 images per second unless given.
     reference
-        (N, 4, 4) T_world_camera, NaN where there is none: only ever compared with.
+        (N, 4, 4) T_world_camera, NaN where unknown; used only for comparison.
     odometry
-        (N, 4, 4) T_world_camera that may help, NaN where there is none.
+        (N, 4, 4) T_world_camera of odometry, NaN where unknown.
     depth_kind
         "z", or "range" along the rays.
     depth_unit_m
-        What a depth of 1 is, in m.
+        Metres per unit of depth.
+    amplitude_kind
+        See `RangeFrame`.
 
     Raises
     ------
     InputError
-        If shapes or types do not fit, or the depth can't be in the unit that is assumed.
+        If shapes or types do not fit, or the depth can't be in the assumed unit.
     """
     images = _images("depth", depth, None)
     shape = images[0].shape
     if len(shape) != 2:
         raise InputError(f"has images of shape {shape}", where="depth", remedy="give (N, H, W)")
-    seen_by = _camera(camera, shape)
+    checked_camera = _camera(camera, shape)
     times = _times(timestamps, len(images))
     colors = _optional("color", color, images, np.uint8, 3)
     amplitudes = _optional("amplitude", amplitude, images, np.float32)
@@ -84,7 +86,7 @@ def from_arrays(
             RangeFrame(
                 k,
                 float(times[k]),
-                seen_by,
+                checked_camera,
                 np.where(good, metres, 0).astype(np.float32),
                 depth_kind,
                 amplitude_image=None if amplitudes is None else amplitudes[k],
@@ -105,9 +107,11 @@ def _images(name: str, given: Any, shape: tuple[int, ...] | None) -> list[NDArra
     try:
         images = [np.asarray(image) for image in given]
     except TypeError as error:
-        raise InputError("is no array of images", where=name, remedy="give (N, H, W)") from error
+        raise InputError(
+            "is not an array of images", where=name, remedy="give (N, H, W)"
+        ) from error
     if not images:
-        raise InputError("holds no image", where=name)
+        raise InputError("contains no image", where=name)
     expected = images[0].shape if shape is None else shape
     for k, image in enumerate(images):
         if image.dtype.kind not in "iufb" or image.shape != expected:
@@ -127,12 +131,12 @@ def _optional(
     if given is None:
         return None
     shape = images[0].shape if channels is None else (*images[0].shape, channels)
-    found = _images(name, given, shape)
-    if len(found) != len(images):
-        raise InputError(f"holds {len(found)} images, and depth {len(images)}", where=name)
-    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in found):
-        raise InputError(f"is {found[0].dtype}", where=name, remedy="give uint8, from 0 to 255")
-    return [image.astype(dtype, copy=False) for image in found]
+    optional = _images(name, given, shape)
+    if len(optional) != len(images):
+        raise InputError(f"contains {len(optional)} images, and depth {len(images)}", where=name)
+    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in optional):
+        raise InputError(f"is {optional[0].dtype}", where=name, remedy="give uint8, from 0 to 255")
+    return [image.astype(dtype, copy=False) for image in optional]
 
 
 def _to_metres(
@@ -145,7 +149,7 @@ def _to_metres(
     if unit_m is None and not whole:
         sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
         sample = sample[np.isfinite(sample) & (sample > 0)]
-        if len(sample) and np.median(sample) > _FARTHEST_M:
+        if len(sample) and np.median(sample) > _MAX_MEDIAN_M:
             raise InputError(
                 f"has a median of {np.median(sample):.4g}, which can't be metres",
                 where="depth",
@@ -171,7 +175,7 @@ def _camera(given: Camera | ArrayLike, shape: tuple[int, ...]) -> Camera:
         ) from error
     if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
         raise InputError(
-            f"is no matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
+            f"is not a matrix K: {K.tolist()}" if K.size < 20 else f"has shape {K.shape}",
             where="camera",
             remedy="give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of the depth images",
         )

@@ -1,4 +1,4 @@
-"""Bags and the messages of one of their topics, by the package rosbags."""
+"""ROS bags and the messages of their topics, read by the package rosbags."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tofuse.geometry.cameras import Camera
 from tofuse.recordings.camera_file import check_size
 from tofuse.recordings.ros_messages import GREY, image, taken
 
-MISSING = "give `pip install 'tofuse[ros]'`, which brings rosbags"
-APART_S = 0.02  # amplitude farther from its depth than this is of another frame
+MISSING = "run `pip install 'tofuse[ros]'`, which installs rosbags"
+MAX_GAP_S = 0.02  # between the images of one frame
 ROS1_MAGIC = b"#ROSBAG V2"
 MAGIC = (ROS1_MAGIC, b"\x89MCAP0\r\n")
 
 
 def open_bag(path: Path) -> Any:
-    """Open a bag, to be closed by its ``close``.
+    """Open a bag; the caller has to ``close`` it.
 
     Raises
     ------
@@ -40,9 +40,9 @@ def open_bag(path: Path) -> Any:
 
 
 def open_container(path: Path) -> Any:
-    """Open a ROS 1 bag whose messages rosbags is not to decode; else as `open_bag`.
+    """Open a ROS 1 bag without decoding its messages; else as `open_bag`.
 
-    Makers' own definitions of them are often incomplete.
+    The message definitions in the bags of some makers are incomplete.
     """
     (rosbag1,) = _rosbags(path, "rosbag1")
     return _opened(path, lambda: rosbag1.Reader(path))
@@ -69,7 +69,7 @@ def _opened(path: Path, make: Callable[[], Any]) -> Any:
 
 
 def damaged(error: Exception, where: str | Path) -> InputError:
-    """Return our own error for whatever rosbags says of a damaged bag."""
+    """Return an InputError for any exception that rosbags raises for a damaged bag."""
     return InputError(
         f"can't be read ({type(error).__name__}: {str(error)[:200]})",
         where=where,
@@ -78,21 +78,21 @@ def damaged(error: Exception, where: str | Path) -> InputError:
 
 
 class Track:
-    """The messages of one topic, read in order or one by one.
+    """The messages of one topic, with sequential and random access.
 
     Attributes
     ----------
     connection
-        As rosbags gives it, with ``topic`` and ``msgtype``.
+        The connection of rosbags, with ``topic`` and ``msgtype``.
     times
-        (N,) seconds at which they were taken, by their headers, or else arrived.
+        (N,) s, from the message headers, or else of their arrival.
     """
 
     def __init__(self, bag: Any, connection: Any) -> None:
         self.bag, self.connection = bag, connection
-        found = [(t, taken(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()]
-        self._arrived = [arrived for arrived, _ in found]
-        self.times: Float64 = np.array([when or t / 1e9 for t, when in found])
+        stamps = [(t, taken(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()]
+        self._arrived = [arrived for arrived, _ in stamps]
+        self.times: Float64 = np.array([when or t / 1e9 for t, when in stamps])
         self._running: Iterator[tuple[Any, int, Any]] | None = None
         self._next = 0
 
@@ -100,9 +100,9 @@ class Track:
         return len(self._arrived)
 
     def raw(self, index: int) -> Any:
-        """Return the bytes of a message; the next one follows the last without a search."""
+        """Return the bytes of a message; reading in order needs no search."""
         if self._running is None or index != self._next:
-            # Of messages of one time, the one that is meant is so many further on.
+            # Skip earlier messages with the same arrival time.
             time = self._arrived[index]
             self._running = self._messages(time)
             for _ in range(index - self._arrived.index(time)):
@@ -115,7 +115,7 @@ class Track:
             raise
 
     def message(self, index: int) -> Any:
-        """Return a message as rosbags decodes it."""
+        """Return a message, decoded by rosbags."""
         raw = self.raw(index)
         try:
             return self.bag.deserialize(raw, self.connection.msgtype)
@@ -124,32 +124,32 @@ class Track:
             raise
 
     def near(self, time: float, limit: float) -> int | None:
-        """Return the index of the message taken nearest to a time, or None beyond a limit in s."""
+        """Return the index of the message nearest to `time`, or None beyond `limit`, both in s."""
         if not len(self.times):
             return None
         k = int(np.argmin(np.abs(self.times - time)))
         return k if abs(self.times[k] - time) <= limit else None
 
     def _messages(self, start: int | None = None) -> Iterator[tuple[Any, int, Any]]:
-        found: Iterator[tuple[Any, int, Any]] = self.bag.messages(
+        messages: Iterator[tuple[Any, int, Any]] = self.bag.messages(
             connections=[self.connection], start=start
         )
-        return found
+        return messages
 
 
-def amplitude_beside(
+def amplitude_at(
     track: Track | None,
     time: float,
     camera: Camera,
     where: str,
     read: Callable[[Track, int], Any] = Track.message,
 ) -> Float32 | None:
-    """Return the amplitude (H, W) taken with a depth image; zeros where there is none of its time.
+    """Return the amplitude (H, W) of the time of a depth image; zeros if there is none.
 
     Parameters
     ----------
     track
-        Images of the active brightness; None where the bag has none.
+        Amplitude images; None if the bag has none.
     time
         Of the depth image, s.
     camera
@@ -157,16 +157,16 @@ def amplitude_beside(
     where
         For errors.
     read
-        Gives a message of a track.
+        Returns a message of a track by its index.
 
     Raises
     ------
     InputError
-        If the image is of another size or kind, or cut off.
+        If the image is of another size or encoding, or cut off.
     """
     if track is None:
         return None
-    k = track.near(time, APART_S)
+    k = track.near(time, MAX_GAP_S)
     if k is None:
         return np.zeros((camera.height, camera.width), np.float32)
     counts = image(read(track, k), f"{where}, amplitude", GREY)

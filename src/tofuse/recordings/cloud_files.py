@@ -1,4 +1,4 @@
-"""A source over files that each hold one cloud."""
+"""A source over files with one cloud each."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from tofuse.recordings.organised import SAMPLES
 from tofuse.recordings.reader import SURE, Sniff
 from tofuse.recordings.sources import FileSource, read_timestamps, tum_poses
 
-# From here on float32 steps by more than half a millimetre.
+# The resolution of float32 is coarser than half a millimetre beyond.
 MAP_COORDINATES_M = 8192.0
 
-_STEP_M = 1000.0  # coordinates of maps are moved by whole kilometres
+_STEP_M = 1000.0  # map coordinates are shifted by whole kilometres
 
 F = TypeVar("F", bound=Frame)
 LoadFrame = Callable[[Path, int, float], Frame]
@@ -32,7 +32,7 @@ LoadShifted = Callable[[Path, int, float, Float64], Frame]
 
 
 class CloudFileSource(FileSource):
-    """One file, one view; timestamps.txt and poses beside them are read as for native folders.
+    """One view per file; timestamps.txt and pose files in the folder are read as for native ones.
 
     Parameters
     ----------
@@ -43,9 +43,9 @@ class CloudFileSource(FileSource):
     load_frame
         Reads a file, given its index and timestamp.
     load_shifted
-        Does so in double precision, and takes a shift (3,) off the coordinates: coordinates of maps
-        don't fit into float32. All files are moved by the same, found from the first that can be
-        read, which is `shift_m` in `metadata`.
+        Reads in double precision and subtracts a shift (3,) from the coordinates, as map
+        coordinates don't fit into float32. The shift is determined from the first readable file,
+        and is `shift_m` in `metadata`.
     """
 
     def __init__(
@@ -58,9 +58,9 @@ class CloudFileSource(FileSource):
         super().__init__(np.arange(len(files), dtype=float))
         self.files = files
         self.load_frame, self.load_shifted = load_frame, load_shifted
-        self._far = False
-        self._kept: dict[int, Frame] = {}  # read to find shift and camera
-        self._seen: Deprojection | None = None
+        self._warned_far = False
+        self._cached: dict[int, Frame] = {}  # read to determine shift and camera
+        self._deprojection: Deprojection | None = None
         if is_folder(path):
             self._read_timestamps(path / "timestamps.txt")
             if is_file(path / "groundtruth.txt"):
@@ -71,24 +71,24 @@ class CloudFileSource(FileSource):
                 self.odometry = tum_poses(self, path / "odometry.txt")
         self._shift = np.zeros(3)
         if load_shifted is not None:
-            self._shift, self._kept = find_shift(self._read, len(files))
+            self._shift, self._cached = find_shift(self._read, len(files))
             note_shift(self, path, self._shift)
-            self._seen = self._deprojection()
-            if self._seen is not None:
+            self._deprojection = self._find_deprojection()
+            if self._deprojection is not None:
                 self.metadata["depth_kind"] = "z"
 
     def load(self, index: int) -> Frame:
         """See `FileSource.load`."""
-        kept = self._kept.pop(index, None)
-        frame = self._read(index) if kept is None else kept
-        if self._seen is not None and isinstance(frame, CloudFrame):
-            return self._seen.image(frame)
+        cached = self._cached.pop(index, None)
+        frame = self._read(index) if cached is None else cached
+        if self._deprojection is not None and isinstance(frame, CloudFrame):
+            return self._deprojection.image(frame)
         farthest = float(np.abs(frame.points).max(initial=0))
-        if farthest > MAP_COORDINATES_M and not self._far:
-            self._far = True
+        if farthest > MAP_COORDINATES_M and not self._warned_far:
+            self._warned_far = True
             step = float(np.spacing(np.float32(farthest)))
             self.warnings.append(
-                f"{self.files[index]}: coordinates of up to {farthest:.3g} m are kept only to "
+                f"{self.files[index]}: coordinates of up to {farthest:.3g} m are rounded to "
                 f"{step:.2g} m; move the clouds near the origin"
             )
         return frame
@@ -99,27 +99,27 @@ class CloudFileSource(FileSource):
             return self.load_shifted(file, index, time, self._shift)
         return self.load_frame(file, index, time)
 
-    def _deprojection(self) -> Deprojection | None:
-        """The camera that all clouds were deprojected from, by some that can be read."""
+    def _find_deprojection(self) -> Deprojection | None:
+        """The camera from which all clouds were deprojected, determined from a few of them."""
         if self._shift.any():
             return None
         clouds: list[CloudFrame] = []
-        found: Deprojection | None = None
+        candidate: Deprojection | None = None
         for index in range(0, len(self.files), max(1, len(self.files) // SAMPLES)):
             if len(clouds) == SAMPLES:
                 break
             try:
-                frame = self._kept[index] if index in self._kept else self._read(index)
+                frame = self._cached[index] if index in self._cached else self._read(index)
             except InputError:
                 continue
             if not isinstance(frame, CloudFrame):
                 return None
             clouds.append(frame)
-            if found is None:
-                found = find_deprojection(clouds)
-                if found is None:  # as most clouds: one shows it
+            if candidate is None:
+                candidate = find_deprojection(clouds)
+                if candidate is None:  # as for most clouds: one is sufficient to see it
                     return None
-        return find_deprojection(clouds) if len(clouds) > 1 else found
+        return find_deprojection(clouds) if len(clouds) > 1 else candidate
 
     def _read_timestamps(self, path: Path) -> None:
         if not is_file(path):
@@ -127,18 +127,20 @@ class CloudFileSource(FileSource):
         self.timestamps = read_timestamps(path, len(self.files), "cloud", self.warnings)
 
     def _numbered_poses(self, path: Path) -> Float64 | None:
-        """Read 'index x y z qw qx qy qz' lines, the index being the number in the file's name."""
+        """Read lines 'index x y z qw qx qy qz' with the number in the file name as index."""
         table = read_numbers(path)
         fits = table.ndim == 2 and table.shape[1] == 8 and np.isfinite(table).all()
         if not fits or (table[:, 0] != np.rint(table[:, 0])).any():
             self.warnings.append(
-                f"{path}: not 'index x y z qw qx qy qz', left aside; use groundtruth.txt (TUM)"
+                f"{path}: not 'index x y z qw qx qy qz', ignored; use groundtruth.txt (TUM)"
             )
             return None
         norms = np.linalg.norm(table[:, 4:], axis=1)
         if (np.abs(norms - 1) > 0.1).any():
             raise InputError(
-                "holds no unit quaternions", where=path, remedy="write 'index x y z qw qx qy qz'"
+                "contains quaternions that are not of unit length",
+                where=path,
+                remedy="write 'index x y z qw qx qy qz'",
             )
         by_number = {int(row[0]): row for row in table}
         out = np.full((len(self.files), 4, 4), np.nan)
@@ -149,14 +151,14 @@ class CloudFileSource(FileSource):
                 out[k] = np.eye(4)
                 out[k, :3, :3] = to_matrix(row[[5, 6, 7, 4]])
                 out[k, :3, 3] = row[1:4]
-        self.warnings.append(f"{path}: read as index x y z qw qx qy qz, kept as reference only")
+        self.warnings.append(f"{path}: read as index x y z qw qx qy qz, used only as reference")
         return out
 
 
 def find_shift(read: Callable[[int], F], count: int) -> tuple[Float64, dict[int, F]]:
-    """Return what to take off all coordinates (3,), by the first frame that can be read.
+    """Return the shift (3,) in m to subtract from all coordinates, from the first readable frame.
 
-    And that frame by its index, if nothing is taken off, so that it need not be read again.
+    Also that frame by its index if the shift is zero, so that it need not be read again.
     """
     for index in range(count):
         try:
@@ -170,9 +172,9 @@ def find_shift(read: Callable[[int], F], count: int) -> tuple[Float64, dict[int,
 
 
 def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:
-    """Return what to take off coordinates from `low` to `high` (3,), so that float32 holds them.
+    """Return the shift (3,) in m that brings coordinates in a box into the precision of float32.
 
-    Zero but for coordinates of maps.
+    `low` and `high` (3,) are the corners of the box. Zero except for map coordinates.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     if max(np.abs(low).max(), np.abs(high).max()) <= MAP_COORDINATES_M:
@@ -181,13 +183,13 @@ def map_shift(low: ArrayLike, high: ArrayLike) -> Float64:
 
 
 def shift_words(shift: Float64) -> str:
-    """Say what a shift (3,) does to coordinates."""
+    """Return the note on a shift (3,) of coordinates."""
     text = ", ".join(f"{value:.0f}" for value in shift)
-    return f"coordinates are those of the files less ({text}) m"
+    return f"coordinates are those of the files minus ({text}) m"
 
 
 def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
-    """Note that coordinates are those of the files less a shift (3,), and move poses alike."""
+    """Record a shift (3,) of coordinates in a source, and apply it to its poses."""
     if not shift.any():
         return
     source.metadata["shift_m"] = shift.tolist()
@@ -199,14 +201,14 @@ def note_shift(source: FileSource, path: Path, shift: Float64) -> None:
 
 
 def cloud_files(path: Path, *suffixes: str) -> list[Path]:
-    """Return the file itself, or the files in the folder, with one of the suffixes."""
+    """Return the file itself or the files of a folder, if they have one of the suffixes."""
     if is_file(path):
         return [path] if path.suffix.lower() in suffixes else []
     return files_with(path, *suffixes) if is_folder(path) else []
 
 
 def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
-    """Look for files with one of the suffixes."""
+    """Detect a file or a folder of files with one of the suffixes."""
     try:
         files = cloud_files(path, *suffixes)
     except InputError:
@@ -220,7 +222,7 @@ def sniff_clouds(path: Path, *suffixes: str) -> Sniff | None:
 
 
 def required_files(path: Path, *suffixes: str) -> list[Path]:
-    """As `cloud_files`, or raise InputError if there are none."""
+    """Return the same as `cloud_files`; InputError if there are none."""
     files = cloud_files(path, *suffixes)
     if not files:
         raise InputError(f"has no {suffixes[0]} files", where=path, remedy="check the path")

@@ -1,4 +1,4 @@
-"""Colour of what a depth camera sees, from a colour camera beside it."""
+"""Registration of colour images to depth."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from tofuse.arrays import Bool, Float64, Intp, UInt8
 from tofuse.recordings.camera_file import ColorCamera, check_size
 from tofuse.recordings.frames import RangeFrame
 
-# A point is hidden if another one, nearer by more than this share, lands beside it.
-HIDDEN_SHARE = 0.05
+# A point is occluded if another one in its cell is nearer by more than this fraction.
+OCCLUSION_FRACTION = 0.05
 
 
 def sampled_color(
     frame: RangeFrame, image: UInt8, color: ColorCamera | None, where: str | Path
 ) -> UInt8:
-    """Colour (H, W, 3) of each valid depth pixel, from where its point lands in the image.
+    """Return the colour (H, W, 3) of the depth pixels, by projecting their points into an image.
 
-    Black where the point is out of the colour image, or hidden there by a nearer surface that the
-    depth camera sees too. Without a camera of its own (None) the image is of the depth pixels.
+    Black where the point is outside of the colour image, or occluded there by a nearer surface that
+    the depth camera observes too. Without a colour camera (None) the image has the pixels of depth.
 
     Raises
     ------
     InputError
-        If the image, which comes from `where`, isn't of its camera's size.
+        Naming `where`, if the image does not have the size of its camera.
     """
     check_size(image, frame.camera if color is None else color.camera, where)
     if color is None:
@@ -38,26 +38,26 @@ def sampled_color(
     u, v = np.clip(pixel, -1, 1 << 20).astype(np.intp).T
     inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
     cell = _cell(frame, color)
-    hidden = _hidden(u[inside] // cell, v[inside] // cell, points[inside, 2])
-    inside[inside] = ~hidden
-    seen = np.zeros((len(u), 3), np.uint8)
-    seen[inside] = image[v[inside], u[inside]]
+    occluded = _occluded(u[inside] // cell, v[inside] // cell, points[inside, 2])
+    inside[inside] = ~occluded
+    sampled = np.zeros((len(u), 3), np.uint8)
+    sampled[inside] = image[v[inside], u[inside]]
     out = np.zeros((*frame.depth.shape, 3), np.uint8)
-    out[frame.valid] = seen
+    out[frame.valid] = sampled
     return out
 
 
 def _cell(frame: RangeFrame, color: ColorCamera) -> int:
-    """Width in colour pixels of cells in which a closed surface leaves no hole."""
+    """Size in colour pixels of cells that each contain points of a continuous surface."""
     rays = frame.camera.rays()
     pitch = float(np.nanmedian(np.abs(np.diff(rays[..., 0], axis=1))))
     return max(1, int(np.ceil(2 * pitch * color.camera.fx)))
 
 
-def _hidden(u: Intp, v: Intp, z: Float64) -> Bool:
-    """Whether each point lies behind the nearest one of its cell."""
+def _occluded(u: Intp, v: Intp, z: Float64) -> Bool:
+    """Whether each point is behind the nearest one of its cell."""
     if len(z) == 0:
         return np.zeros(0, bool)
     nearest = np.full((int(v.max()) + 1, int(u.max()) + 1), np.inf)
     np.minimum.at(nearest, (v, u), z)
-    return np.asarray(z > nearest[v, u] * (1 + HIDDEN_SHARE))
+    return np.asarray(z > nearest[v, u] * (1 + OCCLUSION_FRACTION))

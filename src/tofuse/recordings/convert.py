@@ -1,4 +1,4 @@
-"""Any recording as a native folder."""
+"""Converting any recording to a native folder."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from tofuse.sensor.depth_correction import DepthCorrection
 
 FINEST_UNIT_M = 1e-4
 FINEST_SIGMA_M = 1e-5
-_LOOKED_AT = 24
+_SAMPLED_FRAMES = 24
 _CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """What came of it: frames written, and what a person should know, one line each."""
+    """The result of a conversion: the folder, the number of frames, and warnings, one line each."""
 
     folder: Path
     frames: int
@@ -44,17 +44,17 @@ def convert(
 ) -> Conversion:
     """Write a recording as a native folder.
 
-    Depth keeps its unit where the recording has one, and each frame its own camera where they
-    differ. A correction is written beside uncorrected depth. The folder appears when all is done.
+    Depth keeps its unit, if the recording has one, and each frame its camera, if they differ. A
+    correction is stored with uncorrected depth. The folder appears when all is written.
 
     Parameters
     ----------
     recording
-        What to write: the selected frames.
+        Its selected frames are written.
     folder
-        Must not be there, or be empty.
+        Must not exist, or be empty.
     progress
-        Called with the number of each frame that was written.
+        Called with the number of frames written so far.
 
     Raises
     ------
@@ -63,8 +63,8 @@ def convert(
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    with new_folder(folder) as beside:
-        count, warnings = _write(recording, beside, progress)
+    with new_folder(folder) as temporary:
+        count, warnings = _write(recording, temporary, progress)
     return Conversion(Path(folder), count, tuple(warnings))
 
 
@@ -73,7 +73,7 @@ def _write(
 ) -> tuple[int, list[str]]:
     warnings: list[str] = []
     recording, correction = _uncorrected(recording)
-    sample = recording.readable(_LOOKED_AT)
+    sample = recording.readable(_SAMPLED_FRAMES)
     if not sample:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     own = not _same_camera(sample)
@@ -86,7 +86,7 @@ def _write(
             continue
         if not own and not _same_camera([sample[0], item]):
             raise InputError(
-                "has another camera than the frames looked at before",
+                "has another camera than the frames sampled before",
                 where=f"{recording.path}: frame {item.index}",
                 remedy="convert the parts of the recording one by one",
             )
@@ -100,7 +100,7 @@ def _write(
     if writer.out_of_range:
         warnings.append(f"{writer.out_of_range} values were too large for 16 bits")
     if any(isinstance(f, CloudFrame) and f.origin.any() for f in sample):
-        warnings.append("the sensor's position within its clouds is not kept")
+        warnings.append("the sensor's position within its clouds is lost")
     noise = Path(recording.path) / "noise.json"
     if noise.is_file():
         shutil.copyfile(noise, folder / "noise.json")
@@ -108,7 +108,7 @@ def _write(
 
 
 def _uncorrected(recording: Recording) -> tuple[Recording, DepthCorrection | None]:
-    """Return a native recording as it was measured, and what is to be subtracted from it."""
+    """A native recording without its depth correction, and the correction."""
     source = recording.source
     if not isinstance(source, NativeSource) or source.correction is None:
         return recording, None
@@ -157,7 +157,7 @@ def _writer(recording: Recording, sample: list[Frame], folder: Path, own: bool) 
 
 
 def _round_up(value: float) -> float:
-    """Return a number of two digits that isn't smaller."""
+    """The value, rounded up to two digits."""
     if value <= 0:
         return 0.0
     digit = 10.0 ** (np.floor(np.log10(value)) - 1)
@@ -165,7 +165,7 @@ def _round_up(value: float) -> float:
 
 
 def _common_camera(cameras: list[Camera]) -> Camera:
-    """Return the camera for camera.json: a lens if all frames have one of its kind, else rays."""
+    """The camera for camera.json: a lens if all frames have its model and distortion, else rays."""
     first = cameras[0]
     if all(camera == first for camera in cameras):
         return first
@@ -177,14 +177,14 @@ def _common_camera(cameras: list[Camera]) -> Camera:
 
 
 def _channels(sample: list[Frame]) -> tuple[str, ...]:
-    """Return which images some frame has: all frames of a folder have the same."""
+    """The channels that any frame has: all frames of a native folder have the same."""
     return tuple(
         name for name in _CHANNELS if any(getattr(f, name, None) is not None for f in sample)
     )
 
 
 def _completed(frame: Frame, channels: tuple[str, ...]) -> Frame:
-    """Return the frame with zeros for the images that only others have."""
+    """The frame with exactly these channels, zeros where it has none."""
     if isinstance(frame, CloudFrame):
         return frame
     shape = frame.depth.shape

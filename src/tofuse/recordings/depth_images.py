@@ -1,4 +1,4 @@
-"""A source over depth PNGs of one camera, as the RGB-D data sets store them."""
+"""A source over depth PNGs of one camera, as in RGB-D data sets."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class DepthImageSource(FileSource):
     timestamps
         (N,) seconds.
     camera, depth_unit_m
-        Of all frames, unless `options` names another camera.json, which then gives both.
+        Of all frames, unless `options` has a camera.json, which replaces both.
     color
-        None, or one image for each frame, None where there is none.
+        None, or one image per frame, None where there is none.
     color_registered
-        Whether they are as seen by the depth camera.
+        Whether colour is registered to depth.
     options
         Of the reader.
 
     Raises
     ------
     InputError
-        If the camera disagrees with the size of the images.
+        If the camera does not have the size of the images.
     """
 
     concurrent = True
@@ -78,7 +78,7 @@ class DepthImageSource(FileSource):
             try:
                 header = read_header(path)
             except InputError:
-                continue  # that frame's own trouble, told when it is read
+                continue  # an error of that frame alone, raised when it is read
             if (header.width, header.height) != (self.camera.width, self.camera.height):
                 raise InputError(
                     f"is {header.width} x {header.height} pixels, {where} "

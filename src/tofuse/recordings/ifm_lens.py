@@ -1,4 +1,4 @@
-"""The lens of ifm's O3R heads, as each frame brings it."""
+"""The lens of ifm's O3R heads, which is stored with each frame."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class HeadInfo:
 
 
 def read_info(data: bytes, where: str) -> HeadInfo:
-    """Read what the head says of a frame (chunk 420): the unit of its distances, and its lens.
+    """Read the head's information on a frame (chunk 420): unit of distance and lens.
 
     Raises
     ------
     InputError
-        If it is cut off or makes no sense.
+        If it is cut off or implausible.
     """
     if len(data) < _INFO.size:
         raise InputError("is cut off", where=where, remedy="copy the file again")
@@ -44,23 +44,23 @@ def read_info(data: bytes, where: str) -> HeadInfo:
 
 
 def checked_info(unit: float, model: int, numbers: tuple[float, ...], where: str) -> HeadInfo:
-    """Make it of the unit in m, the model and its first ten numbers.
+    """Return the information with a unit in m, a lens model and its first ten parameters.
 
     Raises
     ------
     InputError
-        If they make no sense.
+        If they are implausible.
     """
     if not 1e-6 < unit < 1 or len(numbers) != _NUMBERS or not np.isfinite(numbers).all():
-        raise InputError("makes no sense", where=where, remedy="copy it again")
+        raise InputError("has implausible calibration values", where=where, remedy="copy it again")
     return HeadInfo(unit, model, numbers)
 
 
 @lru_cache(maxsize=16)
 def head_camera(info: HeadInfo, width: int, height: int, where: str) -> RayTable:
-    """Return the rays (H, W) of a lens, by the maker's model for image to space.
+    """Return the rays (H, W) of a lens by the maker's back-projection model.
 
-    The polynomials work from pixel to ray, unlike OpenCV's, and count pixels from their corner.
+    Unlike OpenCV's, its polynomials map pixels to rays, and pixel coordinates start at corners.
     """
     model = info.model
     if model not in (BOUGUET, FISHEYE):
@@ -90,7 +90,7 @@ def _bouguet(x: Float64, y: Float64, k: list[float]) -> Float64:
 
 
 def _fisheye(x: Float64, y: Float64, k: list[float]) -> Float64:
-    """Angle by a polynomial in the distance from the centre, which k[4] limits."""
+    """Rays of a fisheye: the angle is a polynomial in the radius, which k[4] limits."""
     radius = np.hypot(x, y)
     s = np.minimum(radius, k[4]) ** 2
     theta = radius * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))

@@ -1,4 +1,4 @@
-"""Which way is down in each frame, as an accelerometer beside the camera tells."""
+"""The direction of gravity in each frame, from an accelerometer fixed to the camera."""
 
 from __future__ import annotations
 
@@ -10,34 +10,35 @@ from tofuse.arrays import Float64, Intp
 
 ACCELERATION = ("ax", "ay", "az")
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
-# A sample belongs to the frame that is nearest in time, if it is no further than this, s.
-_REACH_S = 0.25
-# Of the lengths of what was measured, the largest share that a still camera's may vary by.
+# A sample is assigned to the nearest frame in time, within this distance in s.
+_MAX_GAP_S = 0.25
+# Largest relative deviation of the measured acceleration from its median.
 _PLAUSIBLE = 0.5
-# A fused direction, as phones give it, and the least error of any, rad.
-_FUSED, _LEAST = 0.01, 0.002
+# Error of the fused direction of phones, and the smallest error of any direction, rad.
+_FUSED, _MIN_SIGMA = 0.01, 0.002
 
 
 def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
-    """Direction in which things fall in the frame of each camera, and how well it is known.
+    """Return the direction of gravity in each frame, with its standard deviation.
 
-    A camera that is moved by hand is accelerated to and fro. Along the vertical that changes the
-    length of what is measured, across it the direction: about as much, so that one tells of the
-    other. Acceleration that lasts is not told from gravity.
+    The accelerations of a hand-held camera change the length of the measured vector when they are
+    vertical, and its direction when they are horizontal: about as much, so that the variation of
+    the length predicts the error of the direction. Constant acceleration is not distinguished from
+    gravity.
 
     Parameters
     ----------
     times
-        (N,) of the frames, s.
+        (N,) timestamps of the frames, s.
     imu
-        Columns by name: `timestamp` (s), and either `ax`, `ay`, `az`, which at rest is g upwards
-        (m/s^2 or any unit), or `gravity_x`, `gravity_y`, `gravity_z`, downwards, where a phone
-        has worked that out by itself; both along the axes of the depth camera.
+        Columns by name: `timestamp` (s), and either the acceleration `ax`, `ay`, `az`, which is g
+        upwards at rest (m/s^2 or any unit), or gravity as estimated by a phone, `gravity_x`,
+        `gravity_y`, `gravity_z`, downwards; both in the axes of the depth camera.
 
     Returns
     -------
-    (N, 4): a unit vector and its standard deviation in rad, NaN where nothing was measured near
-    the frame's time; None where the columns are not there, or make no sense.
+    (N, 4): a unit vector and its standard deviation in rad, NaN without samples near the frame's
+    time; None if the columns are missing.
     """
     fused = all(name in imu for name in GRAVITY)
     names = GRAVITY if fused else ACCELERATION
@@ -51,7 +52,7 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
     if not len(at):
         return out
     owner = _nearest(np.asarray(times, float), at)
-    near = np.abs(at - times[owner]) <= _REACH_S
+    near = np.abs(at - times[owner]) <= _MAX_GAP_S
     count = np.bincount(owner[near], minlength=len(times))
     mean = np.zeros((len(times), 3))
     np.add.at(mean, owner[near], samples[near])
@@ -65,13 +66,13 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
     spread = 1.4826 * float(np.median(off[known]))
     known &= off < _PLAUSIBLE
     out[known, :3] = mean[known] / length[known, None]
-    out[known, 3] = _FUSED if fused else np.sqrt(spread**2 + off[known] ** 2 + _LEAST**2)
+    out[known, 3] = _FUSED if fused else np.sqrt(spread**2 + off[known] ** 2 + _MIN_SIGMA**2)
     return out
 
 
 def _nearest(times: Float64, at: Float64) -> Intp:
-    """(S,) which of the times each of `at` is nearest to, the earlier one of two."""
+    """(S,) index of the nearest of the times (N,) to each of `at` (S,); ties go to the earlier."""
     order = np.argsort(times, kind="stable")
     ordered = times[order]
-    middle = 0.5 * (ordered[1:] + ordered[:-1])
-    return order[np.searchsorted(middle, at, side="left")]
+    midpoints = 0.5 * (ordered[1:] + ordered[:-1])
+    return order[np.searchsorted(midpoints, at, side="left")]

@@ -1,4 +1,4 @@
-"""Any recording in the folder layouts of other programs: TUM RGB-D, and Open3D."""
+"""Converting any recording to the folder layouts of TUM RGB-D and Open3D."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from tofuse.recordings.rectify import Rectifier, pinhole_of
 
 Layout = Literal["tum", "open3d"]
 COUNTS_PER_M: dict[Layout, int] = {"tum": 5000, "open3d": 1000}
-_MOST = 65535
-_BRIGHT = 99.0  # percentile of the amplitude that is shown as white
+_MAX_COUNTS = 65535
+_WHITE_PERCENTILE = 99.0  # of the amplitude that is shown as white
 
 
 def convert_to(
@@ -33,32 +33,32 @@ def convert_to(
     layout: Layout,
     progress: Callable[[int], None] | None = None,
 ) -> Conversion:
-    """Write a recording's images for other programs.
+    """Write a recording's images in another layout.
 
-    Both layouts know nothing but pinhole cameras, z depth in counts of 0.2 mm (TUM) or 1 mm
-    (Open3D), and colour at the pixels of depth. So images are rectified; where there is no colour,
-    amplitude stands in as grey, as bright in every image. Confidence and noise are lost.
+    Both layouts support only pinhole cameras, z depth in counts of 0.2 mm (TUM) or 1 mm (Open3D),
+    and colour at the pixels of depth. So images are rectified; without colour, amplitude is written
+    as grey, with the same scale in all images. Confidence and noise are lost.
 
     Parameters
     ----------
     recording
         Range images.
     folder
-        Must not be there, or be empty. It appears when all is done.
+        Must not exist, or be empty. It appears when all is written.
     layout
-        Which.
+        The layout.
     progress
-        Called with the number of each frame that was written.
+        Called with the number of frames written so far.
 
     Raises
     ------
     InputError
-        If the recording holds clouds, or no frame can be read.
+        If the recording contains clouds, or no frame can be read.
     OutputError
         If the folder isn't empty, or can't be written.
     """
-    with new_folder(folder) as beside:
-        count, warnings = _write(recording, beside, layout, progress)
+    with new_folder(folder) as temporary:
+        count, warnings = _write(recording, temporary, layout, progress)
     return Conversion(Path(folder), count, tuple(warnings))
 
 
@@ -77,22 +77,22 @@ def _write(
             continue
         if not isinstance(item, RangeFrame):
             raise InputError(
-                "holds clouds, which these layouts can't", where=recording.path,
+                "contains clouds, which these layouts don't support", where=recording.path,
                 remedy="convert it to the native folder",
             )  # fmt: skip
         if rectifier is None:
             rectifier = Rectifier(pinhole_of(item.camera))
             if rectifier.pinhole != item.camera:
-                warnings.append("images are rectified: these layouts know only pinhole cameras")
+                warnings.append("images are rectified: these layouts support only pinhole cameras")
             if item.color_image is None and item.amplitude_image is None:
                 warnings.append("there is neither colour nor amplitude: colour images are black")
             elif item.amplitude_image is not None and item.amplitude_image.any():
-                lit = item.amplitude_image[item.amplitude_image > 0]
-                white = float(np.percentile(lit, _BRIGHT))
+                positive = item.amplitude_image[item.amplitude_image > 0]
+                white = float(np.percentile(positive, _WHITE_PERCENTILE))
         frame = rectifier(item)
         counts = np.rint(frame.z.astype(float) * COUNTS_PER_M[layout])
-        beyond += int((counts >= _MOST).sum())
-        counts[counts >= _MOST] = 0
+        beyond += int((counts >= _MAX_COUNTS).sum())
+        counts[counts >= _MAX_COUNTS] = 0
         name = f"{_name(len(written), item.timestamp - float(recording.timestamps[0]))}.png"
         write_png(make_folder(folder / "depth") / name, counts.astype(np.uint16))
         write_png(make_folder(folder / colors) / name, _color(frame, white))
@@ -102,8 +102,8 @@ def _write(
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     if beyond:
-        farthest = _MOST / COUNTS_PER_M[layout]
-        warnings.append(f"{beyond} pixels beyond {farthest:.1f} m don't fit, and are left out")
+        farthest = _MAX_COUNTS / COUNTS_PER_M[layout]
+        warnings.append(f"{beyond} pixels beyond {farthest:.1f} m don't fit, and are dropped")
     finish = _finish_tum if layout == "tum" else _finish_open3d
     finish(recording, folder, rectifier.pinhole, written)
     return len(written), warnings
@@ -133,7 +133,7 @@ def _finish_tum(recording: Recording, folder: Path, camera: Pinhole, written: li
         write_text(folder / f"{name}.txt", "# timestamp filename\n" + "".join(lines))
     if recording.reference is not None:
         write_tum(folder / "groundtruth.txt", times, recording.reference[written])
-    # The layout has no place for the camera; this is what --camera takes.
+    # The layout does not store the camera; this file is for --camera.
     about = {"schema": SCHEMA, **camera_fields(camera)}
     about |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
     write_text(folder / "lens.json", json.dumps(about, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""Lenses as makers' software tells them."""
+"""Conversion of makers' lens models."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tofuse.recordings.camera_file import checked_lens
 
 
 def inverse_brown(lens: BrownConrady) -> RayTable:
-    """Return the camera that librealsense calls "inverse Brown-Conrady": `lens` backwards."""
+    """Return librealsense's "inverse Brown-Conrady" camera: `lens` maps its pixels to rays."""
     focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
     v, u = np.mgrid[: lens.height, : lens.width]
     slopes = (np.stack([u, v], axis=-1) - centre) / focal
@@ -21,14 +21,14 @@ def inverse_brown(lens: BrownConrady) -> RayTable:
 
 
 def forward_brown(table: RayTable, lens: BrownConrady) -> BrownConrady:
-    """Return the Brown-Conrady lens that projects as `inverse_brown` of `lens` (`table`) does.
+    """Return the Brown-Conrady lens that is equivalent to `inverse_brown(lens)`, which is `table`.
 
     Focal lengths and centre are those of `lens`; the coefficients are fitted to the table's rays.
 
     Raises
     ------
     InputError
-        If none comes as near as half a pixel everywhere.
+        If the error of the fit exceeds half a pixel anywhere.
     """
     focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
     step = max(1, lens.width // 64)
@@ -51,17 +51,17 @@ def forward_brown(table: RayTable, lens: BrownConrady) -> BrownConrady:
         ]
     )
     k1, k2, k3, p1, p2 = np.linalg.lstsq(rows, (slopes - rays).T.ravel(), rcond=None)[0]
-    found = replace(lens, k1=float(k1), k2=float(k2), k3=float(k3), p1=float(p1), p2=float(p2))
+    fitted = replace(lens, k1=float(k1), k2=float(k2), k3=float(k3), p1=float(p1), p2=float(p2))
     points = np.concatenate([rays, np.ones((len(rays), 1))], axis=-1)
-    if not np.nanmax(np.abs(found.project(points) - slopes * focal - centre)) < 0.5:
-        raise InputError("bends too much to be turned around", where="lens")
-    return found
+    if not np.nanmax(np.abs(fitted.project(points) - slopes * focal - centre)) < 0.5:
+        raise InputError("has too much distortion to be inverted", where="lens")
+    return fitted
 
 
-def plainest_lens(
+def simplest_lens(
     size: tuple[int, int], values: dict[str, float], k: dict[str, float], where: str
 ) -> Pinhole:
-    """Return a rational lens, or a Brown-Conrady or pinhole one where its numbers are all 0.
+    """Return the simplest lens with these coefficients: pinhole, Brown-Conrady or rational.
 
     Parameters
     ----------

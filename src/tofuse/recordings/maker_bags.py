@@ -1,4 +1,4 @@
-"""What bags of makers' viewers have in common: ROS containers with own messages."""
+"""Bags of camera makers' viewers: ROS containers with proprietary messages."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tofuse.errors import InputError
 from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera
 from tofuse.recordings.bags import (
-    APART_S,
+    MAX_GAP_S,
     ROS1_MAGIC,
     Track,
-    amplitude_beside,
+    amplitude_at,
     damaged,
     open_bag,
     open_container,
@@ -42,16 +42,16 @@ def topics(path: Path) -> frozenset[str]:
 
 @lru_cache(maxsize=4)
 def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
-    """As `_topics`; both readers ask, and opening a large bag takes a while."""
+    """See `topics`; cached, as several readers ask and opening a large bag is slow."""
     try:
         if is_folder(path):
-            whole = is_file(path / "metadata.yaml") and bool(files_with(path, ".db3", ".mcap"))
+            is_bag = is_file(path / "metadata.yaml") and bool(files_with(path, ".db3", ".mcap"))
             old = False
         else:
             head = read_head(path, 16)
             old = head.startswith(ROS1_MAGIC)
-            whole = old or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
-        if not whole:
+            is_bag = old or (path.suffix == ".db3" and head.startswith(b"SQLite format 3"))
+        if not is_bag:
             return frozenset()
         bag = open_container(path) if old else open_bag(path)
     except InputError:
@@ -63,7 +63,7 @@ def _topics_of(path: Path, changed_ns: int, size: int) -> frozenset[str]:
 
 
 class BagSource(FileSource):
-    """Depth images of one track, and amplitude of another."""
+    """A source over depth images of a bag, with amplitude and colour of other topics."""
 
     camera: Camera
     unit: float
@@ -77,7 +77,7 @@ class BagSource(FileSource):
         self.path = path
         if options.topic is not None:
             raise InputError(
-                "means nothing for this maker's bags",
+                "does not apply to this maker's bags",
                 where="--topic",
                 remedy="leave it out, or give --format ros",
             )
@@ -99,7 +99,7 @@ class BagSource(FileSource):
             raise damaged(error, path) from error
         self.timestamps = self.depth.times
         if (np.diff(self.timestamps) <= 0).any():
-            self.warnings.append("time goes back or repeats; frames stay in the order of the bag")
+            self.warnings.append("time decreases or repeats; frames stay in the order of the bag")
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
 
     @staticmethod
@@ -108,7 +108,7 @@ class BagSource(FileSource):
         return open_bag(path)
 
     def find(self) -> None:
-        """Set `unit`, `depth`, and where there are any `amplitude` and `color`."""
+        """Set `unit` and `depth`, and `amplitude` and `color` if the bag has them."""
         raise NotImplementedError
 
     def lens(self) -> Camera:
@@ -116,7 +116,7 @@ class BagSource(FileSource):
         raise NotImplementedError
 
     def color_lens(self) -> ColorCamera:
-        """Return the camera of the colour images; raise InputError if it isn't told."""
+        """Return the camera of the colour images; raise InputError if it is unknown."""
         raise NotImplementedError
 
     def _find_color(self) -> None:
@@ -125,7 +125,7 @@ class BagSource(FileSource):
         try:
             self.color_camera = self.color_lens()
         except InputError as error:
-            self.warnings.append(f"colour is left out: {error}")
+            self.warnings.append(f"colour is ignored: {error}")
             self.color = None
 
     def message(self, track: Track, index: int) -> Any:
@@ -145,7 +145,7 @@ class BagSource(FileSource):
                 self.camera,
                 depth_from_counts(counts.astype(np.uint16), self.unit),
                 self.kind,
-                amplitude_beside(self.amplitude, time, self.camera, where, self.message),
+                amplitude_at(self.amplitude, time, self.camera, where, self.message),
                 amplitude_kind="ir",
             )
             return self._colored(frame, where)
@@ -155,8 +155,8 @@ class BagSource(FileSource):
             raise damaged(error, where) from error
 
     def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
-        """Return the frame with the colour of its moment, where there is any."""
-        k = None if self.color is None else self.color.near(frame.timestamp, APART_S)
+        """The frame with the colour image nearest in time, if there is one."""
+        k = None if self.color is None else self.color.near(frame.timestamp, MAX_GAP_S)
         if k is None or self.color is None or self.color_camera is None:
             return frame
         where = f"{where}, colour"
@@ -164,18 +164,18 @@ class BagSource(FileSource):
         return replace(frame, color_image=sampled_color(frame, image, self.color_camera, where))
 
     def track(self, topic: str) -> Track | None:
-        """Return the messages of a topic, None if there are none."""
+        """Return the messages of a topic; None if there are none."""
         for connection in self.bag.connections:
             if connection.topic == topic:
-                found = Track(self.bag, connection)
-                return found if len(found) else None
+                track = Track(self.bag, connection)
+                return track if len(track) else None
         return None
 
-    def needed(self, topic: str, what: str) -> Track:
-        """Return the messages of a topic that must be there."""
-        found = self.track(topic)
-        if found is None:
+    def required_track(self, topic: str, what: str) -> Track:
+        """Return the messages of a topic, called `what` in the error if there are none."""
+        track = self.track(topic)
+        if track is None:
             raise InputError(
                 f"has no {what} ({topic})", where=self.path, remedy="record the depth stream"
             )
-        return found
+        return track

@@ -1,4 +1,4 @@
-"""Which noise model a recording has: its own file, its camera's family, or what its frames show."""
+"""Choice of a recording's noise model: from its folder, its camera family, or its frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.sensor.noise import NOISE, AmplitudeLaw, NoiseModel
 
-# Words of a sensor's name, in lower case, the more telling ones first.
+# Words in a sensor's name, in lower case, the more specific ones first.
 _WORDS = (
     (("sr4000", "swissranger"), "sr4000"),
     (("kinect v2", "kinect2", "kinectv2"), "kinect2"),
@@ -35,27 +35,27 @@ _SIZES = {
     (256, 192): "iphone",
     (192, 256): "iphone",
 }
-# Formats that only one family of cameras writes.
+# Formats of a single camera family.
 _FORMATS = {"7scenes": "kinect1", "redwood": "kinect1", "tum": "kinect1"}
-_LOOKED_AT = 3
-_BELIEVED = 3.0
+_SAMPLED_FRAMES = 3
+_MAX_RATIO = 3.0  # of observed to predicted noise
 _NORMAL_MEDIAN = 0.6745
 
 
 def noise_model_for(recording: Recording) -> NoiseModel:
     """Choose the noise model of a recording.
 
-    A noise.json beside its images comes first, then the sensor's name, the format, the size of
-    the images. Counts of amplitude have no unit that all programs share: where the law over the
-    amplitude is wrong by more than three times what neighbouring pixels show, the counts are
-    taken to have another gain, and the law is rescaled.
+    A noise.json in its folder comes first, then the sensor's name, the format, and the size of the
+    images. Amplitude counts have no common unit: where the noise predicted from amplitude differs
+    by more than a factor of three from that between neighbouring pixels, the amplitude law is
+    rescaled by an unknown gain.
 
     Raises
     ------
     InputError
-        If there is a noise.json that makes no sense.
+        If there is an invalid noise.json.
     """
-    given = _beside(recording)
+    given = _in_folder(recording)
     if given is not None:
         return given
     frames = _some_frames(recording)
@@ -63,11 +63,11 @@ def noise_model_for(recording: Recording) -> NoiseModel:
     if model.amplitude is None:
         return model
     frames = [f for f in frames if model.law(f) == "amplitude"]
-    return _regained(model, model.amplitude, frames) if frames else model
+    return _rescaled(model, model.amplitude, frames) if frames else model
 
 
 def family_of(recording: Recording, frame: RangeFrame | None) -> str:
-    """Return the name in `NOISE` that fits best; "unknown" if nothing tells."""
+    """Return the name of the camera family in `NOISE`; "unknown" if it can't be determined."""
     sensor = str(recording.metadata.get("sensor", "")).lower()
     for words, family in _WORDS:
         if any(word in sensor for word in words):
@@ -78,11 +78,11 @@ def family_of(recording: Recording, frame: RangeFrame | None) -> str:
         return "unknown"
     family = _SIZES.get((frame.camera.width, frame.camera.height), "unknown")
     if family == "iphone" and frame.amplitude_image is not None:
-        return "unknown"  # an iPhone gives no amplitude
+        return "unknown"  # iPhones have no amplitude
     return family
 
 
-def _beside(recording: Recording) -> NoiseModel | None:
+def _in_folder(recording: Recording) -> NoiseModel | None:
     folder = Path(recording.path)
     if is_folder(folder) and is_file(folder / "noise.json"):
         return NoiseModel.load(folder / "noise.json")
@@ -90,7 +90,7 @@ def _beside(recording: Recording) -> NoiseModel | None:
 
 
 def _some_frames(recording: Recording) -> list[RangeFrame]:
-    chosen = np.unique(np.linspace(0, len(recording) - 1, _LOOKED_AT).astype(int))
+    chosen = np.unique(np.linspace(0, len(recording) - 1, _SAMPLED_FRAMES).astype(int))
     frames = []
     for k in chosen:
         try:
@@ -102,16 +102,16 @@ def _some_frames(recording: Recording) -> list[RangeFrame]:
     return frames
 
 
-def _regained(model: NoiseModel, law: AmplitudeLaw, frames: list[RangeFrame]) -> NoiseModel:
-    """Rescale the counts of the law where the frames' own noise says that they are others."""
+def _rescaled(model: NoiseModel, law: AmplitudeLaw, frames: list[RangeFrame]) -> NoiseModel:
+    """The model with the gain of its amplitude law adjusted to the noise of the frames."""
 
     def excess(gain: float) -> float:
-        """Log of seen over predicted noise, if all counts are `gain` times those of the law."""
+        """Log ratio of observed to predicted noise, if counts are `gain` times those of the law."""
         scaled = replace(law, shot=law.shot * gain**0.5, dark=law.dark * gain)
         return _log_excess(replace(model, amplitude=scaled), frames)
 
-    wrong = excess(1.0)
-    if not np.isfinite(wrong) or abs(wrong) <= np.log(_BELIEVED):
+    mismatch = excess(1.0)
+    if not np.isfinite(mismatch) or abs(mismatch) <= np.log(_MAX_RATIO):
         return model
     low, high = 1e-4, 1e4
     for _ in range(30):
@@ -121,16 +121,16 @@ def _regained(model: NoiseModel, law: AmplitudeLaw, frames: list[RangeFrame]) ->
 
 
 def _log_excess(model: NoiseModel, frames: list[RangeFrame]) -> float:
-    """Median log ratio of the noise that second differences along rows show to the model's."""
-    found = []
+    """Median log ratio of the noise in second differences along rows to that of the model."""
+    ratios_of = []
     for frame in frames:
         values, ok = frame.radial_range.astype(float), frame.valid
         second = values[:, :-2] - 2 * values[:, 1:-1] + values[:, 2:]
-        # Equal neighbours: variances 1, 4, 1.
+        # Variance of the second difference: 1 + 4 + 1.
         expected = model.sigma(frame).astype(float)[:, 1:-1] * np.sqrt(6.0)
         seen = ok[:, :-2] & ok[:, 1:-1] & ok[:, 2:] & (expected > 0)
-        found.append(np.abs(second[seen]) / expected[seen])
-    ratios: Float64 = np.concatenate(found) if found else np.empty(0)
+        ratios_of.append(np.abs(second[seen]) / expected[seen])
+    ratios: Float64 = np.concatenate(ratios_of) if ratios_of else np.empty(0)
     if len(ratios) < 200 or not (median := float(np.median(ratios))) > 0:
         return float("nan")
     return float(np.log(median / _NORMAL_MEDIAN))

@@ -1,4 +1,4 @@
-"""How a recording was opened, kept beside a result so that it can be opened again."""
+"""How a recording was opened, stored with a result so that it can be opened again."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ from tofuse.recordings.still import average_still
 
 @dataclass(frozen=True)
 class Opening:
-    """What was asked for when a recording was opened; see `open_recording` and `tofuse run`.
+    """Arguments with which a recording was opened; see `open_recording` and `tofuse run`.
 
     Attributes
     ----------
     paths
         Files or folders.
+    format, camera, topic
+        See `open_recording`.
     start, end, every
-        Which frames, see `Recording.select`.
+        The selected frames, see `Recording.select`.
     average_still
-        Whether stretches in which nothing moves became one frame each.
+        Whether stationary intervals are averaged to one frame each.
     """
 
     paths: tuple[Path, ...]
@@ -37,14 +39,14 @@ class Opening:
     average_still: bool = False
 
     def open(self) -> Recording:
-        """Open the recording; InputError if it can't be."""
+        """Open the recording; InputError if that fails."""
         recording = open_recording(
             *self.paths, format=self.format, camera=self.camera, topic=self.topic
         ).select(self.start, self.end, self.every)
         return average_still(recording) if self.average_still else recording
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data, with paths that hold wherever the program is started."""
+        """Return plain data, with absolute paths."""
         return {
             "paths": [str(path.absolute()) for path in self.paths],
             "format": self.format,
@@ -58,11 +60,11 @@ class Opening:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], where: str | Path) -> Opening:
-        """Make it of what `to_dict` gave; InputError that names `where` if it is something else."""
+        """Return the inverse of `to_dict`; InputError naming `where` if the data is invalid."""
         try:
             paths = tuple(Path(str(path)) for path in data["paths"])
             camera, end = data["camera"], data["end"]
-            found = cls(
+            opening = cls(
                 paths,
                 data["format"],
                 None if camera is None else Path(str(camera)),
@@ -73,7 +75,7 @@ class Opening:
                 bool(data["average_still"]),
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError("does not say how its recording was opened", where=where) from error
+            raise InputError("does not state how its recording was opened", where=where) from error
         if not paths:
             raise InputError("names no recording", where=where)
-        return found
+        return opening

@@ -1,4 +1,4 @@
-"""Organised clouds: points in rows and columns that lie on the rays of a camera's pixels."""
+"""Organised clouds: points in rows and columns, on the rays of a camera's pixels."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.sources import FARTHEST_M
 
 SAMPLES = 8
-# How far a point may lie from its pixel's ray: what rounding to 0.1 mm and float32 can do.
+# Largest distance of a point from its pixel's ray: errors of rounding to 0.1 mm and float32.
 TOLERANCE_M = 5e-4
-TOLERANCE_SHARE = 1e-4
-# A lens this near to a pinhole is one: 0.01 px is 0.2 mm at 10 m.
+TOLERANCE_FRACTION = 1e-4
+# Largest deviation from a pinhole camera to be considered one: 0.01 px is 0.2 mm at 10 m.
 PINHOLE_PIXELS = 0.01
-STEEPEST = 100.0  # slope of a ray: 89.4 degrees off the axis
-# Along a column of pixels x/z changes little: by less than this share of the image's width.
-COLUMN_SHARE = 0.05
+MAX_SLOPE = 100.0  # of a ray: 89.4 degrees off the axis
+# Largest mean deviation of x/z along a column of pixels, as a fraction of its range in the image.
+COLUMN_FRACTION = 0.05
 MIN_CELLS = 256
-MIN_SPREAD_M = 0.1  # of z in a pixel, to tell where its ray begins
+MIN_SPREAD_M = 0.1  # of z in a pixel, to determine the origin of its ray
 
 
 @dataclass(frozen=True)
 class Raster:
-    """How points lie in rows and columns.
+    """The arrangement of points in rows and columns.
 
     Attributes
     ----------
     width, height
-        Of the image.
+        Of the image in pixels.
     signs
-        Of x, y and z, so that x is right, y down and z forward.
+        Factors of x, y and z that make x right, y down and z forward.
     """
 
     width: int
@@ -47,20 +47,20 @@ class Raster:
 
     @property
     def turned(self) -> str:
-        """Which axes run against the pixels, in words; empty if none."""
+        """The axes that are reversed, in words; empty if none."""
         names = [name for name, sign in zip("xyz", self.signs, strict=True) if sign < 0]
         return f"{' and '.join(names)} run{'s'[: len(names) == 1]}" if names else ""
 
     def image(self, points: Float32) -> Float32:
-        """Return points (N, 3) as (H, W, 3)."""
+        """Return points (N, 3) as an image (H, W, 3) with corrected signs."""
         return points.reshape(self.height, self.width, 3) * np.array(self.signs, np.float32)
 
 
 def find_raster(points: Float32, width: int | None = None) -> Raster | None:
-    """Return how points (N, 3), written row by row, lie in the pixels of an image, or None.
+    """Return the raster of points (N, 3) that are stored row by row; None if they form no image.
 
-    The width, where it isn't told, is that of N's divisors with which x/z changes least along
-    columns: the image is at most twice as wide as it is high, or twice as high as wide.
+    Unless given, the width is the divisor of N with which x/z varies least along columns, for
+    aspect ratios up to 2.
     """
     count = len(points)
     measured = np.isfinite(points).all(1) & (points[:, 2] != 0)
@@ -69,7 +69,7 @@ def find_raster(points: Float32, width: int | None = None) -> Raster | None:
     forward = np.median(np.sign(points[measured, 2])) >= 0
     with np.errstate(all="ignore"):
         slopes = points[:, :2] / np.abs(points[:, 2:])
-        measured &= (np.abs(slopes) < STEEPEST).all(1)
+        measured &= (np.abs(slopes) < MAX_SLOPE).all(1)
         slopes[~measured] = np.nan
     widths = [width] if width else range(math.isqrt(count // 2), math.isqrt(2 * count) + 1)
     best: tuple[float, Raster] | None = None
@@ -83,22 +83,21 @@ def find_raster(points: Float32, width: int | None = None) -> Raster | None:
 
 
 def _raster_fit(slopes: NDArray[np.floating], forward: int) -> tuple[float, Raster] | None:
-    """Return how much slopes (H, W, 2) change along columns and rows, and the raster."""
+    """The variation of slopes (H, W, 2) along columns and rows, and the raster; None if none."""
     height, width = slopes.shape[:2]
     signs, worst = [], 0.0
     for axis in (0, 1):
         lines = slopes[..., axis] if axis == 0 else slopes[..., axis].T
         lines = lines[:: max(1, len(lines) // 64)]
-        seen = np.isfinite(lines)
-        used = seen.sum(0) >= 2
+        used = np.isfinite(lines).sum(0) >= 2
         if used.sum() < 0.5 * lines.shape[1]:
             return None
-        middle = np.nanmedian(lines[:, used], axis=0)
-        spread = float(np.nanpercentile(middle, 95) - np.nanpercentile(middle, 5))
-        off = float(np.nanmean(np.abs(lines[:, used] - middle)))
-        rising = np.diff(middle)
+        centre = np.nanmedian(lines[:, used], axis=0)
+        spread = float(np.nanpercentile(centre, 95) - np.nanpercentile(centre, 5))
+        off = float(np.nanmean(np.abs(lines[:, used] - centre)))
+        rising = np.diff(centre)
         sign = 1 if np.median(rising) > 0 else -1
-        if not off < COLUMN_SHARE * spread or np.mean(rising * sign > 0) < 0.8:
+        if not off < COLUMN_FRACTION * spread or np.mean(rising * sign > 0) < 0.8:
             return None
         signs.append(sign)
         worst = max(worst, off / spread)
@@ -106,9 +105,9 @@ def _raster_fit(slopes: NDArray[np.floating], forward: int) -> tuple[float, Rast
 
 
 def origin_behind(images: Sequence[Float32]) -> float:
-    """Return how far behind the origin the rays of the pixels meet, in m; 0 if it can't be told.
+    """Return the distance in m at which the pixels' rays meet behind the origin; 0 if unknown.
 
-    A pixel whose z changes from image to image tells it: x is a (z + behind).
+    Determined from pixels whose z varies between images (H, W, 3): x = a (z + distance).
     """
     if len({image.shape for image in images}) != 1:
         return 0.0
@@ -120,19 +119,19 @@ def origin_behind(images: Sequence[Float32]) -> float:
         mean = np.nansum(z, 0) / count
         around = np.where(np.isfinite(z), z - mean, 0.0)
         spread = (around**2).sum(0)
-        told = (count > 1) & (spread > MIN_SPREAD_M**2)
+        usable = (count > 1) & (spread > MIN_SPREAD_M**2)
         for axis in (0, 1):
             x = np.stack([image[..., axis] for image in images]).astype(float)
             x = np.where(np.isfinite(z), x, 0.0)
             slope = (around * x).sum(0) / spread
             start = x.sum(0) / count - slope * mean
-            top += float((spread * slope * start)[told].sum())
-            bottom += float((spread * slope**2)[told].sum())
+            top += float((spread * slope * start)[usable].sum())
+            bottom += float((spread * slope**2)[usable].sum())
     return top / bottom if bottom > 0 else 0.0
 
 
 def common_camera(images: Sequence[Float32]) -> Camera | None:
-    """Return the camera on whose pixels' rays the points (H, W, 3) of all images lie, or None."""
+    """Return the camera whose pixels' rays contain the points (H, W, 3) of all images, or None."""
     if not images or len({image.shape for image in images}) > 1:
         return None
     rays = _common_rays(images)
@@ -161,17 +160,17 @@ def organised_frame(
     color: UInt8 | None = None,
     normals: Float32 | None = None,
 ) -> RangeFrame:
-    """Return points (H, W, 3) and what is known of each as an image of `camera`.
+    """Return points (H, W, 3) with columns (H * W, ...) as an image of `camera`.
 
     Raises
     ------
     InputError
-        If they aren't one.
+        If the points are not on its rays.
     """
     shape = (camera.height, camera.width)
     if points.shape[:2] != shape:
         raise InputError(
-            f"is organised as {points.shape[1]} x {points.shape[0]}, those before it "
+            f"is organised as {points.shape[1]} x {points.shape[0]}, the previous clouds "
             f"{camera.width} x {camera.height}",
             where=where,
             remedy="keep the clouds of each camera apart",
@@ -182,12 +181,12 @@ def organised_frame(
     known = np.asarray(np.isfinite(rays).all(-1))
     if not _fits(points, measured & known, rays):
         raise InputError(
-            "has points off the rays of those before it",
+            "has points off the rays of the previous clouds",
             where=where,
             remedy="keep the clouds of each camera apart",
         )
     if (measured & ~known).any():
-        # A pixel that saw nothing in the clouds looked at first brings its own ray.
+        # Pixels without measurements in the sampled clouds get the ray of their point.
         own = points[..., :2] / np.where(measured, z, np.nan)[..., None]
         camera = RayTable(np.where(known[..., None], rays, own))
     return RangeFrame(
@@ -203,9 +202,9 @@ def organised_frame(
 
 
 def _common_rays(images: Sequence[Float32]) -> Float32 | None:
-    """Rays (H, W, 2) by least squares over the images, NaN where never seen; None if unfit."""
-    above = np.zeros((*images[0].shape[:2], 2))
-    below = np.zeros(images[0].shape[:2])
+    """Rays (H, W, 2) by least squares over the images, NaN where unknown; None if inconsistent."""
+    numerator = np.zeros((*images[0].shape[:2], 2))
+    denominator = np.zeros(images[0].shape[:2])
     masks = []
     for image in images:
         if (image[..., 2] < 0).any():
@@ -213,11 +212,11 @@ def _common_rays(images: Sequence[Float32]) -> Float32 | None:
         measured = _measured(image)
         z = np.where(measured, image[..., 2], 0).astype(float)
         masks.append(measured)
-        above += np.where(measured[..., None], image[..., :2], 0) * z[..., None]
-        below += z**2
+        numerator += np.where(measured[..., None], image[..., :2], 0) * z[..., None]
+        denominator += z**2
     with np.errstate(invalid="ignore", divide="ignore"):
-        slopes = above / np.where(below > 0, below, np.nan)[..., None]
-    if (np.abs(slopes) > STEEPEST).any():
+        slopes = numerator / np.where(denominator > 0, denominator, np.nan)[..., None]
+    if (np.abs(slopes) > MAX_SLOPE).any():
         return None
     rays = slopes.astype(np.float32)
     fits = all(_fits(image, mask, rays) for image, mask in zip(images, masks, strict=True))
@@ -227,9 +226,9 @@ def _common_rays(images: Sequence[Float32]) -> Float32 | None:
 def _fits(points: Float32, mask: Bool, rays: Float32) -> bool:
     z = points[mask][:, 2:]
     off = np.abs(points[mask][:, :2] - rays[mask] * z)
-    return bool((off <= TOLERANCE_M + TOLERANCE_SHARE * z).all())
+    return bool((off <= TOLERANCE_M + TOLERANCE_FRACTION * z).all())
 
 
 def _measured(points: Float32) -> Bool:
-    """Mask of points; some programs write the origin, not NaN, where nothing came back."""
+    """Mask of valid points; some programs write the origin instead of NaN for missing ones."""
     return np.asarray((np.abs(points) < FARTHEST_M).all(-1) & (points[..., 2] > 0))

@@ -1,4 +1,4 @@
-"""What recordings of phones share: ARKit's axes, lenses given for a larger image, confidence."""
+"""Recordings of phones: ARKit's axes, lenses of larger images, confidence."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from tofuse.recordings.sources import FileSource, read_matrix_pose
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 SENSOR = "iPhone or iPad LiDAR (direct ToF)"
-# Of the metadata: which program found the poses that a phone recorded.
+# Key of the metadata: the program that estimated the recorded poses.
 POSES_BY = "poses_by"
-ARKIT_UP = np.array([0.0, 1.0, 0.0])  # against gravity, in the world of its poses
-IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, which its intrinsics are for
+ARKIT_UP = np.array([0.0, 1.0, 0.0])  # opposite to gravity, in the world frame of its poses
+IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, to which its intrinsics refer
 CONFIDENCE_MAX = 2.0
 
 
 def arkit_pose(table: Float64, where: str) -> Float64:
-    """T_world_camera (4, 4) with x right, y down, z forward, of ARKit's pose; NaN where lost."""
+    """Return T_world_camera (4, 4), x right, y down, z forward, of ARKit's pose; NaN if lost."""
     return read_matrix_pose(table, where) @ ARKIT_AXES
 
 
 def lens(
     K: Float64, image_size: tuple[int, int], size: tuple[int, int], where: str | Path
 ) -> Pinhole:
-    """Make the camera of depth images of `size` from the (3, 3) matrix of larger colour images."""
+    """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     full = checked_lens(Pinhole, image_size, {k: float(v) for k, v in values.items()}, where)
     try:
@@ -45,7 +45,7 @@ def lens(
 
 
 def first_size(files: Sequence[Path]) -> tuple[int, int]:
-    """Return (width, height) of the first image that has a readable header."""
+    """Return (width, height) of the first image with a readable header."""
     error: InputError | None = None
     for path in files:
         try:
@@ -58,28 +58,28 @@ def first_size(files: Sequence[Path]) -> tuple[int, int]:
 
 
 def refuse_replacement(options: ReaderOptions, name: str) -> None:
-    """Raise InputError if a camera was given for a format that brings one for each frame."""
+    """Raise InputError if a camera was given for the format `name`, which stores one per frame."""
     if options.camera is not None:
         raise InputError(
-            f"means nothing for the format {name!r}, which stores a camera with its frames",
+            f"does not apply to the format {name!r}, which stores a camera per frame",
             where="--camera",
             remedy="leave it out",
         )
 
 
 class PhoneSource(FileSource):
-    """Depth images in mm of one camera for each frame, with confidence and colour where found.
+    """Depth images in mm with a camera per frame, and confidence and colour if available.
 
-    ARKit's depth is of the colour camera's view, so colour made small is registered to it.
+    ARKit's depth has the view of the colour camera, so that downscaled colour is registered to it.
 
     Parameters
     ----------
     depth
-        One 16-bit PNG for each frame.
+        One 16-bit PNG per frame.
     timestamps
         (N,) seconds.
     confidence, color
-        One path for each frame; None where there is none.
+        One path per frame; None where there is none.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class PhoneSource(FileSource):
         return depth_from_counts(read_image(self.files[index], size=size, dtype="uint16"), 0.001)
 
     def read_confidence(self, path: Path, size: tuple[int, int]) -> UInt8:
-        """Return the confidence (H, W) in an image, 0 to `CONFIDENCE_MAX`."""
+        """Return the confidence (H, W) of an image file, 0 to `CONFIDENCE_MAX`."""
         return read_image(path, size=size, dtype="uint8").astype(np.uint8, copy=False)
 
     def whole_color(self, index: int) -> UInt8 | None:
@@ -139,7 +139,7 @@ class PhoneSource(FileSource):
         return None if path is None else read_color(path)
 
     def color_path(self, index: int) -> Path:
-        """Return the file that the colour of a frame is in."""
+        """Return the file with the colour of a frame."""
         return self.color[index] or self.files[index]
 
     def _read_color(self, index: int, size: tuple[int, int]) -> UInt8 | None:
@@ -148,14 +148,14 @@ class PhoneSource(FileSource):
 
 
 def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:
-    """Return an image at the size (width, height) of depth, each pixel the mean of its area."""
+    """Return an image (H, W, 3) downscaled by area to the `size` (width, height) of depth."""
     import cv2
 
     height, width = image.shape[:2]
-    # Of another shape, it doesn't show what depth shows.
+    # With another aspect ratio it has another view than depth.
     if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
         raise InputError(
-            f"is {width} x {height} pixels, depth {size[0]} x {size[1]}: another shape",
+            f"is {width} x {height} pixels, depth {size[0]} x {size[1]}: another aspect ratio",
             where=where,
             remedy="export the images again",
         )

@@ -1,4 +1,4 @@
-"""A recording: frames read when they are needed, and what was found beside them."""
+"""A recording: lazily read frames, with timestamps, poses and metadata."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ R = TypeVar("R")
 
 
 class Source(Protocol):
-    """What a reader makes of a path: metadata at once, frames on demand.
+    """What a reader returns for a path: metadata at once, frames on demand.
 
     Attributes
     ----------
     timestamps
         (N,) seconds, one for each frame.
     reference
-        (N, 4, 4) T_world_camera found beside the frames, NaN where there is none; or None.
-        Only ever compared with.
+        (N, 4, 4) T_world_camera that came with the recording, NaN where unknown; or None. Used only
+        for comparison.
     odometry
-        (N, 4, 4) T_world_camera from odometry, NaN where there is none; or None.
+        (N, 4, 4) T_world_camera from odometry, NaN where unknown; or None.
     gravity
-        (N, 4) unit vector in which things fall in the camera's frame, and its standard deviation
-        in rad (`recordings.imu`), NaN where there is none; or None.
+        (N, 4) unit vector along gravity in the camera's frame, and its standard deviation in rad
+        (`recordings.imu`), NaN where unknown; or None.
     warnings
-        What a person should know about how the recording was read, one line each.
+        Notes for the user on how the recording was read, one line each.
     metadata
-        Plain facts for `inspect` and reports (sensor, ambiguity_m, confidence_max ...).
+        Facts for `inspect` and reports (sensor, ambiguity_m, confidence_max ...).
     """
 
     timestamps: Float64
@@ -54,7 +54,7 @@ class Source(Protocol):
 
 @dataclass
 class ArraySource:
-    """A source over frames that are in memory already."""
+    """A source over frames in memory."""
 
     frames: Sequence[Frame]
     reference: Float64 | None = None
@@ -76,15 +76,15 @@ class Recording:
     """A sequence of frames, read lazily.
 
     ``len(recording)``, ``recording[k]`` and iteration give the selected frames. Iteration reads
-    ahead on another thread and skips nothing: a frame that can't be read raises when it is its
-    turn; `read_all` gives the error in its place instead.
+    ahead on another thread, and raises for an unreadable frame when its turn comes; `read_all`
+    yields the error in its place instead.
 
     Attributes
     ----------
     source
-        Where the frames come from.
+        Source of the frames.
     path
-        What was opened, for messages.
+        The opened path, for messages.
     format
         Name of the reader.
     indices
@@ -133,27 +133,27 @@ class Recording:
 
     @property
     def reference(self) -> Float64 | None:
-        """(M, 4, 4) T_world_camera to compare with, NaN where there is none; or None."""
+        """(M, 4, 4) T_world_camera for comparison, NaN where unknown; or None."""
         return None if self.source.reference is None else self.source.reference[self.indices]
 
     @property
     def odometry(self) -> Float64 | None:
-        """(M, 4, 4) T_world_camera of odometry, NaN where there is none; or None."""
+        """(M, 4, 4) T_world_camera of odometry, NaN where unknown; or None."""
         return None if self.source.odometry is None else self.source.odometry[self.indices]
 
     @property
     def gravity(self) -> Float64 | None:
-        """(M, 4) direction in which things fall and its sigma, see `Source`; or None."""
+        """(M, 4) direction of gravity and its sigma, see `Source`; or None."""
         return None if self.source.gravity is None else self.source.gravity[self.indices]
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know about how the recording was read."""
+        """Notes for the user on how the recording was read, one line each."""
         return self.source.warnings
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Plain facts about the recording."""
+        """Facts about the recording."""
         return self.source.metadata
 
     def select(self, start: int = 0, end: int | None = None, every: int = 1) -> Recording:
@@ -162,7 +162,7 @@ class Recording:
         Raises
         ------
         InputError
-            If nothing would be left.
+            If the selection is empty.
         """
         if every < 1:
             raise InputError(f"is {every}", where="--every", remedy="give 1 or more")
@@ -176,9 +176,9 @@ class Recording:
         return Recording(self.source, self.path, self.format, chosen)
 
     def sample(self, count: int) -> list[Frame | UnreadableFrameError]:
-        """Read up to `count` evenly spaced frames, the first and the last among them.
+        """Read up to `count` evenly spaced frames, including the first and the last.
 
-        The error stands in the place of each that can't be read.
+        Unreadable frames are replaced by their error.
         """
         items: list[Frame | UnreadableFrameError] = []
         for k in evenly(np.arange(len(self)), count):
@@ -198,13 +198,13 @@ class Recording:
         for frame in self.readable(count):
             if not isinstance(frame, RangeFrame):
                 raise InputError(
-                    "holds clouds", where=self.path, remedy="give a recording of depth images"
+                    "contains clouds", where=self.path, remedy="give a recording of depth images"
                 )
             out.append(frame)
         return out
 
     def first_readable(self) -> Frame | None:
-        """Read the first frame that can be read; None if there is none."""
+        """Return the first readable frame; None if there is none."""
         for k in range(len(self)):
             try:
                 return self[k]
@@ -213,10 +213,10 @@ class Recording:
         return None
 
     def read_all(self, ahead: int = 8, *, first: int = 0) -> Iterator[Frame | UnreadableFrameError]:
-        """Iterate over the frames from the `first`, with the error in place of unreadable ones.
+        """Iterate over the frames from position `first`, with errors in place of unreadable ones.
 
-        Reads up to `ahead` frames in advance: on two other threads where the source allows it,
-        else on one.
+        Reads up to `ahead` frames in advance: on two other threads if the source allows it, else
+        on one.
         """
         return (item for item, _ in self.read_with(lambda frame: None, ahead, first=first))
 
@@ -257,7 +257,7 @@ class Recording:
 
 
 def evenly(items: Intp, count: int) -> Intp:
-    """Choose at most `count` of the items, evenly spaced, the first and last among them."""
+    """Return at most `count` of the items, evenly spaced, including the first and the last."""
     if len(items) == 0:
         return items
     positions = np.linspace(0, len(items) - 1, min(count, len(items))).round()

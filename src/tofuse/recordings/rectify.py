@@ -1,4 +1,4 @@
-"""Images of any camera as a pinhole camera would have taken them."""
+"""Rectification of images of any camera to a pinhole camera."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.recordings.frames import RangeFrame
 
 # Beyond this slope of a ray (60 degrees off the axis) a pinhole image is mostly stretched rim.
-STEEPEST = 1.75
-_INNER = 0.5  # share of the image that decides the focal length
+MAX_SLOPE = 1.75
+_INNER = 0.5  # central fraction of the image that determines the focal length
 
 
 def pinhole_of(camera: Camera) -> Pinhole:
-    """Return a pinhole camera of the same size and resolution in the middle of the image.
+    """Return a pinhole camera of the same size, and of the same resolution in the image centre.
 
-    The rim of a wide lens, beyond 60 degrees off the axis, may fall outside of it.
+    The rim of a wide-angle lens, beyond 60 degrees off the axis, may be outside of its image.
     """
     if type(camera) is Pinhole:
         return camera
@@ -32,9 +32,9 @@ def pinhole_of(camera: Camera) -> Pinhole:
     )
     dx = np.nanmedian(np.diff(rays[rows, columns, 0], axis=1))
     dy = np.nanmedian(np.diff(rays[rows, columns, 1], axis=0))
-    near = np.nan_to_num(np.hypot(rays[..., 0], rays[..., 1]), nan=np.inf) < STEEPEST
+    near = np.nan_to_num(np.hypot(rays[..., 0], rays[..., 1]), nan=np.inf) < MAX_SLOPE
     x, y = rays[near].T
-    # As wide as what the camera sees, but no finer than it.
+    # Covers the camera's field of view, at no finer resolution.
     fx = min(1 / dx, (width - 1) / float(np.ptp(x)))
     fy = min(1 / dy, (height - 1) / float(np.ptp(y)))
     cx = (width - 1) / 2 - fx * float(x.min() + x.max()) / 2
@@ -43,7 +43,7 @@ def pinhole_of(camera: Camera) -> Pinhole:
 
 
 def _sources(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
-    """Row and column (H, W, 2) of the pixel nearest to each pinhole pixel's ray, and whether."""
+    """Row and column (H, W, 2) of the pixel nearest to each pinhole ray, and whether it exists."""
     rays = pinhole.rays().astype(float)
     points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
     uv = np.rint(camera.project(points))
@@ -58,10 +58,10 @@ def _sources(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
 
 
 class Rectifier:
-    """Turns frames into those of a pinhole camera, each pixel from its nearest.
+    """Rectifies frames to a pinhole camera by nearest-neighbour sampling.
 
-    The depth of a pixel is that at its own ray, on the plane through the nearest pixel's point
-    that its neighbours show; so flat things stay flat.
+    Depth is evaluated at the pinhole ray, on the local plane of the nearest pixel, so that planes
+    stay planar.
     """
 
     def __init__(self, pinhole: Pinhole) -> None:
@@ -75,17 +75,17 @@ class Rectifier:
             return _as_z(frame)
         if self._at is None or frame.camera != self._camera:
             self._camera, self._at = frame.camera, _sources(frame.camera, self.pinhole)
-        return _moved(frame, self.pinhole, *self._at)
+        return _resampled(frame, self.pinhole, *self._at)
 
 
 def _as_z(frame: RangeFrame) -> RangeFrame:
     return replace(frame, depth=frame.z, depth_kind="z")
 
 
-def _moved(frame: RangeFrame, pinhole: Pinhole, at: Intp, inside: Bool) -> RangeFrame:
+def _resampled(frame: RangeFrame, pinhole: Pinhole, at: Intp, inside: Bool) -> RangeFrame:
     rows, columns = at[..., 0], at[..., 1]
 
-    def taken(image: NDArray[Any] | None) -> NDArray[Any] | None:
+    def sampled(image: NDArray[Any] | None) -> NDArray[Any] | None:
         if image is None:
             return None
         mask = inside if image.ndim == 2 else inside[..., None]
@@ -103,19 +103,19 @@ def _moved(frame: RangeFrame, pinhole: Pinhole, at: Intp, inside: Bool) -> Range
         pinhole,
         np.nan_to_num(z, posinf=0.0).astype(np.float32),
         "z",
-        taken(frame.amplitude_image),
-        taken(frame.confidence_image),
-        taken(frame.color_image),
-        taken(frame.sigma_image),
+        sampled(frame.amplitude_image),
+        sampled(frame.confidence_image),
+        sampled(frame.color_image),
+        sampled(frame.sigma_image),
         amplitude_kind=frame.amplitude_kind,
         ambiguity_m=frame.ambiguity_m,
     )
 
 
 def _slopes(inverse: Float32, rays: Float32) -> Float32:
-    """Change (H, W, 2) of inverse depth with the ray's x and y; 0 next to jumps and holes."""
+    """Gradient (H, W, 2) of inverse depth over the ray's x and y; 0 next to jumps and holes."""
     along_u, along_v = (_smaller_step(inverse, rays, axis) for axis in (1, 0))
-    # A step to the next pixel changes both slopes of the ray where the lens distorts.
+    # With distortion a step to the next pixel changes both slopes of the ray.
     (du, xu, yu), (dv, xv, yv) = along_u, along_v
     det = xu * yv - xv * yu
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -124,9 +124,9 @@ def _slopes(inverse: Float32, rays: Float32) -> Float32:
 
 
 def _smaller_step(inverse: Float32, rays: Float32, axis: int) -> tuple[Float64, Float64, Float64]:
-    """Steps of inverse depth, x and y to that neighbour whose depth differs less.
+    """Differences of inverse depth, x and y to the neighbour with the smaller depth difference.
 
-    On a surface both neighbours differ alike; across a jump the other one is the surface's own.
+    On a surface both differ alike; next to a jump that neighbour is on the same surface.
     """
     values = np.concatenate([inverse[..., None], rays], axis=-1).astype(np.float64)
     step = np.diff(values, axis=axis)

@@ -1,4 +1,4 @@
-"""rig.json: several cameras that are fixed to each other."""
+"""rig.json: several cameras that are rigidly connected."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tofuse.recordings.camera_file import read_json
 
 SCHEMA = 1
 FILE_NAME = "rig.json"
-# Larger clock and depth offsets are mistakes in units.
-_MOST_SECONDS, _MOST_METRES = 1e10, 10.0
+# Larger clock and depth offsets are in wrong units.
+_MAX_SECONDS, _MAX_METRES = 1e10, 10.0
 
 _REMEDY = "correct it, or write the file again by `tofuse rig calibrate`"
 
@@ -32,17 +32,17 @@ class RigCamera:
     Attributes
     ----------
     name
-        What it is called.
+        Unique name.
     recording
-        The recording that it was calibrated with, as it was given.
+        The recording used for its calibration, as given.
     T_rig_camera
-        (4, 4) where it is.
+        (4, 4) mounting pose.
     covariance
-        (6, 6) of the right perturbation of that, m and rad.
+        (6, 6) of its right perturbation, m and rad.
     time_offset_s
         The rig's time is the camera's timestamp plus this.
     depth_offset_m
-        By how much its ranges are too long, compared with the first camera's.
+        Excess of its ranges over those of the first camera, m.
     """
 
     name: str
@@ -55,7 +55,7 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """How far surfaces of two cameras (by name) are apart: the median in m, of so many pixels."""
+    """Median distance in m between surfaces of two cameras (by name), and the number of pixels."""
 
     a: str
     b: str
@@ -65,12 +65,16 @@ class Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras that are fixed to each other; the first is the rig's frame.
+    """Rigidly connected cameras; the frame of the first is that of the rig.
 
     Attributes
     ----------
+    cameras
+        Those with known poses.
+    disagreement
+        Of pairs of cameras.
     unplaced
-        Why a camera, by name, could not be placed.
+        Reasons why other cameras could not be located, by name.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -78,11 +82,11 @@ class Rig:
     unplaced: Mapping[str, str] = field(default_factory=dict)
 
     def camera(self, name: str) -> RigCamera | None:
-        """The camera of that name; None if there is none."""
+        """Return the camera called `name`; None if there is none."""
         return next((camera for camera in self.cameras if camera.name == name), None)
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data."""
+        """Return plain data, as stored in rig.json."""
         data: dict[str, Any] = {
             "schema": SCHEMA,
             "cameras": [
@@ -107,7 +111,7 @@ class Rig:
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
-    """Write a rig.json, whole or not at all."""
+    """Write a rig.json; see `replacing` for errors."""
     write_text(path, json.dumps(rig.to_dict(), indent=1) + "\n")
 
 
@@ -117,16 +121,16 @@ def read_rig(path: str | Path) -> Rig:
     Raises
     ------
     InputError
-        Naming the field that makes no sense.
+        Naming the invalid field.
     """
     data = read_json(path)
     schema = data.get("schema")
     if schema != SCHEMA or isinstance(schema, bool):
         problem = f"schema is {schema!r}" if "schema" in data else "schema is missing"
-        raise InputError(problem, where=path, remedy=f"write {SCHEMA}, the only version there is")
+        raise InputError(problem, where=path, remedy=f"write {SCHEMA}, the only version")
     rows = data.get("cameras")
     if not isinstance(rows, list) or not rows:
-        raise InputError("cameras is no list of cameras", where=path, remedy=_REMEDY)
+        raise InputError("cameras is not a list of cameras", where=path, remedy=_REMEDY)
     cameras = tuple(_camera(row, k, path) for k, row in enumerate(rows))
     names = [camera.name for camera in cameras]
     for name in names:
@@ -136,49 +140,51 @@ def read_rig(path: str | Path) -> Rig:
         raise InputError(
             f"the first camera, {names[0]!r}, is not the identity", where=path, remedy=_REMEDY
         )
-    found = data.get("disagreement", [])
-    if not isinstance(found, list):
-        raise InputError("disagreement is no list", where=path, remedy=_REMEDY)
-    pairs = tuple(_disagreement(row, k, names, path) for k, row in enumerate(found))
+    rows = data.get("disagreement", [])
+    if not isinstance(rows, list):
+        raise InputError("disagreement is not a list", where=path, remedy=_REMEDY)
+    pairs = tuple(_disagreement(row, k, names, path) for k, row in enumerate(rows))
     return Rig(cameras, pairs, _unplaced(data.get("unplaced", []), path))
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a name can't lead out of the folder that it is looked for in, on any system."""
+    """Whether a name can't refer to another folder on any system."""
     return name not in (".", "..") and not any(c in "/\\:" or ord(c) < 32 for c in name)
 
 
 def _camera(row: object, k: int, path: str | Path) -> RigCamera:
     at = f"cameras[{k}]"
     if not isinstance(row, dict):
-        raise InputError(f"{at} is no object", where=path, remedy=_REMEDY)
+        raise InputError(f"{at} is not an object", where=path, remedy=_REMEDY)
     name, recording = row.get("name"), row.get("recording", "")
     if not isinstance(name, str) or not name.strip():
-        raise InputError(f"{at}.name is {name!r}, no name", where=path, remedy=_REMEDY)
+        raise InputError(f"{at}.name is {name!r}, not a name", where=path, remedy=_REMEDY)
     if not is_plain_name(name):
         raise InputError(
-            f"{at}.name is {name!r:.80}, which is no name of a folder",
+            f"{at}.name is {name!r:.80}, which is not a folder name",
             where=path,
             remedy="give it one without / \\ : and not . or ..",
         )
     if not isinstance(recording, str):
-        raise InputError(f"{at}.recording is no path", where=path, remedy=_REMEDY)
+        raise InputError(f"{at}.recording is not a path", where=path, remedy=_REMEDY)
     T = check_pose(
         _numbers(row.get("T_rig_camera"), (4, 4), f"{at}.T_rig_camera", path), where=str(path)
     )
     C = _numbers(row.get("covariance", [0.0] * 36), (6, 6), f"{at}.covariance", path)
-    least = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
-    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or least < -1e-6 * max(np.abs(C).max(), 1e-9):
-        raise InputError(f"{at}.covariance is no covariance", where=path, remedy=_REMEDY)
-    time = _number(row.get("time_offset_s", 0.0), _MOST_SECONDS, f"{at}.time_offset_s", path)
-    depth = _number(row.get("depth_offset_m", 0.0), _MOST_METRES, f"{at}.depth_offset_m", path)
+    smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
+    if not np.allclose(C, C.T, rtol=1e-3, atol=1e-12) or smallest < -1e-6 * max(
+        np.abs(C).max(), 1e-9
+    ):
+        raise InputError(f"{at}.covariance is not a covariance", where=path, remedy=_REMEDY)
+    time = _number(row.get("time_offset_s", 0.0), _MAX_SECONDS, f"{at}.time_offset_s", path)
+    depth = _number(row.get("depth_offset_m", 0.0), _MAX_METRES, f"{at}.depth_offset_m", path)
     return RigCamera(name, recording, T, 0.5 * (C + C.T), time, depth)
 
 
 def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Disagreement:
     at = f"disagreement[{k}]"
     if not isinstance(row, dict) or row.get("a") not in names or row.get("b") not in names:
-        raise InputError(f"{at} names no two cameras", where=path, remedy=_REMEDY)
+        raise InputError(f"{at} does not name two cameras", where=path, remedy=_REMEDY)
     median = _number(row.get("median_m"), 1e6, f"{at}.median_m", path)
     pixels = _number(row.get("pixels", 0), 1e15, f"{at}.pixels", path)
     return Disagreement(str(row["a"]), str(row["b"]), median, int(pixels))
@@ -186,7 +192,7 @@ def _disagreement(row: object, k: int, names: list[str], path: str | Path) -> Di
 
 def _unplaced(rows: object, path: str | Path) -> dict[str, str]:
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise InputError("unplaced is no list of cameras", where=path, remedy=_REMEDY)
+        raise InputError("unplaced is not a list of cameras", where=path, remedy=_REMEDY)
     return {str(row.get("name", "")): str(row.get("reason", "")) for row in rows}
 
 
@@ -201,9 +207,9 @@ def _numbers(value: object, shape: tuple[int, int], name: str, path: str | Path)
     return array.reshape(shape)
 
 
-def _number(value: object, most: float, name: str, path: str | Path) -> float:
+def _number(value: object, limit: float, name: str, path: str | Path) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {value!r}, no number", where=path, remedy=_REMEDY)
-    if abs(value) > most:
+        raise InputError(f"{name} is {value!r}, not a number", where=path, remedy=_REMEDY)
+    if abs(value) > limit:
         raise InputError(f"{name} is {value:g}, too large", where=path, remedy=_REMEDY)
     return float(value)

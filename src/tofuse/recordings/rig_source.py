@@ -1,4 +1,4 @@
-"""The recordings of a rig's cameras as one: instant by instant, each instant camera by camera."""
+"""The recordings of a rig's cameras as one, ordered by instant and camera."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Rig
 
-# Images of one instant are no further apart than this share of the time between images.
+# Largest distance in time within an instant, as a fraction of the frame interval.
 _SAME_INSTANT = 0.6
 
 
 class RigSource:
-    """Images of all cameras in the order of time, with depths as the first camera measures them.
+    """Images of all cameras in temporal order, with depth offsets relative to the first camera.
 
     Parameters
     ----------
     rig
-        Its cameras are those of the recordings, in their order.
+        The rig; its cameras have the order of the recordings.
     recordings
         One for each camera.
 
     Attributes
     ----------
     instant, camera
-        (N,) of each frame: which instant, and which camera.
+        (N,) number of the instant and of the camera of each frame.
     """
 
     reference: Float64 | None = None
@@ -45,9 +45,9 @@ class RigSource:
         rows = self._rows()
         if not len(rows):
             raise InputError(
-                "no images of its cameras are of one time",
+                "no images of its cameras are of the same time",
                 where="the rig",
-                remedy="give recordings of the same time, or calibrate the clocks anew",
+                remedy="give recordings of the same time, or calibrate the clocks again",
             )
         self.instant, self.camera, self._row = rows.T
         self.timestamps = np.array(
@@ -69,7 +69,7 @@ class RigSource:
         self.metadata["cameras"] = [camera.name for camera in rig.cameras]
 
     def _rows(self) -> Intp:
-        """(N, 3) instant, camera and position in its recording, of each frame."""
+        """(N, 3) instant, camera, and position in the recording of each frame."""
         times = [
             recording.timestamps + camera.time_offset_s
             for recording, camera in zip(self._recordings, self.rig.cameras, strict=True)
@@ -78,20 +78,20 @@ class RigSource:
         rows: list[tuple[int, int, int]] = []
         instant = 0
         for k, t in enumerate(times[0]):
-            found = [(0, k)]
+            images = [(0, k)]
             for c, own in enumerate(times[1:], 1):
                 near = int(np.abs(own - t).argmin())
                 interval = float(np.median(np.diff(own))) if len(own) > 1 else 0.0
                 if single or abs(own[near] - t) <= _SAME_INSTANT * interval:
-                    found.append((c, near))
-            if len(found) == len(times):
-                rows += [(instant, c, row) for c, row in found]
+                    images.append((c, near))
+            if len(images) == len(times):
+                rows += [(instant, c, row) for c, row in images]
                 instant += 1
         return np.array(rows, np.intp).reshape(-1, 3)
 
     @property
     def T_rig_camera(self) -> Float64:
-        """(N, 4, 4) of each frame."""
+        """(N, 4, 4) mounting pose of the camera of each frame."""
         return np.stack([self.rig.cameras[c].T_rig_camera for c in self.camera])
 
     def read(self, index: int) -> Frame:
@@ -104,7 +104,7 @@ class RigSource:
 
 
 def with_range_added(frame: RangeFrame, metres: float) -> RangeFrame:
-    """An image whose ranges are longer by so many metres."""
+    """Return the image with `metres` added to its ranges."""
     if metres == 0:
         return frame
     along = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)

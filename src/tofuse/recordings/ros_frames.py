@@ -1,4 +1,4 @@
-"""Frames of reference of ROS bags: where a camera is in the world, and beside another one (tf)."""
+"""The tf tree of ROS bags: poses of cameras in the world and relative to each other."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from tofuse.geometry import quaternion, se3
 
 _KIND = "tf2_msgs/msg/TFMessage"
 _OLD_KIND = "tf/msg/tfMessage"
-_STATIC = "static"  # of the name of its topic
-# Between transforms further apart, or beyond the last, a frame's place is not known, s.
-_APART_S, _BESIDE_S = 0.5, 0.02
-_DEEPEST = 64
+_STATIC = "static"  # in the name of the topic
+# Largest interval between transforms to interpolate, and largest extrapolation, s.
+_MAX_GAP_S, _MAX_EXTRAPOLATION_S = 0.5, 0.02
+_MAX_DEPTH = 64
 
 
 @dataclass(frozen=True, eq=False)
 class _Edge:
-    """Where a frame is in its parent: T_parent_child (N, 4, 4) at times (N,), rising.
+    """The pose of a frame in its parent: T_parent_child (N, 4, 4) at ascending times (N,).
 
-    What is fixed has one, which holds at all times.
+    If `fixed`, the last one applies at all times.
     """
 
     parent: str
@@ -33,33 +33,33 @@ class _Edge:
     fixed: bool
 
     def at(self, times: Float64) -> Float64:
-        """(M, 4, 4) at times (M,), NaN where it is not known."""
+        """Return T_parent_child (M, 4, 4) at times (M,), NaN where unknown."""
         if self.fixed:
             return np.broadcast_to(self.T[-1], (len(times), 4, 4))
         out = np.full((len(times), 4, 4), np.nan)
         after = np.searchsorted(self.times, times)
         a, b = (after - 1).clip(0), after.clip(0, len(self.times) - 1)
         span = self.times[b] - self.times[a]
-        share = np.where(span > 0, (times - self.times[a]) / np.where(span > 0, span, 1), 0.0)
-        inside = (span <= _APART_S) & (share >= 0) & (share <= 1)
+        fraction = np.where(span > 0, (times - self.times[a]) / np.where(span > 0, span, 1), 0.0)
+        inside = (span <= _MAX_GAP_S) & (fraction >= 0) & (fraction <= 1)
         nearest = np.minimum(np.abs(times - self.times[a]), np.abs(times - self.times[b]))
-        known = np.where(a == b, nearest <= _BESIDE_S, inside)
+        known = np.where(a == b, nearest <= _MAX_EXTRAPOLATION_S, inside)
         step = se3.log(se3.inverse(self.T[a[known]]) @ self.T[b[known]])
-        out[known] = self.T[a[known]] @ se3.exp(share[known, None] * step)
+        out[known] = self.T[a[known]] @ se3.exp(fraction[known, None] * step)
         return out
 
 
 class Transforms:
-    """The tree of frames in a bag."""
+    """The tf tree of a bag."""
 
     def __init__(self, edges: dict[str, _Edge]) -> None:
         self._edges = edges
 
     @classmethod
     def read(cls, bag: Any) -> Transforms:
-        """Read all transforms of a bag; those that are no rigid motions are left out."""
+        """Read all transforms of a bag, except those that are not rigid motions."""
         chosen = [c for c in bag.connections if c.msgtype in (_KIND, _OLD_KIND)]
-        found: dict[str, list[tuple[float, str, Float64]]] = {}
+        rows: dict[str, list[tuple[float, str, Float64]]] = {}
         fixed: set[str] = set()
         if chosen:
             for connection, _, raw in bag.messages(connections=chosen):
@@ -69,18 +69,18 @@ class Transforms:
                     row = _row(each)
                     if row is None:
                         continue
-                    found.setdefault(child, []).append(row)
+                    rows.setdefault(child, []).append(row)
                     if _STATIC in connection.topic:
                         fixed.add(child)
-        return cls({child: _edge(rows, child in fixed) for child, rows in found.items()})
+        return cls({child: _edge(own, child in fixed) for child, own in rows.items()})
 
     def __bool__(self) -> bool:
         return bool(self._edges)
 
     def above(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on up to the root."""
+        """Return the frame, its parent, and so on up to the root."""
         names = [frame]
-        while names[-1] in self._edges and len(names) < _DEEPEST:
+        while names[-1] in self._edges and len(names) < _MAX_DEPTH:
             parent = self._edges[names[-1]].parent
             if parent in names:
                 break
@@ -88,18 +88,18 @@ class Transforms:
         return names
 
     def moves(self, above: str, frame: str) -> bool:
-        """Whether a frame moves in one above it."""
+        """Whether a frame moves relative to one above it."""
         return any(not self._edges[each].fixed for each in self._between(above, frame))
 
     def poses(self, above: str, frame: str, times: Float64) -> Float64:
-        """T_above_frame (N, 4, 4) at times (N,), NaN where it is not known."""
+        """Return T_above_frame (N, 4, 4) at times (N,), NaN where unknown."""
         T = np.broadcast_to(np.eye(4), (len(times), 4, 4))
         for each in self._between(above, frame):
             T = self._edges[each].at(times) @ T
         return np.array(T)
 
     def fixed(self, to: str, frame: str) -> Float64 | None:
-        """T_to_frame (4, 4) between frames that don't move against each other, or None."""
+        """Return T_to_frame (4, 4) if the frames don't move relative to each other, else None."""
         shared = next((each for each in self.above(frame) if each in self.above(to)), None)
         if shared is None or self.moves(shared, frame) or self.moves(shared, to):
             return None
@@ -115,12 +115,12 @@ class Transforms:
 
 
 def frame_name(name: Any) -> str:
-    """Return the name of a frame without the slash that ROS 1 once had in front of it."""
+    """Return the name of a frame without the leading slash of early ROS 1."""
     return str(name).lstrip("/")
 
 
 def _row(each: Any) -> tuple[float, str, Float64] | None:
-    """Time, parent and T_parent_child (4, 4) of a transform; None if it is no rigid motion."""
+    """Time, parent and T_parent_child (4, 4) of a transform; None if it is not a rigid motion."""
     t, q = each.transform.translation, each.transform.rotation
     numbers = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], float)
     if not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers[3:]) - 1) > 0.01:

@@ -1,4 +1,4 @@
-"""One view by its name: a file that holds one, or `REC#12`, frame 12 of a recording."""
+"""A single view by its name: a file with one frame, or `REC#12`, frame 12 of a recording."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ MIN_POINTS = 10
 
 @dataclass(frozen=True, eq=False)
 class SingleView:
-    """A frame, and where it comes from.
+    """A frame and its origin.
 
     Attributes
     ----------
     name
-        What the person wrote.
+        As the user wrote it.
     path, format, index
-        The recording, its reader, and which frame of it this is.
+        The recording, its reader, and the index of the frame.
     frame
         The view.
     shift
-        (3,) m: coordinates in the file are those of the frame plus this. Not zero only for clouds
-        in the coordinates of a map.
+        (3,) m, to add to coordinates of the frame to get those of the file. Nonzero only for clouds
+        in map coordinates.
     warnings
-        What a person should know about how it was read.
+        Notes for the user on how it was read.
     """
 
     name: str
@@ -52,27 +52,27 @@ def open_view(
     camera: Path | None = None,
     topic: str | None = None,
 ) -> SingleView:
-    """Read the view that is called `name`; options as of `open_recording`.
+    """Read the view called `name`; for the options see `open_recording`.
 
     Raises
     ------
     InputError
-        If there is no such frame, the recording holds several and `name` doesn't say which, or
-        the frame can't be read or has fewer than ten points.
+        If there is no such frame, the recording has several and `name` doesn't state which, or the
+        frame can't be read or has fewer than ten points.
     """
     path, index = split_name(name)
     recording = open_recording(path, format=format, camera=camera, topic=topic)
     count = len(recording)
     if index is None and count > 1:
         raise InputError(
-            f"holds {count} frames",
+            f"contains {count} frames",
             where=name,
-            remedy=f"say which one: {name}#0 to {name}#{count - 1}",
+            remedy=f"choose one: {name}#0 to {name}#{count - 1}",
         )
     index = index or 0
     if index >= count:
-        held = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
-        raise InputError(f"has no frame {index}", where=path, remedy=held)
+        available = "its only frame is 0" if count == 1 else f"its frames are 0 to {count - 1}"
+        raise InputError(f"has no frame {index}", where=path, remedy=available)
     frame = recording[index]
     if len(frame) < MIN_POINTS:
         raise InputError(
@@ -88,16 +88,16 @@ def open_view(
 
 
 def split_name(name: str) -> tuple[str, int | None]:
-    """Return the path and the frame that `name` asks for; None where it names no frame.
+    """Return the path and the frame index in `name`; None if it has no index.
 
-    A path that exists is taken as it is, with any # in it.
+    An existing path is taken literally, with any # in it.
     """
     if "#" not in name or os.path.lexists(name):
         return name, None
     path, _, frame = name.rpartition("#")
     if not (frame.isascii() and frame.isdecimal()):
         raise InputError(
-            f"asks for frame {frame!r}",
+            f"has the frame index {frame!r}",
             where=name,
             remedy="write a whole number after the #, such as recording#12",
         )

@@ -1,4 +1,4 @@
-"""Recordings that are one file: given themselves, or by the folder that holds them."""
+"""Recordings that are one file, given by its path or by its folder."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ def file_of(path: Path, *suffixes: str) -> Path | None:
 
 
 def required_file(path: Path, *suffixes: str) -> Path:
-    """Return what `file_of` returns, or any file that was given by name; refuse the rest."""
-    found = file_of(path, *suffixes)
-    if found is not None:
-        return found
+    """Return the same as `file_of`, or any file given by its path; else raise InputError."""
+    file = file_of(path, *suffixes)
+    if file is not None:
+        return file
     if is_file(path):
         return path
     raise InputError(
-        f"doesn't hold one {' or '.join(suffixes)} file", where=path, remedy="give the file"
+        f"doesn't contain exactly one {' or '.join(suffixes)} file",
+        where=path,
+        remedy="give the file",
     )

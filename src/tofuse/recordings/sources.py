@@ -80,7 +80,7 @@ def tum_poses(source: FileSource, path: Path) -> Float64:
     return out
 
 
-def poses_beside(
+def poses_from_files(
     source: FileSource, files: Sequence[Path], read: Callable[[Path], Float64]
 ) -> Float64:
     """Return (N, 4, 4) poses from one file per frame; NaN, and a warning, if one can't be read."""

@@ -21,7 +21,7 @@ from tofuse.live.device import (
 )
 from tofuse.parts import part
 from tofuse.recordings.frames import RangeFrame
-from tofuse.recordings.lenses import plainest_lens
+from tofuse.recordings.lenses import simplest_lens
 
 _POLL_MS = 100
 
@@ -144,4 +144,4 @@ def _image(frame: Any) -> Float32:
 def _camera(lens: Any, distortion: Any, size: tuple[int, int]) -> Camera:
     values = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
     k = {name: float(getattr(distortion, name)) for name in DISTORTION_ORDER["rational"]}
-    return plainest_lens(size, values, k, "Orbbec")
+    return simplest_lens(size, values, k, "Orbbec")

@@ -17,7 +17,7 @@ from tofuse.geometry.se3 import check_pose, orthonormalise
 from tofuse.parts import part
 from tofuse.recordings.bags import Track, open_container
 from tofuse.recordings.camera_file import ColorCamera
-from tofuse.recordings.lenses import plainest_lens
+from tofuse.recordings.lenses import simplest_lens
 from tofuse.recordings.maker_bags import BagSource, topics
 from tofuse.recordings.reader import ReaderOptions, Sniff
 from tofuse.recordings.ros_messages import GREY
@@ -64,7 +64,7 @@ class _Profile:
     translation_m: Float64
 
     def lens(self, where: str) -> Pinhole:
-        return plainest_lens(self.size, self.values, self.k, where)
+        return simplest_lens(self.size, self.values, self.k, where)
 
 
 class OrbbecSource(BagSource):
@@ -77,7 +77,7 @@ class OrbbecSource(BagSource):
 
     def find(self) -> None:
         """See `BagSource.find`."""
-        self.depth = self.needed(_ORBBEC_DEPTH, "depth")
+        self.depth = self.required_track(_ORBBEC_DEPTH, "depth")
         self.profile = self._profile(_ORBBEC_DEPTH_PROFILE)
         self.unit = 0.001
         self.metadata |= {"sensor": "Orbbec", "frame_rate_hz": float(self.profile.rate)}
@@ -106,7 +106,7 @@ class OrbbecSource(BagSource):
 
     def _profile(self, topic: str) -> _Profile:
         where = f"{self.path}: {topic}"
-        raw = bytes(self.needed(topic, "profile of the stream").raw(0))
+        raw = bytes(self.required_track(topic, "profile of the stream").raw(0))
         at = _header_end(raw, where)
         if len(raw) < at + _PROFILE.size:
             raise InputError("is cut off", where=where, remedy="check the bag")

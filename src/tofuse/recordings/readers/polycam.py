@@ -24,7 +24,7 @@ from tofuse.recordings.phones import (
     refuse_replacement,
 )
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.sources import poses_beside
+from tofuse.recordings.sources import poses_from_files
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
@@ -81,7 +81,7 @@ class PolycamSource(PhoneSource):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
-        poses = poses_beside(self, paths, lambda path: _pose(read_json(path), path))
+        poses = poses_from_files(self, paths, lambda path: _pose(read_json(path), path))
         if np.isfinite(poses).any():
             self.reference = poses
 

@@ -56,7 +56,7 @@ class RealSenseSource(BagSource):
             raise InputError("has no depth of a RealSense", where=self.path, remedy="record it")
         stream = found[0].removesuffix("/image/data")
         sensor = stream.rsplit("/", 1)[0]
-        self.depth = self.needed(found[0], "depth")
+        self.depth = self.required_track(found[0], "depth")
         self.stream = stream
         self.unit = self._unit(sensor)
         name = self._name(sensor.rsplit("/", 1)[0])

@@ -15,10 +15,10 @@ from tofuse.files.reading import files_with, is_file, is_folder, read_head
 from tofuse.geometry.cameras import Camera, Pinhole
 from tofuse.parts import part
 from tofuse.recordings.bags import (
-    APART_S,
     MAGIC,
+    MAX_GAP_S,
     Track,
-    amplitude_beside,
+    amplitude_at,
     damaged,
     open_bag,
 )
@@ -147,7 +147,7 @@ class RosSource(FileSource):
                 self.camera,
                 self._depth(message, where),
                 self.kind,
-                amplitude_beside(self.amplitude, time, self.camera, where),
+                amplitude_at(self.amplitude, time, self.camera, where),
                 amplitude_kind="ir",
             )
             return self._colored(frame, f"{where}, colour")
@@ -303,7 +303,7 @@ class RosSource(FileSource):
         return turn(track.message(index), where)
 
     def _colored(self, frame: RangeFrame, where: str) -> RangeFrame:
-        k = None if self.color is None else self.color.near(frame.timestamp, APART_S)
+        k = None if self.color is None else self.color.near(frame.timestamp, MAX_GAP_S)
         if self.color is None or k is None:
             return frame
         seen = self._color_image(self.color, k, where)
@@ -322,7 +322,7 @@ class RosSource(FileSource):
             first = track.message(0)
             if (first.height, first.width) != (self.camera.height, self.camera.width):
                 continue
-            beside = [track.near(t, APART_S) is not None for t in self.timestamps]
+            beside = [track.near(t, MAX_GAP_S) is not None for t in self.timestamps]
             if sum(beside) > 0.5 * len(beside):
                 self.metadata["amplitude_topic"] = connection.topic
                 return track

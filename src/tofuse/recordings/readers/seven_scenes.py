@@ -18,7 +18,7 @@ from tofuse.parts import part
 from tofuse.recordings.camera_file import checked_lens
 from tofuse.recordings.depth_images import DepthImageSource
 from tofuse.recordings.reader import ReaderOptions, Sniff
-from tofuse.recordings.sources import poses_beside, read_matrix_pose
+from tofuse.recordings.sources import poses_from_files, read_matrix_pose
 
 FRAME_RATE_HZ = 30.0
 DEFAULT_CAMERA = Pinhole(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -63,7 +63,7 @@ class SevenScenes:
         elif color:
             source.warnings.append("colour is not registered to depth in 7-Scenes: taken as it is")
         stems = [file.name[: -len(".depth.png")] for file in files]
-        poses = poses_beside(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
+        poses = poses_from_files(source, [path / f"{stem}.pose.txt" for stem in stems], read_pose)
         if np.isfinite(poses).any():
             source.reference = poses
         source.metadata |= {

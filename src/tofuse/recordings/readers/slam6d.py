@@ -16,7 +16,7 @@ from tofuse.parts import part
 from tofuse.recordings.cloud_files import CloudFileSource, required_files, sniff_clouds
 from tofuse.recordings.frames import CloudFrame
 from tofuse.recordings.reader import ReaderOptions, Sniff, refuse_camera
-from tofuse.recordings.sources import cloud_frame, poses_beside
+from tofuse.recordings.sources import cloud_frame, poses_from_files
 
 # x right, y up, z forward, left-handed, cm; turning y over makes it the camera's convention.
 FLIP = np.diag([1.0, -1.0, 1.0])
@@ -39,7 +39,7 @@ class Slam6d:
         refuse_camera(options, "slam6d")
         files = required_files(path, ".3d")
         source = CloudFileSource(path, files, scan_frame)
-        poses = poses_beside(source, [file.with_suffix(".pose") for file in files], read_pose)
+        poses = poses_from_files(source, [file.with_suffix(".pose") for file in files], read_pose)
         if np.isfinite(poses).any():
             source.odometry = poses
             if source.reference is None:
