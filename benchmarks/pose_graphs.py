@@ -26,13 +26,13 @@ from threadpoolctl import threadpool_limits
 from tofuse.arrays import Float64
 from tofuse.evaluation.trajectory import align
 from tofuse.geometry import quaternion, se3
+from tofuse.lab.methods.elch import Elch
+from tofuse.lab.methods.lu_milios import LuMilios
 from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.charts import Quaternion
-from tofuse.posegraph.elch import Elch
 from tofuse.posegraph.g2o import read_g2o, write_g2o
 from tofuse.posegraph.graph import Optimiser, PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.lu_milios import LuMilios
 
 SHARE = 0.3  # of all loops that are false
 ODOMETRY = np.array([0.004] * 3 + [np.radians(0.2)] * 3)  # standard deviations, m and rad

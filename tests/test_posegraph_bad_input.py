@@ -11,12 +11,12 @@ from test_posegraph_levenberg import walk
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry import se3
+from tofuse.lab.methods.elch import Elch
+from tofuse.lab.methods.lu_milios import LuMilios
 from tofuse.posegraph.castellani import Castellani
-from tofuse.posegraph.elch import Elch
 from tofuse.posegraph.g2o import read_g2o, write_g2o
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.lu_milios import LuMilios
 
 OPTIMISERS = [LevenbergMarquardt(), Castellani(), LuMilios(), Elch()]
 GRAPH, TRUTH, _ = walk(10, 4)

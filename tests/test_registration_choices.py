@@ -22,37 +22,30 @@ from registration_scenes import (
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
-from tofuse.recordings.frames import CloudFrame
-from tofuse.registration import shape
-from tofuse.registration.icp import Icp
-from tofuse.registration.interfaces import Alignment, History, Matches, Points
-from tofuse.registration.matchers import (
-    ClosestCompatible,
-    ClosestInvariant,
-    ClosestPoint,
-    NormalShooting,
-    Projection,
-    ProjectionSearch,
-)
-from tofuse.registration.metrics import PointToPoint
-from tofuse.registration.rejectors import (
+from tofuse.lab.methods.compatibility import (
     AmplitudeCompatibility,
     Boundary,
     ColorCompatibility,
     CurvatureCompatibility,
-    MaxDistance,
     NormalCompatibility,
     Trimmed,
 )
-from tofuse.registration.selectors import (
-    All,
-    IntensityGradient,
-    NormalSpace,
-    Random,
-    RandomEachIteration,
-    Uniform,
-    Voxel,
+from tofuse.lab.methods.correspondence import (
+    ClosestCompatible,
+    ClosestInvariant,
+    NormalShooting,
+    Projection,
+    ProjectionSearch,
 )
+from tofuse.lab.methods.sampling import IntensityGradient, NormalSpace, RandomEachIteration, Voxel
+from tofuse.recordings.frames import CloudFrame
+from tofuse.registration import shape
+from tofuse.registration.icp import Icp
+from tofuse.registration.interfaces import Alignment, History, Matches, Points
+from tofuse.registration.matchers import ClosestPoint
+from tofuse.registration.metrics import PointToPoint
+from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.selectors import All, Random, Uniform
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane
 

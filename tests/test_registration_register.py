@@ -20,11 +20,11 @@ from registration_scenes import (
 from tofuse.files.ply import read_ply
 from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
+from tofuse.lab.methods.variants import Tricp
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.hold import Hold
 from tofuse.registration.reduce import averaged
 from tofuse.registration.surface_metrics import PointToPlane
-from tofuse.registration.variants import Tricp
 
 
 def source_of(points, T):

@@ -13,6 +13,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
 from tofuse.kernels.threads import threads
+from tofuse.lab.methods.symmetric import Symmetric
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Alignment, Matches, Points
@@ -21,7 +22,7 @@ from tofuse.registration.pairs import loss_weights
 from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
-from tofuse.registration.surface_metrics import PlaneToPlane, PointToPlane, Symmetric
+from tofuse.registration.surface_metrics import PlaneToPlane, PointToPlane
 
 SURFACE_METRICS = [PointToPlane(), Symmetric(), PlaneToPlane()]
 

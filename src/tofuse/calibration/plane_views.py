@@ -16,8 +16,7 @@ from tofuse.geometry.cameras import Camera, points_from_z, ray_lengths
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
-from tofuse.registration.plane_sets import PlaneSets
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.registration.plane_detection import detect_planes
 from tofuse.sensor.noise import NoiseModel
 
 _SEARCHED = 60  # frames at most
@@ -135,13 +134,18 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
         If there are none.
     """
     noise = noise_model_for(recording)
-    finder = PlaneSets(planes=planes, least_share=0.1, thickness=0.01)
     views, camera = [], None
     for frame in recording.images(_SEARCHED):
         camera = camera or frame.camera
         rng = np.random.default_rng([seed, frame.index])
         taken = np.zeros(frame.depth.shape, bool)
-        for found in finder.found(prepare_view(frame, SurfaceOptions()), rng):
+        for found in detect_planes(
+            prepare_view(frame, SurfaceOptions()),
+            rng,
+            max_planes=planes,
+            min_share=0.1,
+            thickness=0.01,
+        ):
             plane = found.normal / found.offset
             mask = _near(frame, plane, noise) & ~taken
             taken |= mask

@@ -7,6 +7,7 @@ turns the pairs into a motion, the *stopping* rule looks at the history. Before 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Protocol, Self
@@ -208,7 +209,7 @@ class Rejector(Protocol):
 
     def reach(self, resolution: float) -> float:
         """Return the distance in m beyond which it drops every pair; infinity if there is none."""
-        ...
+        return math.inf
 
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """Return the pairs that stay, in the same order."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from tofuse.kernels.icp import shortest_of_each_target, transform_points
+from tofuse.kernels.icp import shortest_of_each_target
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches, Rejector
 
@@ -38,17 +35,9 @@ class MaxDistance(Rejector):
         return matches.keep(matches.distance <= self.reach(alignment.resolution))
 
 
-class _Unlimited(Rejector):
-    """A rejector that looks at other things than the distance."""
-
-    def reach(self, resolution: float) -> float:
-        """See `Rejector.reach`."""
-        return math.inf
-
-
 @part("rejector", "unique", label="validated")
 @dataclass(frozen=True)
-class Unique(_Unlimited):
+class Unique(Rejector):
     """Of several pairs with the same target point only the shortest stays (Algorithm 1, line 7).
 
     Of equally short ones the one with the lowest index in the source stays.
@@ -57,146 +46,4 @@ class Unique(_Unlimited):
     def reject(self, matches: Matches, alignment: Alignment) -> Matches:
         """See `Rejector.reject`."""
         keep = shortest_of_each_target(matches.target, matches.distance, len(alignment.target))
-        return matches.keep(keep)
-
-
-@part("rejector", "normal", label="validated")
-@dataclass(frozen=True)
-class NormalCompatibility(_Unlimited):
-    """Drops pairs whose normals point in different directions (Zhang 1994; Pulli 1999).
-
-    Pairs without a normal stay out as well.
-
-    Attributes
-    ----------
-    max_angle_rad
-        Largest angle between the normals, rad; Pulli: 45 degrees.
-    """
-
-    max_angle_rad: float = math.pi / 4
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_angle_rad <= math.pi:
-            raise ValueError(f"max_angle_rad is {self.max_angle_rad}, not 0 to pi")
-
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """See `Rejector.reject`."""
-        turn = np.eye(4)
-        turn[:3, :3] = alignment.T_target_source[:3, :3]
-        a = transform_points(turn, alignment.source.normals[matches.source])
-        b = alignment.target.normals[matches.target]
-        return matches.keep((a * b).sum(1) >= math.cos(self.max_angle_rad))
-
-
-@part("rejector", "curvature", label="validated")
-@dataclass(frozen=True)
-class CurvatureCompatibility(_Unlimited):
-    """Drops pairs where one surface is bent more than the other (section 2.9.4).
-
-    Attributes
-    ----------
-    tolerance
-        Largest difference of the mean curvatures times the resolution.
-    """
-
-    tolerance: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance is {self.tolerance}, not more than 0")
-
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """See `Rejector.reject`."""
-        a = alignment.source.shape.curvature[matches.source]
-        b = alignment.target.shape.curvature[matches.target]
-        return matches.keep(np.abs(a - b) * alignment.resolution <= self.tolerance)
-
-
-@part("rejector", "amplitude", label="validated")
-@dataclass(frozen=True)
-class AmplitudeCompatibility(_Unlimited):
-    """Drops pairs of different amplitude (Godin et al. 1994); needs amplitude in both views.
-
-    Attributes
-    ----------
-    ratio
-        Largest ratio of the amplitudes, more than 1.
-    """
-
-    ratio: float = 1.5
-
-    def __post_init__(self) -> None:
-        if not self.ratio > 1:
-            raise ValueError(f"ratio is {self.ratio}, not more than 1")
-
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """See `Rejector.reject`."""
-        a = alignment.source.amplitude[matches.source]
-        b = alignment.target.amplitude[matches.target]
-        return matches.keep((a > 0) & (b > 0) & (a <= self.ratio * b) & (b <= self.ratio * a))
-
-
-@part("rejector", "color", label="validated")
-@dataclass(frozen=True)
-class ColorCompatibility(_Unlimited):
-    """Drops pairs of different colour (Pulli 1999); needs colour in both views.
-
-    Attributes
-    ----------
-    tolerance
-        Largest distance of the colours in RGB, where black and white lie sqrt(3) apart.
-    """
-
-    tolerance: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance is {self.tolerance}, not more than 0")
-
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """See `Rejector.reject`."""
-        gap = alignment.source.color[matches.source] - alignment.target.color[matches.target]
-        return matches.keep((gap * gap).sum(1) <= self.tolerance**2)
-
-
-@part("rejector", "boundary", label="validated")
-@dataclass(frozen=True)
-class Boundary(_Unlimited):
-    """Drops pairs whose target point is where its surface ends (Turk and Levoy 1994).
-
-    Where the views overlap in part, all points beyond the overlap are closest to its edge, and
-    would pull the source towards the target.
-    """
-
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """See `Rejector.reject`."""
-        return matches.keep(~alignment.target.shape.boundary[matches.target])
-
-
-@part("rejector", "trimmed", label="validated")
-@dataclass(frozen=True)
-class Trimmed(_Unlimited):
-    """Keeps the shortest pairs, as many as the source has points in the overlap (TrICP).
-
-    Chetverikov, Stepanov and Krsek (2005). Of equally short pairs the first stay.
-
-    Attributes
-    ----------
-    share
-        The overlap: a share of all of the source's points that take part.
-    """
-
-    share: float = 0.8
-
-    def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise ValueError(f"share is {self.share}, not more than 0 and at most 1")
-
-    def reject(self, matches: Matches, alignment: Alignment) -> Matches:
-        """See `Rejector.reject`."""
-        count = int(self.share * len(alignment.source))
-        if count >= len(matches):
-            return matches
-        keep = np.zeros(len(matches), bool)
-        keep[np.argsort(matches.distance, kind="stable")[:count]] = True
         return matches.keep(keep)

@@ -1,20 +1,17 @@
-"""Error metrics that know the surfaces: point-to-plane, symmetric, plane-to-plane."""
+"""Error metrics that know the surfaces: point-to-plane, plane-to-plane."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from tofuse.arrays import Float64
-from tofuse.geometry import se3
 from tofuse.kernels.cloud_sums import (
     matrix_sums,
     plane_sums,
     plane_to_plane_weights,
-    symmetric_sums,
 )
 from tofuse.parts import part
 from tofuse.registration.interfaces import Alignment, Matches, Metric
@@ -115,59 +112,6 @@ class PointToPlane(TangentPlanes):
     def weights(self, residual: Float64, resolution: float) -> Float64:
         """See `TangentPlanes.weights`."""
         return loss_weights(self.loss, residual, resolution)
-
-
-@part("metric", "symmetric", label="validated")
-@dataclass(frozen=True)
-class Symmetric(SurfaceMetric):
-    """Distances along the sum of both normals (Rusinkiewicz 2019).
-
-    ``sum w_i ((R p_i - R^-1 q_i + t) . (n_pi + n_qi))^2``: half of the rotation is given to each
-    view. It is zero wherever two points and their normals lie on one circle, so that curved
-    surfaces may slide along themselves, and converges faster and from further away than
-    point-to-plane.
-
-    Attributes
-    ----------
-    loss
-        "square" as in the paper; "huber", "cauchy" or "tukey" count large residuals less.
-    """
-
-    loss: Loss = "square"
-
-    def motion(self, matches: Matches, alignment: Alignment) -> Float64:
-        """See `Metric.motion`; no motion along directions that no plane holds."""
-        pairs = surface_pairs(matches, alignment, source=True)
-        n = pairs.source_normals + pairs.target_normals
-        r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
-        # p and q in one frame, that of the source; centred between both.
-        p = pairs.points
-        q = p - pairs.residual
-        centre = (p.mean(0) + q.mean(0)) / 2
-        H, g = symmetric_sums(p - centre, q - centre, n, weight)
-        x = solve(H, g, 2 * pairs.size)
-        tangent = float(np.linalg.norm(x[3:]))
-        angle = math.atan(tangent)
-        half = np.eye(4)
-        if tangent > 0:
-            half[:3, :3] = se3.so3_exp(x[3:] * (angle / tangent))
-        shift, to, back = np.eye(4), np.eye(4), np.eye(4)
-        shift[:3, 3] = x[:3] * math.cos(angle)
-        to[:3, 3] = pairs.centre + centre
-        back[:3, 3] = -to[:3, 3]
-        T = pairs.T_target_source
-        return T @ to @ half @ shift @ half @ back @ se3.inverse(T)
-
-    def fit(self, pairs: SurfacePairs) -> tuple[Float64, float]:
-        """See `SurfaceMetric.fit`: along the mean normal."""
-        n = pairs.source_normals + pairs.target_normals
-        n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
-        r = (pairs.residual * n).sum(1)
-        weight = pairs.weight * loss_weights(self.loss, r, pairs.resolution)
-        H, _, square = plane_sums(pairs.points, n, n, r, weight)
-        variance = variance_of(square, weight, pairs.resolution)
-        return H / variance, variance
 
 
 @part("metric", "gicp", label="validated")

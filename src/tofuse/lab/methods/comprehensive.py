@@ -9,13 +9,13 @@ from typing import ClassVar
 import numpy as np
 
 from tofuse.kernels.kdtree import KdTree
+from tofuse.lab.methods.variants import Variant
 from tofuse.parts import part
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, Search
 from tofuse.registration.metrics import PointToPoint
 from tofuse.registration.selectors import All, Random
 from tofuse.registration.stopping import SmallStep
-from tofuse.registration.variants import Variant
 
 # Neighbours that a point asks for at first; it asks for twice as many when all are taken.
 _FIRST = 8

@@ -12,10 +12,11 @@ from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
+from tofuse.lab.methods.compatibility import Boundary
 from tofuse.lab.methods.multiview import Cloud, Pairs, Relaxing, resolution_of, rotation_to
 from tofuse.parts import part
 from tofuse.registration.icp import Icp
-from tofuse.registration.rejectors import Boundary, MaxDistance
+from tofuse.registration.rejectors import MaxDistance
 from tofuse.registration.selectors import All
 from tofuse.registration.stopping import SmallStep
 from tofuse.registration.surface_metrics import PointToPlane

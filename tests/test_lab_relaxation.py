@@ -7,11 +7,11 @@ import pytest
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
+from tofuse.lab.methods.elch import Elch
+from tofuse.lab.methods.lu_milios import LuMilios, solve_linear
 from tofuse.posegraph.build import Measured, build_graph, chain
-from tofuse.posegraph.elch import Elch
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.lu_milios import LuMilios, solve_linear
 from tofuse.posegraph.sparse import PairSystem
 
 

@@ -9,10 +9,11 @@ import tofuse
 from test_registration_search import TRUE, A, B, error, seen
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
-from tofuse.recordings.frames import CloudFrame
-from tofuse.registration.features import Features
-from tofuse.registration.plane_sets import PlaneSets
+from tofuse.lab.methods.features import Features
+from tofuse.lab.methods.plane_sets import PlaneSets
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
+from tofuse.recordings.frames import CloudFrame
+from tofuse.registration.plane_detection import detect_planes
 
 WORLD = [((0, 1, 0), 1.0), ((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)]
 
@@ -29,7 +30,7 @@ def in_view(T_world_camera):
 
 def test_planes_of_a_view_are_those_of_the_scene():
     view = prepare_view(seen(A, seed=1), SurfaceOptions())
-    found = PlaneSets().found(view, np.random.default_rng(0))
+    found = detect_planes(view, np.random.default_rng(0))
     assert len(found) >= 3
     assert [p.share for p in found[:3]] == sorted((p.share for p in found[:3]), reverse=True)
     planes = np.array([[*p.normal, p.offset] for p in found])

@@ -11,14 +11,9 @@ from registration_scenes import bumpy_ball, error, relief, rng, stone, turn, vie
 from tofuse import parts
 from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
-from tofuse.registration.base import Registrar
-from tofuse.registration.coarse_to_fine import InTurn
-from tofuse.registration.icp import Icp
-from tofuse.registration.matchers import ClosestInvariant
-from tofuse.registration.rejectors import AmplitudeCompatibility, MaxDistance
-from tofuse.registration.selectors import All, Random
-from tofuse.registration.stopping import SmallStep
-from tofuse.registration.variants import (
+from tofuse.lab.methods.compatibility import AmplitudeCompatibility
+from tofuse.lab.methods.correspondence import ClosestInvariant
+from tofuse.lab.methods.variants import (
     GeneralizedIcp,
     Iccp,
     Icpif,
@@ -26,6 +21,12 @@ from tofuse.registration.variants import (
     SymmetricIcp,
     Tricp,
 )
+from tofuse.registration.base import Registrar
+from tofuse.registration.coarse_to_fine import InTurn
+from tofuse.registration.icp import Icp
+from tofuse.registration.rejectors import MaxDistance
+from tofuse.registration.selectors import All, Random
+from tofuse.registration.stopping import SmallStep
 
 
 def vanilla(resolution, points, steps=100):

@@ -9,20 +9,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from tofuse.arrays import Bool, Float64
+from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
-from tofuse.registration.view_points import ViewPoints
+from tofuse.registration.plane_detection import Plane, detect_planes
 
-# Points of a view, and points from which planes are tried in each round of RANSAC.
-_POINTS, _TRIED = 3000, 150
-# Angle between the normals of a point and of the plane that it lies on, rad.
-_SAME_WAY = 0.35
 # Sine of the angle that two normals must differ by to fix a rotation, and volume that three must
 # span to fix a point.
 _ACROSS, _SPANNED = 0.3, 0.15
@@ -30,28 +25,6 @@ _ACROSS, _SPANNED = 0.3, 0.15
 _JUDGED = 15
 # A direction that the normals share less than this of (mean square) is not held.
 _HELD = 0.005
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """A plane ``normal . p = offset`` in a view.
-
-    Attributes
-    ----------
-    normal
-        (3,) unit, away from the camera.
-    offset
-        m, above 0.
-    share
-        Of the view's points, those on it.
-    rms_m
-        Distance of these from it.
-    """
-
-    normal: Float64
-    offset: float
-    share: float
-    rms_m: float
 
 
 @part("registration", "planes")
@@ -105,7 +78,7 @@ class PlaneSets(Registrar):
             If a view has no plane, or the images contradict all poses.
         """
         s, t = self._prepared(source), self._prepared(target)
-        a, b = self.found(s, rng), self.found(t, rng)
+        a, b = self._planes(s, rng), self._planes(t, rng)
         for view, planes in ((source, a), (target, b)):
             if not planes:
                 raise RegistrationError("has no planes", where=f"frame {view.index}")
@@ -131,34 +104,15 @@ class PlaneSets(Registrar):
             raise RegistrationError("is no image", where=f"frame {view.index}")
         return prepare_view(view, self.surface)
 
-    def found(self, view: PreparedView, rng: np.random.Generator) -> list[Plane]:
-        """Planes of a view by RANSAC, the largest first.
-
-        A point and its normal make a plane; of those tried, that with the most points on it is
-        fitted to them, by weighted least squares, and taken away.
-        """
-        seen = ViewPoints.of(view, _POINTS)
-        p, n = seen.points.astype(float), seen.normals.astype(float)
-        within = self.sigmas * seen.sigma.astype(float) + self.thickness * p[:, 2]
-        weight = 1 / within**2
-        left = np.ones(len(p), bool)
-        planes: list[Plane] = []
-        while len(planes) < self.planes and left.sum() >= max(3, self.least_share * len(p)):
-            tried = rng.choice(np.flatnonzero(left), min(_TRIED, int(left.sum())), replace=False)
-            offsets = (p[tried] * n[tried]).sum(1)
-            on = _on(p, n, within, n[tried], offsets) & left
-            mine = on[int(np.argmax(on.sum(1)))]
-            for _ in range(3):
-                normal, offset = _fitted(p[mine], weight[mine])
-                mine = _on(p, n, within, normal[None], np.array([offset]))[0] & left
-                if mine.sum() < 3:
-                    break
-            if mine.sum() < max(3, self.least_share * len(p)):
-                break
-            left &= ~mine
-            rms = float(np.sqrt(((p[mine] @ normal - offset) ** 2).mean()))
-            planes.append(Plane(normal, offset, float(mine.mean()), rms))
-        return planes
+    def _planes(self, view: PreparedView, rng: np.random.Generator) -> list[Plane]:
+        return detect_planes(
+            view,
+            rng,
+            max_planes=self.planes,
+            min_share=self.least_share,
+            sigmas=self.sigmas,
+            thickness=self.thickness,
+        )
 
     def _poses(
         self, a: list[Plane], b: list[Plane], guess: Float64, depth: float
@@ -239,21 +193,6 @@ class PlaneSets(Registrar):
             unobservable=free,
             margin=margin,
         )
-
-
-def _on(p: Float64, n: Float64, within: Float64, normals: Float64, offsets: Float64) -> Bool:
-    """(K, N) which points lie on each of K planes."""
-    near = np.abs(normals @ p.T - offsets[:, None]) < within
-    return near & (normals @ n.T > np.cos(_SAME_WAY))
-
-
-def _fitted(p: Float64, weight: Float64) -> tuple[Float64, float]:
-    """Weighted least squares plane, its normal away from the camera."""
-    mean = weight @ p / weight.sum()
-    q = (p - mean) * np.sqrt(weight)[:, None]
-    normal = np.linalg.eigh(q.T @ q)[1][:, 0]
-    offset = float(mean @ normal)
-    return (normal, offset) if offset > 0 else (-normal, -offset)
 
 
 def _rotations(a: Float64, b: Float64, guess: Float64, tolerance: float) -> Iterator[Float64]:

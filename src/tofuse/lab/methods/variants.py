@@ -9,18 +9,20 @@ from typing import Protocol
 import numpy as np
 
 from tofuse.arrays import Float64
+from tofuse.lab.methods.compatibility import Trimmed
+from tofuse.lab.methods.correspondence import ClosestCompatible, ClosestInvariant, Invariant
+from tofuse.lab.methods.symmetric import Symmetric
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.coarse_to_fine import InTurn
 from tofuse.registration.icp import Icp
 from tofuse.registration.interfaces import Metric
-from tofuse.registration.matchers import ClosestCompatible, ClosestInvariant, Invariant
 from tofuse.registration.metrics import PointToPoint
-from tofuse.registration.rejectors import MaxDistance, Trimmed, Unique
+from tofuse.registration.rejectors import MaxDistance, Unique
 from tofuse.registration.selectors import All, at_most
 from tofuse.registration.stopping import SmallStep
-from tofuse.registration.surface_metrics import PlaneToPlane, PointToPlane, Symmetric
+from tofuse.registration.surface_metrics import PlaneToPlane, PointToPlane
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 

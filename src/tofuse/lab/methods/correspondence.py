@@ -1,0 +1,275 @@
+"""Matchers of the literature: normal shooting, projection, features (section 2.9.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from tofuse.arrays import Float64, Int64
+from tofuse.errors import RegistrationError
+from tofuse.kernels.cloud_matching import grid_search
+from tofuse.kernels.icp import transform_points
+from tofuse.kernels.kdtree import KdTree
+from tofuse.parts import part
+from tofuse.recordings.frames import RangeFrame
+from tofuse.registration.interfaces import Alignment, Matcher, Matches, Points, Search
+from tofuse.registration.shape import tree_of
+
+Invariant = Literal["curvature", "moments"]
+
+# Lines this close to a tangent plane (cosine) never meet it in a useful place.
+_GRAZING = 0.1
+
+
+@part("matcher", "normal-shooting", label="validated")
+@dataclass(frozen=True)
+class NormalShooting(Matcher):
+    """Where the normal of a source point meets the target's surface (Chen and Medioni 1992).
+
+    The surface is only known at points, so the meeting point is approached as in the paper: the
+    line is cut with the tangent plane of the closest target point, then with that of the point
+    closest to the cut, and so on. The target point closest to the last cut is taken.
+
+    Attributes
+    ----------
+    steps
+        Tangent planes that are tried.
+    """
+
+    steps: int = 3
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"steps is {self.steps}, not 1 or more")
+
+    def prepare(self, target: Points) -> Search:
+        """Build the tree, once for all iterations: the target doesn't move."""
+        return _NormalSearch(KdTree(target.points), self.steps)
+
+
+@dataclass(frozen=True, eq=False)
+class _NormalSearch:
+    tree: KdTree
+    steps: int
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        start, target = alignment.moved, alignment.target
+        turn = np.eye(4)
+        turn[:3, :3] = alignment.T_target_source[:3, :3]
+        line = transform_points(turn, alignment.source.normals)
+        at = start
+        index, _ = self.tree.nearest(at, reach)
+        for _ in range(self.steps):
+            safe = np.maximum(index, 0)
+            n = target.normals[safe]
+            slope = (line * n).sum(1)
+            good = (index >= 0) & (np.abs(slope) > _GRAZING)
+            slope = np.where(good, slope, 1.0)
+            along = ((target.points[safe] - start) * n).sum(1) / slope
+            at = np.where(good[:, None], start + along[:, None] * line, np.nan)
+            index, _ = self.tree.nearest(at, reach)
+        source = np.flatnonzero(index >= 0)
+        index = index[source]
+        gap = start[source] - target.points[index]
+        distance = np.sqrt((gap * gap).sum(1))
+        return Matches(source, index, distance).keep(distance <= reach)
+
+
+@part("matcher", "projection", label="validated")
+@dataclass(frozen=True)
+class Projection(Matcher):
+    """The target point on the pixel that a source point falls on ("reverse calibration").
+
+    Blais and Levine (1995). Needs a target with a camera, best with all of its points.
+    """
+
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def prepare(self, target: Points) -> Search:
+        """Find the point of each pixel."""
+        return _GridSearch(*_grid(target), 0)
+
+
+@part("matcher", "projection-search", label="validated")
+@dataclass(frozen=True)
+class ProjectionSearch(Matcher):
+    """The closest point near the pixel that a source point falls on (section 2.9.3).
+
+    From the closest of the pixels within `radius` the search goes on round that one, until none
+    is closer. Needs a target with a camera.
+
+    Attributes
+    ----------
+    radius
+        Pixels.
+    """
+
+    radius: int = 2
+    takes: ClassVar[frozenset[str]] = frozenset({"range"})
+
+    def __post_init__(self) -> None:
+        if self.radius < 1:
+            raise ValueError(f"radius is {self.radius}, not 1 or more")
+
+    def prepare(self, target: Points) -> Search:
+        """Find the point of each pixel."""
+        return _GridSearch(*_grid(target), self.radius)
+
+
+def _grid(target: Points) -> tuple[RangeFrame, Int64]:
+    view = target.view
+    if not isinstance(view, RangeFrame):
+        raise RegistrationError(
+            "is a cloud without a camera: points can't be projected into it",
+            where=f"frame {view.index}",
+            remedy="use the matcher 'closest-point'",
+        )
+    grid = np.full(view.valid.shape, -1, np.int64)
+    pixels = np.flatnonzero(view.valid)[target.index]
+    grid.ravel()[pixels] = np.arange(len(target))
+    return view, grid
+
+
+@dataclass(frozen=True, eq=False)
+class _GridSearch:
+    view: RangeFrame
+    grid: Int64
+    radius: int
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        moved = alignment.moved
+        pixels = np.ascontiguousarray(self.view.camera.project(moved))
+        index = np.empty(len(moved), np.int64)
+        squared = np.empty(len(moved))
+        grid_search(self.grid, alignment.target.points, moved, pixels, self.radius, index, squared)
+        source = np.flatnonzero(squared <= reach * reach)
+        return Matches(source, index[source], np.sqrt(squared[source]))
+
+
+@part("matcher", "closest-compatible", label="validated")
+@dataclass(frozen=True)
+class ClosestCompatible(Matcher):
+    """The closest target point of like amplitude (ICCP: Godin, Rioux and Baribeau 1994).
+
+    Points are compatible if their amplitudes differ by less than a factor. The search passes over
+    the others, where a rejector would lose the pair.
+
+    Attributes
+    ----------
+    ratio
+        Largest ratio of two compatible amplitudes, more than 1.
+    """
+
+    ratio: float = 1.2
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if not self.ratio > 1:
+            raise ValueError(f"ratio is {self.ratio}, not more than 1")
+
+    def prepare(self, target: Points) -> Search:
+        """Build the tree, once for all iterations."""
+        return _CompatibleSearch(
+            KdTree(target.points), _log_amplitude(target), float(np.log(self.ratio))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _CompatibleSearch:
+    tree: KdTree
+    features: Float64
+    tolerance: float
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        # Amplitudes choose; among the compatible only the distance in space counts.
+        asked = _log_amplitude(alignment.source)
+        index, squared = self.tree.nearest_featured(
+            alignment.moved, self.features, asked, self.tolerance, reach, 0.0
+        )
+        source = np.flatnonzero(index >= 0)
+        return Matches(source, index[source], np.sqrt(squared[source]))
+
+
+def _log_amplitude(points: Points) -> Float64:
+    """(n, 1) logarithm of the amplitude; NaN, which matches nothing, where there is none."""
+    amplitude = points.amplitude
+    return np.log(np.where(amplitude > 0, amplitude, np.nan))[:, None]
+
+
+@part("matcher", "closest-invariant", label="validated")
+@dataclass(frozen=True)
+class ClosestInvariant(Matcher):
+    """The target point closest in space and in invariant features (ICPIF: Sharp et al. 2002).
+
+    Least is ``|p - q|^2 + sum (a_k (f_k - g_k))^2``. The features don't change when a view is
+    moved: mean curvature, or the three eigenvalues of the second moments of the surface in a ball
+    (whose symmetric functions are the paper's moment invariants J1 to J3). They are scaled by
+    their mean absolute deviation over the target, and their weight is in resolutions.
+
+    Attributes
+    ----------
+    features
+        Which: "curvature", "moments".
+    weight
+        Distance, in resolutions, that counts as much as one deviation of a feature.
+    radius
+        Of the ball for moments, in resolutions.
+    """
+
+    features: tuple[Invariant, ...] = ("moments",)
+    weight: float = 20.0
+    radius: float = 6.0
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
+
+    def __post_init__(self) -> None:
+        if not self.features:
+            raise ValueError("features is empty")
+        if not (self.weight > 0 and self.radius > 0):
+            raise ValueError("weight or radius is not more than 0")
+
+    def prepare(self, target: Points) -> Search:
+        """Build the tree, once for all iterations."""
+        return _InvariantSearch(self, KdTree(target.points), {})
+
+
+@dataclass(frozen=True, eq=False)
+class _InvariantSearch:
+    options: ClosestInvariant
+    tree: KdTree
+    # Features of both views, as found at the first matching; those of the source by its identity.
+    known: dict[str, tuple[Points, Float64]]
+
+    def match(self, alignment: Alignment, reach: float) -> Matches:
+        of_target = self._features("target", alignment.target, alignment.resolution)
+        of_source = self._features("source", alignment.source, alignment.resolution)
+        spread = np.array([_mean_deviation(column) for column in of_target.T])
+        by = self.options.weight * alignment.resolution / (spread * np.sqrt(of_target.shape[1]))
+        index, squared = self.tree.nearest_featured(
+            alignment.moved, of_target * by, of_source * by, np.inf, reach
+        )
+        source = np.flatnonzero(index >= 0)
+        return Matches(source, index[source], np.sqrt(squared[source]))
+
+    def _features(self, which: str, points: Points, resolution: float) -> Float64:
+        if which in self.known and self.known[which][0] is points:
+            return self.known[which][1]
+        columns = []
+        for feature in self.options.features:
+            if feature == "curvature":
+                columns.append(points.shape.curvature[:, None] * resolution)
+            else:
+                radius = self.options.radius * resolution
+                moments = tree_of(points.view).moments(points.points, radius)
+                columns.append(moments / radius**2)
+        self.known[which] = (points, np.concatenate(columns, 1))
+        return self.known[which][1]
+
+
+def _mean_deviation(column: Float64) -> float:
+    """Mean absolute deviation from the median of the values that aren't NaN; 1 if it is nil."""
+    column = column[np.isfinite(column)]
+    deviation = float(np.abs(column - np.median(column)).mean()) if len(column) else 0.0
+    return deviation or 1.0

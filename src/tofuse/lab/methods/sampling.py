@@ -1,0 +1,164 @@
+"""Selectors of the literature: which points of a view ICP uses (section 2.9.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from tofuse.arrays import Float64, Int64
+from tofuse.errors import RegistrationError
+from tofuse.parts import part
+from tofuse.recordings.frames import Frame, RangeFrame
+from tofuse.registration.interfaces import Selector
+from tofuse.registration.selectors import Random
+from tofuse.registration.shape import NEIGHBOURS, normals_at
+
+
+@part("selector", "random-each-iteration", label="validated")
+@dataclass(frozen=True)
+class RandomEachIteration(Random):
+    """A random subset, another one at each iteration (Masuda, Sakaue and Yokoya 1996).
+
+    Attributes
+    ----------
+    points
+        How many; a view with fewer gives all it has.
+    """
+
+    each_iteration: ClassVar[bool] = True
+
+
+@part("selector", "voxel", label="validated")
+@dataclass(frozen=True)
+class Voxel(Selector):
+    """One point in each cube of space, that closest to its middle: evenly spread over surfaces.
+
+    Attributes
+    ----------
+    size
+        Edge of the cubes in m.
+    """
+
+    size: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not self.size > 0:
+            raise ValueError(f"size is {self.size}, not more than 0")
+
+    def select(self, view: Frame, rng: np.random.Generator) -> Int64:
+        """See `Selector.select`; draws nothing."""
+        points = view.points.astype(np.float64) / self.size
+        cell = np.floor(points)
+        off = ((points - cell - 0.5) ** 2).sum(1)
+        order = np.lexsort((off, cell[:, 2], cell[:, 1], cell[:, 0]))
+        cell = cell[order]
+        first = np.ones(len(order), bool)
+        first[1:] = (cell[1:] != cell[:-1]).any(1)
+        return np.sort(order[first])
+
+
+@part("selector", "normal-space", label="validated")
+@dataclass(frozen=True)
+class NormalSpace(Selector):
+    """Points whose normals are spread as evenly as can be (Rusinkiewicz and Levoy 2001).
+
+    Normals are sorted into buckets of like direction, and points are drawn from one bucket after
+    the other, at random, so that small features with rare directions are not outvoted by large
+    flat surfaces. Points without a normal are left out.
+
+    Attributes
+    ----------
+    points
+        How many.
+    buckets
+        Along each side of a cube's faces, 6 buckets^2 in all.
+    neighbours
+        Points of each plane fit, where the view brings no normals.
+    """
+
+    points: int = 1000
+    buckets: int = 8
+    neighbours: int = NEIGHBOURS
+
+    def __post_init__(self) -> None:
+        if self.points < 1 or self.buckets < 1:
+            raise ValueError("points or buckets is not 1 or more")
+        if self.neighbours < 3:
+            raise ValueError(f"neighbours is {self.neighbours}, not 3 or more")
+
+    def select(self, view: Frame, rng: np.random.Generator) -> Int64:
+        """See `Selector.select`."""
+        normals = normals_at(view, np.arange(len(view)), self.neighbours)
+        usable = np.flatnonzero(np.isfinite(normals).all(1))
+        if len(usable) <= self.points:
+            return usable
+        order = rng.permutation(len(usable))
+        bucket = _bucket(normals[usable[order]], self.buckets)
+        # The k-th draw from every bucket comes before the (k + 1)-th from any.
+        by_bucket = np.argsort(bucket, kind="stable")
+        counts = np.bincount(bucket)
+        starts = np.cumsum(counts) - counts
+        turn = np.empty(len(usable), np.int64)
+        turn[by_bucket] = np.arange(len(usable)) - np.repeat(starts, counts)
+        chosen = np.argsort(turn, kind="stable")[: self.points]
+        return np.sort(usable[order[chosen]])
+
+
+def _bucket(normals: Float64, side: int) -> Int64:
+    """Cell (n,) of a cube map with side^2 cells on each face."""
+    n = np.arange(len(normals))
+    axis = np.abs(normals).argmax(1)
+    height = normals[n, axis]
+    # Equal steps of the angle, not of its tangent.
+    u = np.arctan(normals[n, (axis + 1) % 3] / np.abs(height)) / (np.pi / 2) + 0.5
+    v = np.arctan(normals[n, (axis + 2) % 3] / np.abs(height)) / (np.pi / 2) + 0.5
+    i = np.clip((u * side).astype(np.int64), 0, side - 1)
+    j = np.clip((v * side).astype(np.int64), 0, side - 1)
+    return ((2 * axis + (height > 0)) * side + i) * side + j
+
+
+@part("selector", "intensity-gradient", label="validated")
+@dataclass(frozen=True)
+class IntensityGradient(Selector):
+    """The points where the amplitude changes most (Weik 1997).
+
+    The gradient is that of the amplitude's logarithm between the neighbours of a pixel, all of
+    which must be valid. Needs a range image with amplitude.
+
+    Attributes
+    ----------
+    points
+        How many.
+    """
+
+    points: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.points < 1:
+            raise ValueError(f"points is {self.points}, not 1 or more")
+
+    def select(self, view: Frame, rng: np.random.Generator) -> Int64:
+        """See `Selector.select`; draws nothing.
+
+        Raises
+        ------
+        RegistrationError
+            If the view has no camera or no amplitude.
+        """
+        if not isinstance(view, RangeFrame) or view.amplitude_image is None:
+            raise RegistrationError(
+                "has no amplitude image, by whose gradient points are chosen",
+                where=f"frame {view.index}",
+                remedy="use the selector 'random'",
+            )
+        usable = view.valid & (view.amplitude_image > 0)
+        image = np.where(usable, np.log(np.where(usable, view.amplitude_image, 1)), np.nan)
+        gradient = np.zeros(image.shape)
+        gradient[1:-1, 1:-1] = np.hypot(
+            image[1:-1, 2:] - image[1:-1, :-2], image[2:, 1:-1] - image[:-2, 1:-1]
+        )
+        strength = np.nan_to_num(gradient[view.valid], nan=0.0)
+        order = np.argsort(-strength, kind="stable")[: self.points]
+        return np.sort(order[strength[order] > 0])
