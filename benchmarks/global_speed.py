@@ -34,7 +34,7 @@ from tofuse.pipeline.config import from_method
 from tofuse.pipeline.mapper import Mapper
 from tofuse.pipeline.progress import Stopwatch
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
+from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, overlaps
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView, prepare_view
 from tofuse.registration.search import SearchOptions, search

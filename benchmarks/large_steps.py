@@ -33,10 +33,10 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.plane_sets import PlaneSets
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.fpfh import Fpfh
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.search import SearchOptions
 from tofuse.registration.view_pair import register_pair
 

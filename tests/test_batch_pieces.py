@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from test_posegraph_refine import drifted, path, surfaces
+from test_posegraph_joint_alignment import drifted, path, surfaces
 from test_posegraph_revisits import ALL, pushed, turn  # noqa: F401 - a fixture
 from test_posegraph_submaps import refined
 from tofuse.batch import client

@@ -13,8 +13,8 @@ from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.methods.features import Features
 from tofuse.lab.methods.keypoints import keypoints, light_image
-from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.recordings.frames import CloudFrame, RangeFrame
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,

@@ -16,7 +16,7 @@ from tofuse.lab.methods.multiview import Cloud, Pairs, relaxed, squared_error
 from tofuse.lab.methods.pulli import Pulli, spread
 from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, corresponding
 from tofuse.posegraph.refinement import Refining
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.prepared_view import PreparedView
 
 METHODS = [Bergevin(), Pulli(), WilliamsBennamoun(), SmallAngles()]

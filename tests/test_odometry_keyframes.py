@@ -418,7 +418,10 @@ def test_clouds_are_refused():
         ("surface.radii", [2, 1000000]),
         ("surface.fill", float("nan")),
         ("alignment.levels", []),
-        ("alignment.levels", [{"stride": 0, "iterations": 1, "slack_m": 0, "photo_slack": 0}]),
+        (
+            "alignment.levels",
+            [{"stride": 0, "iterations": 1, "inflation_m": 0, "photometric_inflation": 0}],
+        ),
         ("alignment.robust", 0),
         ("alignment.prior_m", -1),
         ("unusual", 0),

@@ -244,7 +244,7 @@ FORGED: dict[str, object] = {
     ],
     "attributes more": [
         ["tuple", [1]],
-        ["object", "tofuse.posegraph.views.Spacing", "__class__", 1],
+        ["object", "tofuse.posegraph.view_store.Spacing", "__class__", 1],
     ],
     "an odd table": [["list", [1]], ["dict", 1]],
     "a list as a key": [["list", [1]], ["dict", [2], 1], ["list"]],

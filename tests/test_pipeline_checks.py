@@ -13,10 +13,10 @@ from tofuse.geometry import se3
 from tofuse.pipeline.checks import Evidence, judge, stretches
 from tofuse.posegraph.accuracy import Accuracy, Shown, accuracy_of
 from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.calibration_check import CalibrationCheck, Gap
+from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import GraphPart, LoopRecord, Optimisation
-from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import Gap, Suspicion
 from tofuse.registration.base import Registration
 from tofuse.results.types import Component, FrameRecord, Reason
 from tofuse.results.verdict import ADVICE, REASONS, ranked, verdict_of
@@ -176,7 +176,7 @@ CASES = {
         gaps=(),
         sigma=(0.001, 0.001),
         refinement=Refinement(
-            np.zeros((9, 4, 4)), True, 9, 20, suspicion=Suspicion(focal_sigma=0.05)
+            np.zeros((9, 4, 4)), True, 9, 20, calibration_check=CalibrationCheck(focal_sigma=0.05)
         ),
     ),
     "not_improved": evidence(parts=(GraphPart(0, 9, 9, 1.0, 1.0, True),)),
@@ -191,7 +191,7 @@ CASES = {
     "stood_still": evidence(steps=[(0.001 * (k % 2), 0, 0, 0, 0, 0) for k in range(9)]),
     "single_frame": evidence(("tracked",)),
     "sensor_differs": replace(
-        evidence(), outside=(OutsideRecord("odometry", 8, 0, None, "it was not used"),)
+        evidence(), outside=(SensorRecord("odometry", 8, 0, None, "it was not used"),)
     ),
     "loop_rejected": evidence(rejected=[(1, 7)], given=[(1, 7)]),
     "disconnected": in_components(apart((7, 8))),
@@ -519,24 +519,24 @@ def test_loops_given_by_hand_are_listed_once() -> None:
 
 def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
     """A note: the verdict stays, as a camera's factory calibration is usually right."""
-    found = Suspicion(False, {"focal": -0.05}, {"focal": 0.003}, focal_sigma=0.003)
-    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, suspicion=found)
+    found = CalibrationCheck(False, {"focal": -0.05}, {"focal": 0.003}, focal_sigma=0.003)
+    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
-    def said(suspicion: Suspicion) -> list[str]:
-        told = replace(refinement, suspicion=suspicion)
+    def said(suspicion: CalibrationCheck) -> list[str]:
+        told = replace(refinement, calibration_check=suspicion)
         case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=told)
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
     (text,) = said(found)
     assert "a focal length 5.3% larger, but no loop closure confirms it" in text
-    (text,) = said(Suspicion(focal_sigma=0.02))
+    (text,) = said(CalibrationCheck(focal_sigma=0.02))
     assert "does not determine the camera's focal length" in text
     small = Gap(2, 7, (0.006, 0.005), (0.006, 0.008))  # too small to tell
     assert said(replace(found, gap=small)) == said(found)
     gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02))
     for quiet in (
-        Suspicion(focal_sigma=0.001),  # determined, and as stated
-        Suspicion(),  # not asked: too few views
+        CalibrationCheck(focal_sigma=0.001),  # determined, and as stated
+        CalibrationCheck(),  # not asked: too few views
         replace(found, errors={"focal": -0.005}),  # within what a calibration is good to
         replace(found, gap=gap),  # a loop speaks against it
         replace(found, alarm=True, gap=gap),  # which is an alarm
@@ -546,8 +546,10 @@ def test_a_calibration_that_no_loop_confirms_is_noted() -> None:
 
 def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
     gap = Gap(2, 7, (0.33, 0.2), (0.09, 0.05))
-    found = Suspicion(True, {"focal": -0.05, "offset": -0.03}, {"focal": 0.003}, (0.6, 0.7), gap)
-    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, suspicion=found)
+    found = CalibrationCheck(
+        True, {"focal": -0.05, "offset": -0.03}, {"focal": 0.003}, (0.6, 0.7), gap
+    )
+    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
     case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=refinement)
     verdict, reasons = judge(case)
     assert verdict == "degraded"
@@ -556,5 +558,7 @@ def test_what_all_views_say_of_the_camera_is_told_with_its_cure() -> None:
     for words in ("330 mm", "11.5°", "focal length 5.3% larger", "ranges 30 mm shorter"):
         assert words in alarm.text
     # Without an alarm nothing is said.
-    calm = replace(case, refinement=replace(refinement, suspicion=replace(found, alarm=False)))
+    calm = replace(
+        case, refinement=replace(refinement, calibration_check=replace(found, alarm=False))
+    )
     assert "calibration_alarm" not in [r.code for r in judge(calm)[1]]

@@ -14,7 +14,7 @@ from tofuse.files.trajectory import write_tum
 from tofuse.geometry import se3
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.outside import GravityEdges, OdometryEdges
+from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.posegraph.refinement import Joint
 from tofuse.recordings.open import open_recording
 from tofuse.results.output import run_json

@@ -15,7 +15,7 @@ from tofuse.geometry import se3
 from tofuse.pipeline.config import from_method
 from tofuse.pipeline.priors import with_prior
 from tofuse.pipeline.reconstruct import device_up, reconstruct
-from tofuse.posegraph.outside import GravityEdges, OdometryEdges
+from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import ArraySource, Recording

@@ -17,8 +17,8 @@ from tofuse.pipeline.progress import Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.pipeline.self_calibration import in_words, self_calibrated
 from tofuse.posegraph.accuracy import Accuracy
+from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import Suspicion
 from tofuse.recordings.frames import CloudFrame, RangeFrame
 from tofuse.recordings.open import open_recording
 from tofuse.recordings.recording import ArraySource, Recording
@@ -144,9 +144,11 @@ def test_a_right_one_is_left_as_it_is(recording) -> None:
 
 def said(result, error: float | None, bound: float, posed: int = 3, support: float = 0.5):
     """A result whose views show an error of the focal length."""
-    found = Suspicion(error is not None, {"focal": error or 0.0}, {"focal": 0.001}, best="focal")
+    found = CalibrationCheck(
+        error is not None, {"focal": error or 0.0}, {"focal": 0.001}, best="focal"
+    )
     poses = np.tile(np.eye(4), (3, 1, 1))
-    refinement = Refinement(poses, True, 3, 3, support=(support, 0.9), suspicion=found)
+    refinement = Refinement(poses, True, 3, 3, support=(support, 0.9), calibration_check=found)
     d = replace(
         result.diagnostics,
         refinement=refinement,

@@ -20,7 +20,7 @@ from tofuse.pipeline.config import changed, from_method
 from tofuse.pipeline.state_checks import check_tracked
 from tofuse.pipeline.states import StateError, decode, encode
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.prepared_view import PreparedView
 

@@ -25,7 +25,7 @@ from tofuse.posegraph.accuracy import (
 from tofuse.posegraph.build import Measured, build_graph
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from walks import round_walk, true_poses

@@ -12,7 +12,7 @@ from tofuse.geometry.cameras import Pinhole
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.likeness import look_of, mutual_unlikeness
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view

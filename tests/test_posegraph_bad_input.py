@@ -33,9 +33,9 @@ FAR[0, 3] = 1e200
 MOTIONS = {
     "pose 2 is not finite": spoilt("poses", 2, np.nan),
     "measurement 3 is not finite": spoilt("measurements", 3, np.inf),
-    "pose 4 is no rigid motion": spoilt("poses", 4, np.diag([2.0, 2, 2, 1])),
-    "pose 5 is no rigid motion": spoilt("poses", 5, np.diag([1.0, 1, -1, 1])),
-    "measurement 6 is no rigid motion": spoilt("measurements", 6, FAR),
+    "pose 4 is not a rigid motion": spoilt("poses", 4, np.diag([2.0, 2, 2, 1])),
+    "pose 5 is not a rigid motion": spoilt("poses", 5, np.diag([1.0, 1, -1, 1])),
+    "measurement 6 is not a rigid motion": spoilt("measurements", 6, FAR),
 }
 INFORMATION = {
     "information 3 is not finite": spoilt("information", 3, np.nan),

@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.threads import threads
 from tofuse.posegraph import joining
 from tofuse.posegraph.joining import Joining, Stretch
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.view_pair import follow, register_pair
 
@@ -164,7 +164,7 @@ def test_a_wrong_link_is_outvoted_even_if_it_is_certain(three) -> None:
 
 
 def test_two_certain_links_that_contradict_each_other_decide_nothing(three, monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     wrong = linked(three[0], three[1], off=se3.exp([0.8, 0, -0.5, 0, 0.5, 0]))
     right = linked(three[0], three[1])
     assert members(SPARSELY.join(three[:2], [right])) == [[0, 1]]
@@ -175,7 +175,7 @@ def test_two_certain_links_that_contradict_each_other_decide_nothing(three, monk
     "off", [[0, 0, -0.5, 0, 0, 0], [0, 0, 0.5, 0, 0, 0], [0.4, 0, 0, 0, 0.3, 0]]
 )
 def test_a_link_that_free_space_contradicts_is_refused(three, off, monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     wrong = linked(three[0], three[1], off=se3.exp(np.array(off)))
     assert members(SPARSELY.join(three[:2], [wrong])) == [[0], [1]]
 
@@ -183,7 +183,7 @@ def test_a_link_that_free_space_contradicts_is_refused(three, off, monkeypatch) 
 def test_one_link_that_is_not_certain_needs_another_view_that_says_the_same(
     three, elsewhere, monkeypatch
 ) -> None:
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     (group,) = SPARSELY.join(three[:2], [linked(three[0], three[1], certain=False)])
     assert_joined(group, three)
     # Nothing else can be registered where the scene is another.
@@ -204,7 +204,7 @@ def turned_back(late):
 @pytest.mark.parametrize(("late", "joined"), [(0.0, False), (5.0, True)])
 def test_the_camera_must_have_been_able_to_get_there(late, joined, monkeypatch) -> None:
     """It turned by 0.5 rad/s, and would have had to turn by 1.5 rad at once."""
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     path, parts, link = turned_back(late)
     groups = SPARSELY.join(parts, [link])
     assert members(groups) == ([[0, 1]] if joined else [[0], [1]])
@@ -265,7 +265,7 @@ def test_what_hangs_on_a_single_link_is_reconsidered() -> None:
 
 def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) -> None:
     """Without a motion between them, a single link need not wait; but not where it says one."""
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(joining._Joiner, "reconsider", lambda _: None)
     joiner = joining._Joiner(Joining(), three[:2])
     joiner.decide()
@@ -276,7 +276,7 @@ def test_a_short_time_speaks_for_no_pose_that_is_far_away(three, monkeypatch) ->
 
 
 def test_between_recordings_no_motion_is_known(monkeypatch) -> None:
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     path, parts, link = turned_back(0.0)
     (group,) = SPARSELY.join([parts[0], replace(parts[1], recording=1)], [link])
     assert_joined(group, parts, path)
@@ -326,7 +326,7 @@ def test_links_to_frames_without_a_pose_are_left_out(three) -> None:
 
 def test_real_links_of_searches_and_alignments_do(three, monkeypatch) -> None:
     """As relocalization on the way finds them."""
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     a, b, c = three
     ends = [(a.views[-1].view, b.views[0].view), (b.views[-1].view, c.views[0].view)]
     made = [register_pair(*reversed(ends[0])), follow(*reversed(ends[1]), np.eye(4))]
@@ -347,29 +347,29 @@ def probable(first, second, p, T=None):
 
 
 @pytest.fixture
-def surely(three, monkeypatch):
+def min_probability(three, monkeypatch):
     """Joins two stretches by links alone, and says how sure that is; None if it refuses."""
-    monkeypatch.setattr(joining._Joiner, "look_for_more", lambda _: None)
+    monkeypatch.setattr(joining._Joiner, "search_links", lambda _: None)
     monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
 
     def joined(links, at_least=0.9):
-        groups = replace(SPARSELY, surely=at_least).join(three[:2], links)
-        found = {join.sure for group in groups for join in group.joins}
+        groups = replace(SPARSELY, min_probability=at_least).join(three[:2], links)
+        found = {join.probability for group in groups for join in group.joins}
         assert len(found) <= 1
         return found.pop() if found else None
 
     return joined
 
 
-def test_links_of_other_views_make_a_join_surer(three, surely) -> None:
+def test_links_of_other_views_make_a_join_surer(three, min_probability) -> None:
     a, b = three[0].views, three[1].views
-    one = surely([probable(a[-1], b[0], 0.95)])
+    one = min_probability([probable(a[-1], b[0], 0.95)])
     assert one == pytest.approx(0.95)
     # The same views again say little more: here the turns are 0.24 rad.
-    same = surely([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
+    same = min_probability([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
     odds = 19 ** (1 + 0.24 / joining.IN_SIGHT) / 2
     assert same == pytest.approx(odds / (1 + odds), abs=0.02)
-    other = surely([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)])
+    other = min_probability([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)])
     assert other > same
 
 
@@ -377,19 +377,19 @@ def test_who_tries_often_finds_something_by_chance(three, monkeypatch) -> None:
     monkeypatch.setattr(joining._Joiner, "_confirming", lambda *_: [])
     a, b = three[0].views, three[1].views
     right = probable(a[-1], b[0], 0.96)
-    joiner = joining._Joiner(replace(SPARSELY, surely=0.9), three[:2])
+    joiner = joining._Joiner(replace(SPARSELY, min_probability=0.9), three[:2])
     joiner.add(right)
-    assert joiner._sureness(*joiner._islands, [right]) == pytest.approx(0.96)
+    assert joiner._probability(*joiner._islands, [right]) == pytest.approx(0.96)
     joiner._tried |= {(a[k].index, b[k].index) for k in range(3)}  # and nothing was found
-    assert joiner._sureness(*joiner._islands, [right]) == pytest.approx(24 / 28)
+    assert joiner._probability(*joiner._islands, [right]) == pytest.approx(24 / 28)
     joiner.decide(single=True)
     assert len(joiner.groups()) == 2
 
 
-def test_no_single_link_is_certain(three, surely) -> None:
+def test_no_single_link_is_certain(three, min_probability) -> None:
     a, b = three[0].views, three[1].views
-    assert surely([probable(a[-1], b[0], 1.0)]) == pytest.approx(joining._MOST_SURE)
-    assert surely([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
+    assert min_probability([probable(a[-1], b[0], 1.0)]) == pytest.approx(joining._MAX_PROBABILITY)
+    assert min_probability([probable(a[-1], b[0], 1.0)], at_least=0.999) is None
 
 
 def test_the_main_group_is_the_first_one_where_asked_for(elsewhere, three) -> None:
@@ -399,7 +399,8 @@ def test_the_main_group_is_the_first_one_where_asked_for(elsewhere, three) -> No
 
 
 @pytest.mark.parametrize(
-    "options", [{"tries": -1}, {"surely": 1.0}, {"surely": np.nan}, {"main": "last"}]
+    "options",
+    [{"tries": -1}, {"min_probability": 1.0}, {"min_probability": np.nan}, {"main": "last"}],
 )
 def test_options_of_sessions_are_checked(options) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):

@@ -364,5 +364,5 @@ def test_benchmark_graphs_end_where_gtsam_does(shared_data, name, least):
 
 def test_settings_of_the_part_are_those_of_the_function():
     part, function = LevenbergMarquardt(), Settings()
-    for name in ("robust", "gate", "slack", "rotation", "tolerance", "max_iterations"):
+    for name in ("robust", "gate", "max_inflation", "rotation", "tolerance", "max_iterations"):
         assert getattr(part, name) == getattr(function, name)

@@ -16,7 +16,7 @@ from tofuse.posegraph.build import Measured, accumulate, build_graph, chain
 from tofuse.posegraph.given import read_loops
 from tofuse.posegraph.loops import Confirmation, GivenLoop, LoopDetector, mean_error
 from tofuse.posegraph.nearby import Nearby, yaw
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
 from tofuse.registration.base import Registration
 from tofuse.registration.icp import algorithm_1

@@ -13,7 +13,7 @@ from tofuse.posegraph import revisits
 from tofuse.posegraph.appearance import Appearance
 from tofuse.posegraph.loops import GivenLoop
 from tofuse.posegraph.revisits import Revisits
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.registration.base import Registration
 from tofuse.registration.confidence import BELIEVED
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from test_kernels_refinement import SHARP, corner, unpack
-from test_posegraph_refine import path
+from test_posegraph_joint_alignment import path
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels import shared_error as patch_kernels
 from tofuse.posegraph import shared_error
-from tofuse.posegraph.refine import RefineOptions, refine
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.joint_alignment import RefineOptions, refine
+from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.prepared_view import prepare_view
 
 WIDE = (1.0, 50.0, 0.5)  # scale, robust limit (so wide that robust weights are 1), cosine

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from test_posegraph_refine import away, drifted, path, surfaces
+from test_posegraph_joint_alignment import away, drifted, path, surfaces
 from tofuse.files.spill import Scratch
 from tofuse.geometry import se3
-from tofuse.posegraph import views as of_views
+from tofuse.posegraph import view_store as of_views
+from tofuse.posegraph.calibration_check import CalibrationCheck, of_submaps
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.submaps import cut, submaps
-from tofuse.posegraph.suspicion import Suspicion, of_submaps
-from tofuse.posegraph.views import KeptView, Spacing, ViewStore, nearby, overlaps
+from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, nearby, overlaps
 from tofuse.registration.likeness import alike, mutual_unlikeness, unlikeness_of_pairs
 
 COUNT = 40
@@ -165,8 +165,11 @@ def test_the_index_of_looks_finds_what_looks_most_alike() -> None:
 
 
 def test_submaps_share_their_camera() -> None:
-    quiet, alarm = Suspicion(), Suspicion(alarm=True, errors={"focal": 0.05}, best="focal")
-    other = Suspicion(alarm=True, errors={"focal": 0.04}, best="focal")
+    quiet, alarm = (
+        CalibrationCheck(),
+        CalibrationCheck(alarm=True, errors={"focal": 0.05}, best="focal"),
+    )
+    other = CalibrationCheck(alarm=True, errors={"focal": 0.04}, best="focal")
     assert not of_submaps([]).alarm
     assert not of_submaps([quiet, alarm]).alarm
     assert of_submaps([quiet, alarm, other]).errors == {"focal": 0.05}

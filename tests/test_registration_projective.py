@@ -248,9 +248,9 @@ def test_points_lie_on_the_fitted_surface(room):
         {"held": 0.0},
         {"common_tilt": -1.0},
         {"common_slope": float("inf")},
-        {"most_sigma_m": 0.0},
+        {"max_sigma_m": 0.0},
         {"tolerance": -1.0},
-        {"settled": float("nan")},
+        {"convergence": float("nan")},
     ],
 )
 def test_options_that_make_no_sense_are_refused(wrong):
@@ -264,11 +264,11 @@ def test_options_that_make_no_sense_are_refused(wrong):
         {"stride": 0},
         {"iterations": 0},
         {"iterations": 10**9},
-        {"slack_m": -1.0},
-        {"photo_slack": float("nan")},
+        {"inflation_m": -1.0},
+        {"photometric_inflation": float("nan")},
     ],
 )
 def test_levels_that_make_no_sense_are_refused(wrong):
-    good = {"stride": 2, "iterations": 4, "slack_m": 0.0, "photo_slack": 0.0}
+    good = {"stride": 2, "iterations": 4, "inflation_m": 0.0, "photometric_inflation": 0.0}
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Level(**(good | wrong))

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.geometry import se3
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.rig import around, relative
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.rigs.joint import View, disagreements, refine_together

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from tofuse.geometry import se3
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.view_store import KeptView
 from tofuse.rigs.calibrate import calibrate_cameras
 from tofuse.rigs.inputs import open_cameras
 from tofuse.rigs.joint import View, disagreements

@@ -17,6 +17,7 @@ from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for
 from tofuse.recordings.recording import Recording
 from tofuse.registration.plane_detection import detect_planes
+from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.sensor.noise import NoiseModel
 
 _SEARCHED = 60  # frames at most

@@ -31,14 +31,14 @@ from tofuse.posegraph.accuracy import (
     without_degenerate,
 )
 from tofuse.posegraph.build import Measured, build_graph
+from tofuse.posegraph.covariances import MIN_WEIGHT, accepted_only, pose_covariances
 from tofuse.posegraph.cut_edges import cut_edges
+from tofuse.posegraph.external_sensors import SensorPriors, measure_all, with_sensors
 from tofuse.posegraph.graph import LoopRecord, Optimisation, PoseGraph
 from tofuse.posegraph.joining import Join
 from tofuse.posegraph.loops import ClosedLoop, GivenLoop, Loops
-from tofuse.posegraph.outside import Told, told_by, with_outside
 from tofuse.posegraph.refinement import Refinement, Refiner
-from tofuse.posegraph.trust import LEFT_OUT, pose_covariances, without_left_out
-from tofuse.posegraph.views import ViewStore
+from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
@@ -65,7 +65,7 @@ class Closed:
     loops: list[ClosedLoop]
     sequential: Float64
     optimisation: Optimisation
-    told: Told
+    told: SensorPriors
     judged: Judged
 
 
@@ -176,18 +176,18 @@ class BackEnd:
             graph = self.graph(loops)
         sequential = led = graph.poses
         sensed = self._log.sensed(graph.ids.tolist())
-        told = told_by(self._config.outside, sensed, tracked)
-        graph = with_outside(graph, told)
+        told = measure_all(self._config.outside, sensed, tracked)
+        graph = with_sensors(graph, told)
         optimisation = Optimisation(graph, (), True)
         if graph.loop.any() or told:
             self._progress.stage("optimising")
             with self._watch.timing("optimisation"):
                 optimisation = self._config.optimiser.optimise(graph)
                 if told and graph.loop.any():  # what loops are to be compared with
-                    alone = with_outside(tracked, told)
+                    alone = with_sensors(tracked, told)
                     led = self._config.optimiser.optimise(alone).graph.poses
             loops = _decided(loops, optimisation)
-            optimisation = without_left_out(optimisation)
+            optimisation = accepted_only(optimisation)
         graph = optimisation.graph
         judged = Judged(led, optimisation)
         if told:
@@ -206,7 +206,7 @@ class BackEnd:
             graph = self.graph(loops)
             if not graph.loop.any():
                 break
-            graph = without_left_out(self._config.optimiser.optimise(graph)).graph
+            graph = accepted_only(self._config.optimiser.optimise(graph)).graph
             poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
             if not self._kept.loops.look_again(poses):
                 break
@@ -220,7 +220,7 @@ class BackEnd:
         with self._watch.timing("refinement"):
             refinement = self._kept.refiner.finish(graph.ids.tolist(), graph.poses, closed.told)
             if refinement.kept:
-                graph = with_outside(self.graph(closed.loops, refinement), closed.told)
+                graph = with_sensors(self.graph(closed.loops, refinement), closed.told)
         return Refined(graph, refinement)
 
     def _fuse(self, closed: Closed, refined: Refined) -> Fused:
@@ -388,7 +388,7 @@ class BackEnd:
         if self._tracks:  # how far off poses from elsewhere were says nothing of what is left
             moved = displacement(closed.optimisation.graph.poses, refined.graph.poses)
         excess = 0.0 if cross_view is None else cross_view.excess_m()
-        suspicion, gap = refinement.suspicion, (0.0, 0.0)
+        suspicion, gap = refinement.calibration_check, (0.0, 0.0)
         if suspicion is not None and suspicion.alarm and suspicion.gap is not None:
             gap = suspicion.gap.before
         shown = Shown(*moved, excess, *gap)
@@ -512,7 +512,7 @@ def _decided(loops: Sequence[ClosedLoop], optimisation: Optimisation) -> list[Cl
     weights = iter(optimisation.weights[optimisation.graph.loop])
     out = []
     for loop in loops:
-        if loop.T_i_j is not None and next(weights) < LEFT_OUT:
+        if loop.T_i_j is not None and next(weights) < MIN_WEIGHT:
             reason = f"contradicts the rest of the graph ({loop.record.reason})"
             loop = ClosedLoop(replace(loop.record, accepted=False, reason=reason))
         out.append(loop)

@@ -13,11 +13,11 @@ from tofuse.evaluation.cross_view import CrossViewConsistency
 from tofuse.geometry import se3
 from tofuse.odometry.motion import Moment, jumps
 from tofuse.posegraph.accuracy import Accuracy
+from tofuse.posegraph.calibration_check import in_words as camera_in_words
+from tofuse.posegraph.covariances import loop_errors
+from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import LoopRecord, Optimisation
-from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import in_words as camera_in_words
-from tofuse.posegraph.trust import loop_errors
 from tofuse.registration.base import Registration
 from tofuse.results.ranges import Range, in_words, is_one, runs, runs_of, size, union
 from tofuse.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
@@ -116,7 +116,7 @@ class Evidence:
     ambiguity_m: float | None = None
     repeated: tuple[int, ...] = ()
     interruptions: tuple[int, ...] = ()
-    outside: tuple[OutsideRecord, ...] = ()
+    outside: tuple[SensorRecord, ...] = ()
     components: tuple[Component, ...] = ()
     moving: tuple[tuple[int, float], ...] = ()
     doubtful: tuple[int, ...] = ()
@@ -456,7 +456,7 @@ def _missed(e: Evidence) -> Iterator[Reason]:
 
 def _suspected(e: Evidence) -> Iterator[Reason]:
     """All views together may say what is wrong with the camera."""
-    found = None if e.refinement is None else e.refinement.suspicion
+    found = None if e.refinement is None else e.refinement.calibration_check
     if found is None or not found.alarm or found.gap is None:
         return
     gap = found.gap
@@ -472,7 +472,7 @@ def _suspected(e: Evidence) -> Iterator[Reason]:
 
 def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     """The bound of the poses assumes a calibration that this recording may not be able to check."""
-    found = None if e.refinement is None else e.refinement.suspicion
+    found = None if e.refinement is None else e.refinement.calibration_check
     if found is None or found.alarm:
         return
     if found.undetermined:

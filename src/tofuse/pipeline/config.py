@@ -17,10 +17,10 @@ from tofuse.files.reading import parsed, read_text
 from tofuse.filters.base import Filter
 from tofuse.fusion.options import Fusion
 from tofuse.odometry.base import Odometry
+from tofuse.posegraph.external_sensors import ExternalSensor
 from tofuse.posegraph.graph import Optimiser
 from tofuse.posegraph.joining import Joining
 from tofuse.posegraph.loops import LoopDetector
-from tofuse.posegraph.outside import Outside
 from tofuse.posegraph.refinement import NoRefinement, Refining
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.results.output import read_run_json
@@ -76,7 +76,7 @@ class Config:
     refinement: Refining = NoRefinement()  # noqa: RUF009 - immutable
     corrections: tuple[Correction, ...] = ()
     model_filters: tuple[Filter, ...] = ()
-    outside: tuple[Outside, ...] = ()
+    outside: tuple[ExternalSensor, ...] = ()
     joining: Joining = Joining()  # noqa: RUF009 - immutable
     self_calibration: bool = True
     tolerance_m: float | None = None

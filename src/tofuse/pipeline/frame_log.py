@@ -11,9 +11,9 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.odometry.base import Step
+from tofuse.posegraph.external_sensors import SensorData
 from tofuse.posegraph.joining import Stretch
-from tofuse.posegraph.outside import Sensed
-from tofuse.posegraph.views import ViewStore
+from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Link
 from tofuse.registration.prepared_view import PreparedView
@@ -178,7 +178,7 @@ class FrameLog:
             )
         return found
 
-    def sensed(self, ids: Sequence[int]) -> Sensed:
+    def sensed(self, ids: Sequence[int]) -> SensorData:
         """What the recording knows of some frames beside their images."""
         by_index = {e.record.index: e for e in self.entries}
         odometry, gravity = np.full((len(ids), 4, 4), np.nan), np.full((len(ids), 4), np.nan)
@@ -189,7 +189,7 @@ class FrameLog:
             if entry.gravity is not None:
                 gravity[k] = entry.gravity
         parts = np.array([by_index[index].recording for index in ids], np.intp)
-        return Sensed(np.array(ids, np.intp), odometry, gravity, parts)
+        return SensorData(np.array(ids, np.intp), odometry, gravity, parts)
 
 
 def poses_in_world(log: FrameLog, T_world_component: Mapping[int, Float64]) -> dict[int, Float64]:

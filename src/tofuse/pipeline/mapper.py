@@ -23,7 +23,7 @@ from tofuse.pipeline.observations import Observations
 from tofuse.pipeline.preparation import Preparation, Prepared, Ready
 from tofuse.pipeline.progress import Progress, Silent, Stopwatch
 from tofuse.posegraph.loops import GivenLoop
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.types import FrameRecord, Reconstruction

@@ -28,7 +28,7 @@ from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import Tracked, described, push_frames
 from tofuse.pipeline.session_pairs import Model, session_changes, session_pairs
 from tofuse.pipeline.sessions import Session, read_sessions, sessions_of
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import Recording, Source
 from tofuse.recordings.sources import JoinedSource
 from tofuse.registration.prepared_view import PreparedView
@@ -116,7 +116,7 @@ def merged_config(sessions: Sequence[Session]) -> Config:
     outside = default.outside if all(s.config.outside for s in sessions) else ()
     searches = _SEARCHES * (len(sessions) - 1)
     joining = replace(
-        default.joining, main="first", tries=_TRIES, searches=searches, surely=_SURELY
+        default.joining, main="first", tries=_TRIES, searches=searches, min_probability=_SURELY
     )
     return replace(
         default,

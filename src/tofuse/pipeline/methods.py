@@ -16,11 +16,11 @@ from tofuse.odometry.pairwise import Pairwise
 from tofuse.odometry.sequential import Sequential
 from tofuse.pipeline.config import Config, ViewKind
 from tofuse.posegraph.castellani import Castellani
+from tofuse.posegraph.external_sensors import GravityEdges
 from tofuse.posegraph.levenberg import LevenbergMarquardt
 from tofuse.posegraph.loops import Confirmation
 from tofuse.posegraph.nearby import Nearby
-from tofuse.posegraph.outside import GravityEdges
-from tofuse.posegraph.planes import Planes
+from tofuse.posegraph.plane_refinement import Planes
 from tofuse.posegraph.refinement import Joint
 from tofuse.posegraph.revisits import Revisits
 from tofuse.registration.any_pair import AnyPair

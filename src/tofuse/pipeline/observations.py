@@ -18,7 +18,7 @@ from tofuse.pipeline.budget import views_bytes
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.preparation import Ready
 from tofuse.posegraph.loops import GivenLoop
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.samples import FrameSample, FrameSamples

@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.pipeline.config import Config
-from tofuse.posegraph.outside import GravityEdges, OdometryEdges
+from tofuse.posegraph.external_sensors import GravityEdges, OdometryEdges
 from tofuse.recordings.phones import POSES_BY
 from tofuse.recordings.recording import Recording, Source
 

@@ -1,7 +1,8 @@
 """Self-calibration: a recording that shows an error of its camera is reconstructed without it.
 
 Refined views say if a focal length or a depth offset bends the path: with that corrected they
-support each other better, and a loop closes that neighbours alone miss (`posegraph.suspicion`). The
+support each other better, and a loop closes that neighbours alone miss
+(`posegraph.calibration_check`). The
 recording is then reconstructed once more with it corrected, and this stays only where the stated
 bound of the poses gets smaller (`posegraph.accuracy`). Where neither trajectory is bounded, views
 must fit better before they are refined.
@@ -17,8 +18,8 @@ import numpy as np
 from tofuse.corrections.camera_errors import CameraErrors
 from tofuse.pipeline.config import Config
 from tofuse.pipeline.progress import Progress
-from tofuse.posegraph.suspicion import Suspicion
-from tofuse.posegraph.suspicion import in_words as errors_in_words
+from tofuse.posegraph.calibration_check import CalibrationCheck
+from tofuse.posegraph.calibration_check import in_words as errors_in_words
 from tofuse.results.card import length
 from tofuse.results.types import Diagnostics, Reason, Reconstruction, SelfCalibration
 from tofuse.results.verdict import ranked
@@ -71,10 +72,10 @@ def in_words(wrong: CameraErrors) -> str:
     return " and ".join(errors_in_words({name: e for name, e in errors.items() if e}))
 
 
-def _shown(result: Reconstruction) -> tuple[Suspicion, CameraErrors] | None:
+def _shown(result: Reconstruction) -> tuple[CalibrationCheck, CameraErrors] | None:
     """The error that the views of a result show, if they do; of several the one that helps most."""
     refinement = result.diagnostics.refinement
-    found = None if refinement is None else refinement.suspicion
+    found = None if refinement is None else refinement.calibration_check
     if found is None or not found.alarm:
         return None
     value = found.errors[found.best]

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.evaluation.changes import changes
 from tofuse.evaluation.cross_view import CrossViewConsistency, compare_views
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.recordings.recording import evenly
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.results.sessions import MAX_STATED_PROBABILITY
@@ -61,9 +61,9 @@ class Model:
     def sure(self, one: SessionRecord, other: SessionRecord) -> float | None:
         """Probability that what joined two sessions is right; None where others did."""
         said = [
-            join.sure
+            join.probability
             for join in self.result.diagnostics.joins
-            if join.sure is not None
+            if join.probability is not None
             and any(one.has(k) for k in (join.link.i, join.link.j))
             and any(other.has(k) for k in (join.link.i, join.link.j))
         ]

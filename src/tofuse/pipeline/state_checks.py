@@ -24,7 +24,7 @@ from tofuse.odometry.keyframe_map import Keyframe
 from tofuse.pipeline.frame_log import Entry
 from tofuse.posegraph.graph import PoseGraph
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.views import Outline, PosedView
+from tofuse.posegraph.view_store import Outline, PosedView
 from tofuse.registration.base import Registration
 from tofuse.registration.prepared_view import PreparedView, Projection
 from tofuse.results.samples import FrameSample

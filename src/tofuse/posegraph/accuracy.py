@@ -18,9 +18,9 @@ from scipy.stats import chi2
 
 from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
+from tofuse.posegraph.covariances import joint_covariance, pose_covariances
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.trust import joint_covariance, pose_covariances
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.projective import UNITS, ProjectiveOptions, Target, align, span
 

@@ -69,7 +69,7 @@ class PlaneOptions:
     robust
         Residuals beyond so many standard deviations count nothing (Tukey's biweight; with 4.685 an
         estimate from normal errors has 95 % of the efficiency of least squares).
-    settled
+    convergence
         Iterations end when points move by less, as a share of the size of the cells.
     """
 
@@ -80,7 +80,7 @@ class PlaneOptions:
     flatness: float = 0.6
     divisions: int = 4
     robust: float = 4.685
-    settled: float = 0.002
+    convergence: float = 0.002
 
     def __post_init__(self) -> None:
         for name in ("coarsest", "shrink", "flatness"):
@@ -92,7 +92,7 @@ class PlaneOptions:
             raise ValueError(f"divisions is {self.divisions}, not 1 to 100")
         if self.least < 4:
             raise ValueError(f"least is {self.least}, not 4 or more")
-        for name in ("robust", "settled"):
+        for name in ("robust", "convergence"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
 
@@ -272,7 +272,7 @@ def _level(
         step, motion = _bounded(points, found, step, _BOLDEST * size)
         found = se3.orthonormalise(found @ se3.exp(step))
         cells = [_cells(points, found, c.mean[np.diff(c.start) > 0]) for c in cells]
-        if motion < options.settled * size:
+        if motion < options.convergence * size:
             break
     # Cut afresh: cells that went along have had longer to fit.
     cells = _divided(points, found, size, divisions)

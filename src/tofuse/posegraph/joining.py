@@ -1,13 +1,13 @@
-"""Joins components: parts of a recording that were tracked apart, each in a frame of its own.
+"""Joins components: parts of a recording that were tracked separately, each in its own frame.
 
-Links, registrations of single views across components, come from relocalization on the way, and
-from candidates that look alike in the end. No link decides by itself whether two components are
-joined. Those between the same two components are reduced to the largest set that agrees pairwise
-(Mangelson 2018); what this set says is verified with several views of both sides, as to support and
-to free space; it must have no rival, and the camera must have been able to get there. All this is
-decided when everything was seen: best first, each join with what was joined before. What then still
-hangs on a single link is taken apart again, and compared with other places for all that was joined
-to both sides since. A component that nothing joins stays one of its own.
+Links are registrations of single views across components. They come from relocalization during
+tracking, and at the end from candidates with similar descriptors. No link joins two components by
+itself. Those between the same two components are reduced to the largest pairwise consistent set
+(Mangelson 2018). The pose of this set is verified with several views of both sides, by support and
+free space; it must have no rival, and the camera must have been able to get there in time. This is
+decided after tracking: best first, each join together with those made before. A join that rests on
+a single link is then undone and searched for again, as more views have been joined to both sides
+since. A component that nothing joins stays separate.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tofuse.kernels.motion import retract, twist_between
 from tofuse.odometry.motion import HANDHELD
 from tofuse.posegraph.cut_edges import cut_edges, sides_without
 from tofuse.posegraph.pairwise_consistency import maximum_consistent_set
-from tofuse.posegraph.views import PosedView
+from tofuse.posegraph.view_store import PosedView
 from tofuse.registration.agreement import Agreement, agreement
 from tofuse.registration.base import Link, Registration
 from tofuse.registration.confidence import CONTRADICTION, logistic
@@ -47,38 +47,38 @@ from tofuse.registration.view_pair import follow, register_pair
 How = Literal["links", "motion"]
 View = PosedView[PreparedView]
 
-# Pairs of neighbouring views from which is learnt how views of this camera fit.
+# Pairs of neighbouring views from which the usual fit of this camera's views is learnt.
 _LEARN = 16
-# View pairs that verify a join, beside those of the links; and the overlap that says something.
+# View pairs that verify a join, besides those of the links; and their smallest overlap.
 _VERIFY, _OVERLAP = 8, 0.2
-# Contradiction is unusual beyond so many standard deviations above the median of neighbours.
-# Wrong poses within one scene contradict by more than the last number, whatever neighbours do.
-_SIGMAS, _LEAST_SPREAD, _MAX_CONTRADICTION = 3.0, 0.02, 0.2
-# By which fraction of their path components may have drifted in themselves; how far a link may be
-# off, and an alignment can follow: fractions of the depth, and rad.
-_DRIFT, _LINK_ERROR, _FOLLOWED = 0.05, 0.02, 0.1
-# Lengths and turns of the path on either side of a gap say how fast the camera is: it may go on
-# three times as fast, and somewhere near where it was in any case (a fraction of the depth, rad).
+# Contradiction is unusual beyond this many standard deviations above the median of neighbours.
+# Wrong poses within one scene contradict by more than the last number in any case.
+_SIGMAS, _MIN_SPREAD, _MAX_CONTRADICTION = 3.0, 0.02, 0.2
+# Largest drift within components, as a fraction of the path; largest error of a link, and range of
+# convergence of an alignment: fractions of the depth, and rad.
+_DRIFT, _LINK_ERROR, _MAX_ALIGNED = 0.05, 0.02, 0.1
+# Motions on either side of a gap that bound the camera's speed within it, the factor on their
+# maximum, and a distance that is always possible (fraction of the depth, rad).
 _AROUND, _FASTER, _NEAR = 20, 3.0, 0.3
-# Times the speed that nine of ten motions stay below; where the camera had no time to get out of
-# sight, the two sides see the same place unless more than this fraction of the overlap contradicts.
+# Factor on the 90 % quantile of the speed that the camera hardly exceeds. Where it had no time to
+# lose sight of the place, up to this fraction of the overlap may contradict.
 _HARDLY, _SAME_PLACE = 2.0, 0.3
-# A gap may be bridged by motion alone where its standard deviation is at most this: fraction of the
-# depth, and rad.
+# Largest standard deviation of a gap that is bridged by motion alone: fraction of the depth, rad.
 _BRIDGE_M, _BRIDGE_RAD = 0.02, np.radians(2.0)
-# Links that say something else than those that are believed must weigh less than this.
+# Largest weight of rival links, relative to the accepted ones.
 _RIVAL = 0.5
 _SHIFT = 0.35
-# Of up to so many views every two are compared by how they look.
+# Up to this many views, all pairs of descriptors are compared.
 _ALL = 512
-# No model of probabilities is to be trusted beyond what it was fitted to: some hundred poses.
-_MOST_SURE = 0.998
+# Probabilities are not extrapolated beyond the data that their model was fitted to, a few hundred
+# poses.
+_MAX_PROBABILITY = 0.998
 _NEARBY = ProjectiveOptions(levels=PATIENT, prior_m=3.0, prior_rad=3.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A component as the tracker leaves it.
+    """A component as tracked.
 
     Attributes
     ----------
@@ -89,11 +89,11 @@ class Stretch:
     times
         (N,) s.
     poses
-        (N, 4, 4) in its frame.
+        (N, 4, 4) T_component_camera.
     views
-        Those that are kept.
+        The stored views of its frames.
     recording
-        Which of several joined recordings it is of: between these, no motion is known.
+        Number of its recording, if several are merged: no motion is known between these.
     """
 
     component: int
@@ -105,7 +105,7 @@ class Stretch:
 
     @cached_property
     def depth(self) -> float:
-        """Typical distance of what its views see, m."""
+        """Median depth of its views, m."""
         return float(np.median([v.depth for v in self.views])) if self.views else 1.0
 
 
@@ -120,32 +120,31 @@ class Join:
     how
         "links", or "motion" where the motion over a gap was extrapolated.
     needed
-        Whether the component hangs on it; else it is one more that says the same.
-    sure
-        Probability that all that joins the two sides together says what is right; None where it
-        was not asked for.
+        Whether it defines the pose of the component; otherwise it confirms another one.
+    probability
+        That the pose given by all links between the two sides is right; None if not computed.
     """
 
     link: Link
     how: How
     needed: bool
-    sure: float | None = None
+    probability: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Components in one frame, that of the one whose first frame is earliest.
+    """Joined components in one frame, that of the component with the earliest frame.
 
     Attributes
     ----------
     T_group_component
         (4, 4) by component.
     joins
-        What joins them.
+        Edges between the components.
     frames
-        How many frames they have.
+        Number of their frames.
     bridged
-        Components that are connected with the first one by extrapolated motion only.
+        Components that only extrapolated motion connects to the first one.
     """
 
     T_group_component: Mapping[int, Float64]
@@ -154,32 +153,31 @@ class Group:
     bridged: frozenset[int] = frozenset()
 
     def joined(self, component: int) -> How:
-        """How a component is connected with the first one."""
+        """Return how a component is connected to the first one."""
         return "motion" if component in self.bridged else "links"
 
 
 @dataclass(frozen=True)
 class Joining:
-    """How components are joined.
+    """Options of joining components.
 
     Attributes
     ----------
     search
-        How far and how finely views are searched.
+        Range and resolution of the exhaustive search.
     searches, searches_per_frame
-        How many searches are made at most: so many, plus one for each component, plus this for
-        each frame.
+        Largest number of searches: a constant, plus one for each component, plus this for each
+        frame.
     bridge
         Whether short gaps may be bridged by motion alone.
     tries
-        How many view pairs are tried between the same two components.
-    surely
-        Probability that a join is right which it must have, given how many view pairs were tried:
-        who looks often finds something by chance. 0 where that is not asked for, as the motion
-        from one side to the other speaks for the join as well.
+        Largest number of view pairs that are tried between the same two components.
+    min_probability
+        Smallest probability of a join, given the number of tried view pairs (multiple testing). 0:
+        not required, as the motion between the two sides supports the join as well.
     main
-        Which group is the main one: of the most frames ("largest"), or with the component of the
-        lowest number ("first").
+        The main group: that with most frames ("largest"), or with the component of the lowest
+        number ("first").
     """
 
     search: SearchOptions = SearchOptions(mode="both")  # noqa: RUF009 - immutable
@@ -187,7 +185,7 @@ class Joining:
     searches_per_frame: float = 0.02
     bridge: bool = True
     tries: int = 4
-    surely: float = 0.0
+    min_probability: float = 0.0
     main: Literal["largest", "first"] = "largest"
 
     def __post_init__(self) -> None:
@@ -197,18 +195,20 @@ class Joining:
             raise ValueError(f"searches_per_frame is {self.searches_per_frame}, not 0 or more")
         if not 0 <= self.tries <= 1_000_000:
             raise ValueError(f"tries is {self.tries}, not 0 or more")
-        if not 0 <= self.surely < 1:
-            raise ValueError(f"surely is {self.surely}, not from 0 to below 1")
+        if not 0 <= self.min_probability < 1:
+            raise ValueError(f"min_probability is {self.min_probability}, not from 0 to below 1")
         if self.main not in ("largest", "first"):
             raise ValueError(f"main is {self.main!r}, not largest or first")
 
     def join(self, stretches: Sequence[Stretch], links: Sequence[Link]) -> list[Group]:
-        """Join what can be joined; the main group first, then the largest ones.
+        """Join components as far as possible; the main group first, then by decreasing size.
 
         Parameters
         ----------
+        stretches
+            The components.
         links
-            Found on the way, between frames of different components.
+            Between frames of different components, from relocalization during tracking.
         """
         if len(stretches) == 1:
             only = stretches[0]
@@ -219,7 +219,7 @@ class Joining:
         ):
             joiner.add(link)
         joiner.decide()
-        joiner.look_for_more()
+        joiner.search_links()
         joiner.reconsider()
         joiner.decide(single=True)
         if self.bridge:
@@ -229,7 +229,7 @@ class Joining:
 
 @dataclass(eq=False)
 class _Island:
-    """Components that are joined so far: each with T_island_component."""
+    """Components that are joined so far, each with T_island_component."""
 
     T: dict[int, Float64]
     joins: list[Join] = field(default_factory=list)
@@ -246,7 +246,7 @@ class _Joiner:
         self._links: list[Link] = []
         self._tried: set[tuple[int, int]] = set()  # pairs of views that were registered
         self._refused: set[tuple[int, ...]] = set()
-        # Frames of each component that links or verification ask about.
+        # Frames of each component that links or verification refer to.
         self._nodes = {s.component: {v.index for v in s.views} for s in stretches}
         self._proposals: dict[tuple[int, ...], tuple[float, list[Link]]] = {}
         self._paths: dict[tuple[int, ...], dict[int, float]] = {}
@@ -256,9 +256,9 @@ class _Joiner:
         self._contradiction = CONTRADICTION
         steps = [_speeds(s, end=True) for s in stretches]
         known = np.concatenate(steps)
-        # (2,) m and rad by the unit of time that the camera hardly exceeds.
-        # Motions that the tracker could not follow may have been faster than any that it did.
-        unknown = np.full((_not_followed(stretches), 2), np.inf)
+        # (2,) m/s and rad/s that the camera hardly exceeds. Motions at which tracking failed may
+        # have been faster than all others.
+        unknown = np.full((_tracking_failures(stretches), 2), np.inf)
         speeds = np.concatenate([known, unknown])
         self._speed = np.full(2, np.inf)
         if len(known):
@@ -266,7 +266,7 @@ class _Joiner:
         self._learn_from_neighbours()
 
     def add(self, link: Link) -> None:
-        """Take note of a link."""
+        """Add a link."""
         if {link.i, link.j} <= self._poses.keys():
             self._links.append(link)
             self._tried.add((link.i, link.j))
@@ -277,10 +277,10 @@ class _Joiner:
             self._nodes[self._component_of[frame]].add(frame)
 
     def decide(self, *, single: bool = False) -> None:
-        """Join islands while links say so, those with the most support first.
+        """Join islands as long as links support it, those with the largest weight first.
 
-        A single link waits for the end, unless the camera had no time to get far: another room may
-        look the same, and only links elsewhere contradict.
+        A single link is considered only at the end (`single`), unless the camera had no time to
+        get far: another room may look the same, and only links elsewhere contradict.
         """
         while True:
             proposals = []
@@ -299,16 +299,16 @@ class _Joiner:
                 return
 
     def _need_not_wait(self, a: _Island, b: _Island, links: list[Link]) -> bool:
-        """Whether to join two islands before everything was tried, for a single link."""
+        """Whether a single link may join two islands before all searches are done."""
         T_a_b = self._T_a_b(a, b, _best(links))
         if np.isfinite(self._speed).all():
             return self._is_near(a, b, T_a_b, IN_SIGHT)
-        # Views in no order are joined one by one: each is one more to compare the next with. What
-        # then hangs on one link is reconsidered.
+        # Unordered views are joined one by one, so that the next is compared with more of them.
+        # Joins that rest on one link are reconsidered later.
         return any(link.certain for link in links) or bool(self._confirming(a, b, T_a_b, links))
 
     def _links_between(self) -> dict[tuple[int, int], list[Link]]:
-        """Links by the positions (a, b), a < b, of the islands that they are between."""
+        """Links by the positions (a, b), a < b, of the islands that they connect."""
         place = {c: k for k, island in enumerate(self._islands) for c in island.T}
         found: dict[tuple[int, int], list[Link]] = {}
         for link in self._links:
@@ -317,8 +317,8 @@ class _Joiner:
                 found.setdefault((a, b), []).append(link)
         return found
 
-    def look_for_more(self) -> None:
-        """Look for links between islands where views look most alike, within the budget."""
+    def search_links(self) -> None:
+        """Register views of different islands, most similar first, within the budget."""
         views = sorted(self._views.values(), key=lambda v: v.index)
         if len(self._islands) < 2 or len(views) < 2:
             return
@@ -327,7 +327,7 @@ class _Joiner:
         if len(looks) <= _ALL:
             i, j = np.nonzero(np.triu(component[:, None] != component))
             far = mutual_unlikeness(looks, _SHIFT)[i, j]
-        else:  # an index: not the square of a long path
+        else:  # by an index, as all pairs would be too many
             i, j = alike(looks, _SHIFT)
             across = component[i] != component[j]
             i, j = i[across], j[across]
@@ -352,10 +352,10 @@ class _Joiner:
                 self.decide()
 
     def reconsider(self) -> None:
-        """Take apart what hangs on a single link, and look for other places.
+        """Undo joins that rest on a single link, and search for links again.
 
-        When it was joined, one of the sides may have been a single view, of which nothing else
-        could be compared.
+        At the time of the join, one of the sides may have been a single view, so that no other
+        views could be compared.
         """
         weak = [
             island.joins[k]
@@ -368,13 +368,13 @@ class _Joiner:
             self._proposals.clear()
             self._refused.clear()
             self._paths.clear()
-            self.look_for_more()
+            self.search_links()
 
     def _components(self, join: Join) -> tuple[int, int]:
         return self._component_of[join.link.i], self._component_of[join.link.j]
 
     def _cut(self, join: Join) -> None:
-        """Make two islands of one that a join alone holds together."""
+        """Split an island at a join that alone connects its two sides."""
         whole = self._island_of(self._components(join)[0])
         self._islands.remove(whole)
         edges = [self._components(other) for other in whole.joins]
@@ -384,7 +384,7 @@ class _Joiner:
             self._islands.append(_Island(T, inside))
 
     def bridge_gaps(self) -> None:
-        """Connect what comes right after a short gap by the motion before and after it."""
+        """Connect components across short gaps by the motion before and after each gap."""
         ordered = sorted(self._stretches.values(), key=lambda s: int(s.frames[0]))
         for before, after in itertools.pairwise(ordered):
             a, b = self._island_of(before.component), self._island_of(after.component)
@@ -395,7 +395,7 @@ class _Joiner:
                 self._merge(a, b, link, [Join(link, "motion", True)])
 
     def groups(self) -> list[Group]:
-        """What is joined, the main group first, then the largest ones."""
+        """Return the joined groups, the main one first, then by decreasing size."""
         found = []
         for island in self._islands:
             first = min(island.T, key=lambda c: int(self._stretches[c].frames[0]))
@@ -416,21 +416,21 @@ class _Joiner:
         return [found[k] for k in order]
 
     def _bridged_from(self, island: _Island, first: int) -> frozenset[int]:
-        """Components that no chain of links connects with the first one."""
-        reached, grown = {first}, True
+        """Components that no chain of links connects to the first one."""
+        reached, changed = {first}, True
         linked = [
             {self._component_of[j.link.i], self._component_of[j.link.j]}
             for j in island.joins
             if j.how == "links"
         ]
-        while grown:
+        while changed:
             more = {c for ends in linked if ends & reached for c in ends}
-            grown = not more <= reached
+            changed = not more <= reached
             reached |= more
         return frozenset(island.T) - reached
 
     def _learn_from_neighbours(self) -> None:
-        """How do neighbouring views of one component fit, and contradict each other?"""
+        """Learn the usual fit and contradiction from neighbouring views of one component."""
         pairs = [(a, b) for s in self._stretches.values() for a, b in itertools.pairwise(s.views)]
         some = np.linspace(0, len(pairs) - 1, min(len(pairs), _LEARN)).round().astype(int)
         options = ProjectiveOptions(levels=PATIENT)
@@ -444,13 +444,13 @@ class _Joiner:
                 found = agreement(b.view, a.view, T_a_b, self_scaled(self._usual))
                 seen.append(found.contradiction)
         if len(seen) > 3:
-            middle = float(np.median(seen))
-            spread = 1.48 * float(np.median(np.abs(np.array(seen) - middle)))
-            limit = middle + _SIGMAS * max(spread, _LEAST_SPREAD)
+            median = float(np.median(seen))
+            spread = 1.48 * float(np.median(np.abs(np.array(seen) - median)))
+            limit = median + _SIGMAS * max(spread, _MIN_SPREAD)
             self._contradiction = max(self._contradiction, min(limit, _MAX_CONTRADICTION))
 
     def _registered(self, first: View, second: View) -> Link | None:
-        """Register two views that look alike; what needs no search does not count as one."""
+        """Register two similar views; only an exhaustive search counts against the budget."""
         found = register_pair(
             second.view, first.view, usual=self._usual, options=self._options.search
         )
@@ -469,7 +469,7 @@ class _Joiner:
         return np.asarray(T, np.float64)
 
     def _T_a_b(self, a: _Island, b: _Island, link: Link) -> Float64:
-        """T_a_b that a link between two islands implies, whichever way it goes."""
+        """T_a_b that a link between two islands implies, whatever its direction."""
         i, j, T = link.i, link.j, link.T_i_j
         if self._component_of[i] not in a.T:
             i, j, T = j, i, se3.inverse(T)
@@ -478,7 +478,7 @@ class _Joiner:
     def _proposal(
         self, a: _Island, b: _Island, between: list[Link]
     ) -> tuple[float, list[Link]] | None:
-        """The links to believe between two islands, and their weight; None if there are none."""
+        """The consistent links between two islands, and their weight; None if there are none."""
         key = _key(a, b, between)
         if key in self._refused:
             return None
@@ -489,7 +489,7 @@ class _Joiner:
         agree = np.ones((n, n), bool)
         for p in range(n):
             for q in range(p + 1, n):
-                agree[p, q] = agree[q, p] = self._say_the_same(
+                agree[p, q] = agree[q, p] = self._consistent(
                     a, b, between[p], between[q], T[p], T[q]
                 )
         weights = [_weight(link) for link in between]
@@ -503,12 +503,12 @@ class _Joiner:
         self._proposals[key] = weight, [between[k] for k in chosen]
         return self._proposals[key]
 
-    def _say_the_same(
+    def _consistent(
         self, a: _Island, b: _Island, first: Link, second: Link, T: Float64, other: Float64
     ) -> bool:
-        """Whether the T_a_b of two links put the view of the first one at the same place.
+        """Whether the T_a_b of two links agree at the view of the first one.
 
-        Drift between the views of the two links, on both sides, is allowed for.
+        Drift between the views of the two links, on both sides, is tolerated.
         """
         i, j = self._ends(a, first)
         k, m = self._ends(a, second)
@@ -529,12 +529,12 @@ class _Joiner:
         return self._stretches[self._component_of[frame]].depth
 
     def _path(self, island: _Island, start: int) -> dict[int, float]:
-        """Length of the way from a frame to those with kept views or joins, as drift grows with it.
+        """Path length, which drift grows with, from a frame to those with stored views or joins.
 
-        Along the poses of components, and over what joins them; turns in rad plus motions as a
+        Along the poses of components, and across joins; rotation in rad plus translation as a
         fraction of the depth.
         """
-        # They only become more, so that their number says which they are.
+        # Nodes are only added, so their number identifies the set.
         key = (start, sum(len(self._nodes[c]) for c in island.T), *sorted(island.T))
         if key not in self._paths:
             nodes = set().union(*(self._nodes[c] for c in island.T))
@@ -562,35 +562,36 @@ class _Joiner:
         return {f: float(away[k]) for f, k in row.items()}
 
     def _join(self, a: _Island, b: _Island, links: list[Link]) -> bool:
-        """Join two islands if what links say is verified."""
+        """Join two islands if the pose of the links is verified."""
         best = _best(links)
         T_a_b = self._T_a_b(a, b, best)
         extra = self._confirming(a, b, T_a_b, links)
         certain = any(link.certain for link in links)
-        sure = self._sureness(a, b, [*links, *extra]) if self._options.surely else None
+        minimum = self._options.min_probability
+        probability = self._probability(a, b, [*links, *extra]) if minimum else None
         if (
             not (certain or len(links) + len(extra) > 1)
-            or (sure is not None and sure < self._options.surely)
+            or (probability is not None and probability < minimum)
             or self._contradicts(a, b, best)
             or not self._reachable(a, b, T_a_b)
         ):
             between = self._links_between()[self._positions(a, b)]
             self._refused.add(_key(a, b, between))
             return False
-        joins = [Join(link, "links", link is best, sure) for link in [*links, *extra]]
+        joins = [Join(link, "links", link is best, probability) for link in [*links, *extra]]
         self._merge(a, b, best, joins)
         return True
 
-    def _sureness(self, a: _Island, b: _Island, links: Sequence[Link]) -> float:
-        """Probability that links between two islands, which agree, are right.
+    def _probability(self, a: _Island, b: _Island, links: Sequence[Link]) -> float:
+        """Probability that consistent links between two islands are right.
 
-        Odds multiply as far as views see something else than those before them, and share what
-        each of the view pairs that were tried could have found by chance (Bonferroni).
+        Odds multiply as far as views are independent, and are divided by the number of tried view
+        pairs (Bonferroni).
         """
         counted: list[Link] = []
         total = 0.0
         for link in sorted(links, key=lambda link: -(link.registration.probability or 0.0)):
-            p = min(link.registration.probability or 0.0, _MOST_SURE)
+            p = min(link.registration.probability or 0.0, _MAX_PROBABILITY)
             if p <= 0:
                 continue
             new = min([1.0, *(self._apart(a, b, link, other) / IN_SIGHT for other in counted)])
@@ -604,9 +605,9 @@ class _Joiner:
         return logistic(total - float(np.log(max(tried, 1))))
 
     def _apart(self, a: _Island, b: _Island, link: Link, other: Link) -> float:
-        """How far the views of two links are from each other on the side where that is farther.
+        """Distance between the views of two links, on the side where it is larger.
 
-        Motion as a fraction of the depth plus turn in rad.
+        Translation as a fraction of the depth plus rotation in rad.
         """
         far = []
         for island, i, k in zip((a, b), self._ends(a, link), self._ends(a, other), strict=True):
@@ -621,7 +622,7 @@ class _Joiner:
 
     def _merge(self, a: _Island, b: _Island, link: Link, joins: list[Join]) -> None:
         T_a_b = self._T_a_b(a, b, link)
-        a.T.update(_moved(b.T, T_a_b))
+        a.T.update(_transformed(b.T, T_a_b))
         a.joins += [*b.joins, *joins]
         for join in joins:
             self._remember_ends(join.link)
@@ -630,7 +631,7 @@ class _Joiner:
     def _overlapping(
         self, a: _Island, b: _Island, T_a_b: Float64
     ) -> list[tuple[View, View, Float64, Agreement]]:
-        """View pairs of both sides that overlap most under T_a_b: T_i_j, and what both saw."""
+        """View pairs of both sides that overlap most under T_a_b: T_i_j, and their agreement."""
         compare = self_scaled(self._usual)
         ours = [self._views[i] for i in self._views if self._component_of[i] in a.T]
         theirs = [self._views[i] for i in self._views if self._component_of[i] in b.T]
@@ -657,9 +658,9 @@ class _Joiner:
     def _contradicts(self, a: _Island, b: _Island, link: Link) -> bool:
         """Whether views of both sides contradict each other more than neighbours do.
 
-        Islands have drifted in themselves, the more the further it is from the link: what
-        contradicts at the pose that they imply counts only if no pose nearby explains it, and says
-        nothing where the drift may be larger than an alignment can follow.
+        Islands have drifted, the more the longer the path from the link. A contradiction at the
+        implied pose counts only if no pose within the drift removes it, and is ignored where the
+        drift may exceed the range of convergence of an alignment.
         """
         overlap = against = 0.0
         T_a_b = self._T_a_b(a, b, link)
@@ -667,7 +668,7 @@ class _Joiner:
         from_i, from_j = self._path(a, i), self._path(b, j)
         for first, second, T, at_implied in self._overlapping(a, b, T_a_b):
             drift = _DRIFT * (from_i[first.index] + from_j[second.index])
-            if drift > _FOLLOWED:
+            if drift > _MAX_ALIGNED:
                 continue
             seen = at_implied
             if seen.contradiction > self._contradiction:
@@ -683,17 +684,17 @@ class _Joiner:
             against += seen.violation + seen.clash
         limit = self._contradiction
         if self._is_near(a, b, T_a_b, _NEAR):
-            # What contradicts has moved, or is an error of the pose.
+            # Contradictions come from moving objects or errors of the pose.
             limit = max(limit, _SAME_PLACE)
         return overlap > 0 and against / overlap > limit
 
     def _is_near(self, a: _Island, b: _Island, T_a_b: Float64, far: float) -> bool:
-        """Whether the camera had no time to get `far` between the two sides, and T_a_b agrees.
+        """Whether the camera had no time to move by `far` between the two sides, and T_a_b agrees.
 
-        A fraction of the depth, and rad. A pose that puts it further away than it can be has not
-        the short time for it, but against it.
+        `far` is a fraction of the depth, and rad. A pose further away than the camera can have
+        moved is contradicted by the short time, not supported.
         """
-        T = {**a.T, **_moved(b.T, T_a_b)}
+        T = {**a.T, **_transformed(b.T, T_a_b)}
         for c in a.T:
             for d in b.T:
                 before, after = self._in_time(c, d)
@@ -713,20 +714,20 @@ class _Joiner:
         return (first, second) if first.frames[0] < second.frames[0] else (second, first)
 
     def _drifted(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
-        """Whether two poses differ by no more than drift and what a single link is off by."""
+        """Whether two poses differ by no more than drift and the error of a single link."""
         between = se3.inverse(T) @ other
         limit = drift + _LINK_ERROR
         return bool(np.linalg.norm(between[:3, 3]) <= limit * depth and se3.angle(between) <= limit)
 
     def _confirming(self, a: _Island, b: _Island, T_a_b: Float64, known: list[Link]) -> list[Link]:
-        """Registrations of other view pairs that say the same as T_a_b."""
+        """Registrations of other view pairs that agree with T_a_b."""
         seen = {frozenset((link.i, link.j)) for link in known}
         found = []
-        count = _VERIFY if self._options.surely else 4
+        count = _VERIFY if self._options.min_probability else 4
         for first, second, T, _ in self._overlapping(a, b, T_a_b)[:count]:
             if frozenset((first.index, second.index)) in seen:
                 continue
-            # Along degenerate directions an alignment stays where it began: that confirms nothing.
+            # Along degenerate directions an alignment stays at its guess, which confirms nothing.
             made = follow(second.view, first.view, T, usual=self._usual)
             link = _link(first, second, made)
             if link is None or len(link.registration.unobservable):
@@ -736,8 +737,8 @@ class _Joiner:
         return found
 
     def _reachable(self, a: _Island, b: _Island, T_a_b: Float64) -> bool:
-        """Whether the camera can have got from the one side to the other in the time it had."""
-        T = {**a.T, **_moved(b.T, T_a_b)}
+        """Whether the camera can have moved from one side to the other in the elapsed time."""
+        T = {**a.T, **_transformed(b.T, T_a_b)}
         for c in a.T:
             for d in b.T:
                 first, second = self._in_time(c, d)
@@ -755,46 +756,46 @@ class _Joiner:
 
 
 def _link(first: View, second: View, found: Registration | None) -> Link | None:
-    """A registration of two views as a link, if it is probable."""
+    """Return a registration of two views as a link, None if it is not probable."""
     if found is None or not found.is_probable:
         return None
     return Link(first.index, second.index, found, found.stands_alone, found.how)
 
 
-def _moved(T: Mapping[int, Float64], T_other: Float64) -> dict[int, Float64]:
+def _transformed(T: Mapping[int, Float64], T_other: Float64) -> dict[int, Float64]:
     """Poses of components in another frame."""
     return {c: np.asarray(T_other @ T_c, np.float64) for c, T_c in T.items()}
 
 
 def _over_the_gap(before: Stretch, after: Stretch, T: Mapping[int, Float64]) -> Float64:
-    """The motion from the end of one component to the begin of another, with T by component."""
+    """The motion from the end of one component to the start of another, with T by component."""
     end = T[before.component] @ before.poses[-1]
     return np.asarray(se3.inverse(end) @ T[after.component] @ after.poses[0], np.float64)
 
 
 def _best(links: Sequence[Link]) -> Link:
-    """The link that the others are taken to confirm."""
+    """The link that defines the pose; the others confirm it."""
     return max(links, key=lambda link: (link.certain, _weight(link)))
 
 
-def _not_followed(stretches: Sequence[Stretch]) -> int:
-    """How often a component ends, and the next frame begins another one of the recording."""
+def _tracking_failures(stretches: Sequence[Stretch]) -> int:
+    """Number of components that end where the next frame of the recording begins another one."""
     first = {(s.recording, int(s.frames[0])) for s in stretches}
     return sum((s.recording, int(s.frames[-1]) + 1) in first for s in stretches)
 
 
 def _key(a: _Island, b: _Island, between: Sequence[Link]) -> tuple[int, ...]:
-    """What was decided about: two islands, and how many links were known between them."""
+    """Key of a decision: two islands, and the number of links between them."""
     return (*sorted(a.T), -1, *sorted(b.T), -1, len(between))
 
 
 def _weight(link: Link) -> float:
-    """A certain link counts for two that are not."""
+    """Weight of a link: a certain one counts twice."""
     return (2.0 if link.certain else 1.0) * (0.5 + (link.registration.support or 0.0))
 
 
 def _speeds(stretch: Stretch, *, end: bool) -> Float64:
-    """(n, 2) m and rad by the unit of time of the motions next to one end."""
+    """(n, 2) m/s and rad/s of the motions next to one end."""
     some = slice(-_AROUND, None) if end else slice(None, _AROUND)
     poses, times = stretch.poses[some], stretch.times[some]
     if len(poses) < 2:
@@ -806,7 +807,7 @@ def _speeds(stretch: Stretch, *, end: bool) -> Float64:
 
 
 def _reach(before: Stretch, after: Stretch) -> Float64:
-    """(2,) m and rad that the camera may have moved over a gap; infinite where it is not known."""
+    """(2,) m and rad that the camera may have moved during a gap; infinite if unknown."""
     speeds = np.concatenate([_speeds(before, end=True), _speeds(after, end=False)])
     if len(speeds) < _AROUND // 4:
         return np.full(2, np.inf)
@@ -815,7 +816,7 @@ def _reach(before: Stretch, after: Stretch) -> Float64:
 
 
 def _bridged(before: Stretch, after: Stretch) -> Link | None:
-    """The motion over a gap, extrapolated from both sides; None where it is too uncertain."""
+    """The motion over a gap, extrapolated from both sides; None if it is too uncertain."""
     elapsed = float(after.times[0] - before.times[-1])
     n = 5
     if min(len(before.frames), len(after.frames)) < n or elapsed <= 0:

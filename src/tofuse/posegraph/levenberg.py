@@ -1,4 +1,4 @@
-"""The default optimiser: all that is known of the poses, each by its full information."""
+"""The default optimiser: all measurements of the poses, weighted by their full information."""
 
 from __future__ import annotations
 
@@ -16,43 +16,43 @@ from tofuse.posegraph.robust import Robust, Settings
 from tofuse.posegraph.solve import Solution, solve
 from tofuse.posegraph.sparse import parts_of
 
-_RIGID = 1e-3  # by how much a rotation may be off orthonormal
-_FARTHEST_M = 1e9  # beyond it, a position is damage
-_NEGATIVE = -1e-9  # of the largest eigenvalue: below it information is not positive
+_RIGID = 1e-3  # largest deviation of a rotation from orthonormal
+_MAX_POSITION_M = 1e9  # larger coordinates are corrupt
+_NEGATIVE = -1e-9  # of the largest eigenvalue: information with a smaller one is not positive
 
 
 @part("optimiser", "levenberg-marquardt", label="validated")
 @dataclass(frozen=True)
 class LevenbergMarquardt(Optimiser):
-    """Weighted least squares on SE(3), in which single loops can be wrong.
+    """Weighted least squares on SE(3), robust against false loops.
 
-    Edges of odometry, gravity and anchors count in full; loop edges as the kernel says. The search
-    starts from the poses in the graph. Connected parts are solved by themselves; the first vertex
-    of each stays where it is. Where a part can't be improved, its poses stay as they are.
+    Edges of odometry, gravity and anchors have their full weight; loop edges that of the robust
+    kernel. The iteration starts from the poses in the graph. Connected parts are solved separately;
+    the first vertex of each stays where it is. If a part can't be improved, its poses stay.
 
     Attributes
     ----------
     robust
-        Kernel of the loop edges. "truncated": all in full, unless they contradict each other;
-        then graduated non-convexity chooses (Yang et al. 2020). Others, see
+        Kernel of the loop edges. "truncated": full weight unless they contradict each other; then
+        graduated non-convexity selects (Yang et al. 2020). For the others see
         `tofuse.posegraph.robust`.
     gate
-        A loop edge is in doubt where its squared error is above this, in units of its
-        information: 100 is ten standard deviations.
-    slack
-        By so much the information of the loops may overstate their standard deviations before
-        "truncated" takes them for wrong.
+        Threshold on a loop edge's squared error, in units of its information: 100 is ten standard
+        deviations.
+    max_inflation
+        Largest factor on the loops' standard deviations before "truncated" rejects them, as stated
+        information is often too large.
     rotation
-        Numbers that stand for a rotation in a step: "tangent", "quaternion" or "cosines".
+        Parametrisation of rotations in a step: "tangent", "quaternion" or "cosines".
     tolerance
-        Stop when a step lowers the objective by less than this share of it.
+        Iterations stop when a step lowers the objective by a smaller fraction.
     max_iterations
-        At most so many steps.
+        Largest number of steps.
     """
 
     robust: Robust = "truncated"
     gate: float = 100.0
-    slack: float = 3.0
+    max_inflation: float = 3.0
     rotation: Rotation = "tangent"
     tolerance: float = 1e-6
     max_iterations: int = 100
@@ -60,8 +60,8 @@ class LevenbergMarquardt(Optimiser):
     def __post_init__(self) -> None:
         if not self.gate > 0:
             raise ValueError(f"gate is {self.gate}, not above 0")
-        if not self.slack >= 1:
-            raise ValueError(f"slack is {self.slack}, not 1 or more")
+        if not self.max_inflation >= 1:
+            raise ValueError(f"max_inflation is {self.max_inflation}, not 1 or more")
 
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`.
@@ -81,7 +81,7 @@ class LevenbergMarquardt(Optimiser):
             history = solution.history if after < before else (before,)
             if after < before:
                 poses[vertices] = se3.orthonormalise(solution.poses[: len(vertices)])
-                # Not even by rounding.
+                # Exactly as before, without rounding errors.
                 poses[vertices[0]] = graph.poses[vertices[0]]
             weights[edges] = solution.weights[: len(edges)]
             histories.append(history)
@@ -100,7 +100,7 @@ class LevenbergMarquardt(Optimiser):
         )
 
     def _solve(self, graph: PoseGraph, vertices: Intp, edges: Intp) -> Solution:
-        """Solve one part; anchors are edges to one more vertex, behind the others."""
+        """Solve one part; anchors are edges to one additional vertex, the last."""
         number = np.full(len(graph.ids), -1)
         number[vertices] = np.arange(len(vertices))
         poses, pairs = graph.poses[vertices], number[graph.edges[edges]]
@@ -122,7 +122,7 @@ class LevenbergMarquardt(Optimiser):
             poses, pairs, measured, information,
             loop=loop, fixed=fixed, gravity=_gravity_of(graph, number),
             settings=Settings(
-                self.robust, self.gate, self.slack, self.rotation, self.tolerance,
+                self.robust, self.gate, self.max_inflation, self.rotation, self.tolerance,
                 self.max_iterations,
             ),
         )  # fmt: skip
@@ -147,7 +147,7 @@ def _gravity_of(graph: PoseGraph, number: Intp) -> Gravity | None:
 def pieces(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
     """Positions of the vertices and of the edges of each connected part.
 
-    Anchors join what they hold; gravity does not, as it leaves four of six directions free.
+    Anchors connect their vertices; gravity does not, as it leaves four of six directions free.
     """
     n = len(graph.ids)
     pairs = graph.edges
@@ -161,14 +161,14 @@ def pieces(graph: PoseGraph) -> list[tuple[Intp, Intp]]:
 
 
 def added_up(histories: list[tuple[float, ...]]) -> tuple[float, ...]:
-    """Objective of all parts together at every step; those that are done keep their last value."""
+    """Objective of all parts together at every step; converged parts keep their last value."""
     length = max((len(h) for h in histories), default=1)
     padded = [[*h, *[h[-1]] * (length - len(h))] for h in histories]
     return tuple(float(sum(column)) for column in zip(*padded, strict=True)) if padded else (0.0,)
 
 
 def check_graph(graph: PoseGraph) -> None:
-    """Raise InputError for poses or measurements that are none, or information not positive."""
+    """Raise InputError for invalid poses, measurements or information."""
     check_motions(graph)
     bad = np.flatnonzero(~np.isfinite(graph.information).all((1, 2)))
     if len(bad):
@@ -184,7 +184,7 @@ def check_graph(graph: PoseGraph) -> None:
 
 
 def check_motions(graph: PoseGraph) -> None:
-    """Raise InputError for poses or measurements that are no rigid motions."""
+    """Raise InputError for poses or measurements that are not rigid motions."""
     for name, T in (("pose", graph.poses), ("measurement", graph.measurements)):
         bad = np.flatnonzero(~np.isfinite(T).all((1, 2)))
         if len(bad):
@@ -192,6 +192,6 @@ def check_motions(graph: PoseGraph) -> None:
         R = np.clip(T[:, :3, :3], -10, 10)
         off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max((1, 2), initial=0)
         far = np.abs(T[:, :3, 3]).max(1, initial=0)
-        bad = np.flatnonzero((off > _RIGID) | (far > _FARTHEST_M) | (np.linalg.det(R) < 0))
+        bad = np.flatnonzero((off > _RIGID) | (far > _MAX_POSITION_M) | (np.linalg.det(R) < 0))
         if len(bad):
-            raise InputError(f"{name} {bad[0]} is no rigid motion", where="pose graph")
+            raise InputError(f"{name} {bad[0]} is not a rigid motion", where="pose graph")

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.errors import RegistrationError
 from tofuse.posegraph.graph import LoopRecord
-from tofuse.posegraph.views import ViewStore
+from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.icp import algorithm_1

@@ -19,7 +19,7 @@ from tofuse.posegraph.loops import (
     given_loop,
     in_order,
 )
-from tofuse.posegraph.views import ViewStore
+from tofuse.posegraph.view_store import ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
 

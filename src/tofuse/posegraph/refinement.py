@@ -1,4 +1,4 @@
-"""Refinement as a part: which views take part, what is believed, and how the others follow."""
+"""Refinement as a part: selection of views, acceptance of the result, and poses of other frames."""
 
 from __future__ import annotations
 
@@ -15,17 +15,22 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.outside import Told
-from tofuse.posegraph.refine import Beside, Refined, RefineOptions, refine
-from tofuse.posegraph.submaps import InSubmap, fell, refine_submaps
-from tofuse.posegraph.suspicion import Suspicion, loop_gap, of_submaps, suspicion
-from tofuse.posegraph.views import KeptView, Outline, PosedView, Spilled, ViewStore
+from tofuse.posegraph.calibration_check import (
+    CalibrationCheck,
+    check_calibration,
+    loop_gap,
+    of_submaps,
+)
+from tofuse.posegraph.external_sensors import SensorPriors
+from tofuse.posegraph.joint_alignment import Priors, Refined, RefineOptions, refine
+from tofuse.posegraph.submaps import RefinedSubmap, fell, refine_submaps
+from tofuse.posegraph.view_store import KeptView, Outline, PosedView, Spilled, ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
 
 CameraError = Literal["offset", "scale", "focal"]
 
-# Neighbouring pixels share their noise: so many count as one.
+# Neighbouring pixels have correlated noise: this many count as one.
 _SHARED_NOISE = 5.0
 _ERRORS: dict[CameraError, int] = {
     "offset": kernels.OFFSET,
@@ -36,30 +41,30 @@ _ERRORS: dict[CameraError, int] = {
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What a refinement made of a trajectory.
+    """Result of the refinement of a trajectory.
 
     Attributes
     ----------
     poses
         (N, 4, 4) T_world_camera; the first has not moved.
     kept
-        Whether it is believed: only a trajectory whose views support each other better. Where they
-        do so as well as before, but for chance, the poses stay, and what was measured counts.
+        Whether it is accepted: only if the views support each other better. If their support is
+        the same but for chance, the poses stay, but the measurements are used.
     views, pairs
-        How many took part.
+        Numbers of views and of pairs that were compared.
     moved_m, moved_rad
         Largest motions of a view.
     support
-        How well the views agree, up to 1, before and after: see `refine.Support`.
+        Mean support of the views, up to 1, before and after: see `joint_alignment.Support`.
     errors
-        Of the camera, by name, where they were estimated: what is missing from the range (m), from
-        the depth (share), and by how much rays are wider than thought (share).
+        Estimated errors of the camera by name: corrections of the range (m), of the depth
+        (fraction) and of the width of the rays (fraction).
     edges
-        What each pair measures by itself, in frame indices; none unless kept.
-    suspicion
-        What the views say of errors of the camera, where they were asked.
+        Measurement of each pair by itself, by frame indices; none unless kept.
+    calibration_check
+        Evidence for errors of the camera, if it was computed.
     stated
-        Pairs (i, j) of edges that do not rest on what the two views see of each other.
+        Pairs (i, j) of edges that do not come from the overlap of the two views.
     """
 
     poses: Float64
@@ -71,35 +76,44 @@ class Refinement:
     support: tuple[float, float] = (0.0, 0.0)
     errors: dict[str, float] = field(default_factory=dict)
     edges: tuple[Measured, ...] = ()
-    suspicion: Suspicion | None = None
+    calibration_check: CalibrationCheck | None = None
     stated: tuple[tuple[int, int], ...] = ()
 
 
 class Refiner(Protocol):
-    """Refinement at work on one recording.
+    """State of a refinement of one recording.
 
     Attributes
     ----------
     points
-        Whether it looks at the points of frames, and not only at prepared views.
+        Whether it needs the points of frames, not only prepared views.
     """
 
     points: ClassVar[bool] = True
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
-        """Add the next frame that has a pose, if it looks at points."""
+        """Add the next frame that has a pose, if `points` is set."""
         ...
 
-    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
-        """Refine the poses (N, 4, 4) of all frames, whose indices are `ids`, ascending.
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
+        """Refine the poses of all frames.
 
-        `told` is what other sensors say of them.
+        Parameters
+        ----------
+        ids
+            (N,) frame indices, ascending.
+        poses
+            (N, 4, 4) T_world_camera.
+        measured
+            Measurements by external sensors.
         """
         ...
 
 
 class Refining(Protocol):
-    """A method that makes poses better once loops are closed."""
+    """A method that refines poses after loop closure."""
 
     part_kind: ClassVar[str] = "refinement"
 
@@ -111,7 +125,7 @@ class Refining(Protocol):
 @part("refinement", "none")
 @dataclass(frozen=True)
 class NoRefinement(Refining):
-    """Leaves the poses as the optimiser found them."""
+    """Leaves the poses as they are after the optimisation."""
 
     def start(self, views: ViewStore[PreparedView]) -> Refiner:
         """See `Refining.start`."""
@@ -124,19 +138,21 @@ class _Idle(Refiner):
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """Keep nothing."""
 
-    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
         """See `Refiner.finish`."""
         return Refinement(poses)
 
 
 @dataclass(frozen=True, eq=False)
 class Known(Refining):
-    """Leaves the poses, which were refined elsewhere, and tells what was measured there.
+    """Keeps poses that were refined before, with the measurements of that refinement.
 
     Attributes
     ----------
     measured, stated
-        In frame indices: what pairs of views measured, and what is known otherwise.
+        By frame indices: measurements of pairs of views, and other edges.
     """
 
     measured: tuple[Measured, ...]
@@ -151,7 +167,9 @@ class _Known(_Idle):
     def __init__(self, known: Known) -> None:
         self._known = known
 
-    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
         """See `Refiner.finish`."""
         there = set(ids)
         edges = (*self._known.measured, *self._known.stated)
@@ -166,22 +184,22 @@ class _Known(_Idle):
 @part("refinement", "joint")
 @dataclass(frozen=True)
 class Joint(Refining):
-    """Moves all views until each agrees with all that it overlaps with (eq 2.8), see `refine`.
+    """Joint alignment of all overlapping views (eq 2.8), see `refine`.
 
     Views are spaced by the motion of the camera (`ViewStore`); frames in between follow them. The
-    outcome is believed only if the views support each other at least as well as before, and views
-    that lose support stay where their neighbours had them.
+    result is accepted only if the views support each other at least as well as before, and views
+    that lose support keep their pose relative to their neighbours.
 
     Attributes
     ----------
     refine
-        How they are refined.
+        Options of the joint alignment.
     calibrate
-        Errors of the camera that are estimated as well: "offset", "scale", "focal".
+        Errors of the camera to estimate as well: "offset", "scale", "focal".
     loss
-        A view has lost support if it fell by more.
+        Largest tolerated decrease of a view's support.
     submap
-        Up to so many views are refined together; of more, so many at a time, see `submaps`.
+        Largest number of views that are refined together; more are divided, see `submaps`.
     """
 
     refine: RefineOptions = RefineOptions()  # noqa: RUF009 - immutable
@@ -210,7 +228,9 @@ class _Joint(Refiner):
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`. The views are in the store."""
 
-    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
         """See `Refiner.finish`."""
         options = self._options
         row = {int(index): k for k, index in enumerate(ids)}
@@ -220,7 +240,7 @@ class _Joint(Refiner):
             return Refinement(poses, views=len(posed))
         before = poses[at]
         together = _together if len(posed) <= options.submap else _in_submaps
-        refined, found = together(options, posed, before, told or Told(), self._store)
+        refined, found = together(options, posed, before, measured or SensorPriors(), self._store)
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
         unchanged = Refinement(poses, False, len(posed), len(refined.pairs), support=mean)
@@ -229,14 +249,13 @@ class _Joint(Refiner):
             return unchanged
         after = without_losers(before, refined.poses, gained < -options.loss)
         if mean[1] < mean[0]:
-            # They were refined before, and are as good as they can be; but what the pairs measure
-            # says how good that is.
+            # The poses were at the optimum already; the measurements give their covariances.
             after = before
         return replace(
             moved_to(unchanged, at, after),
-            suspicion=found(),
+            calibration_check=found(),
             errors={name: float(refined.errors[_ERRORS[name]]) for name in options.calibrate},
-            edges=measured_by([p.index for p in posed], refined),
+            edges=pairwise_measurements([p.index for p in posed], refined),
         )
 
 
@@ -244,16 +263,16 @@ def _together(
     options: Joint,
     posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
-    told: Told,
+    measured: SensorPriors,
     _: ViewStore[PreparedView],
-) -> tuple[Refined, Callable[[], Suspicion]]:
-    """Refine all views at once; returns also what tells what they say of their camera."""
+) -> tuple[Refined, Callable[[], CalibrationCheck]]:
+    """Refine all views at once; also returns a function that computes the calibration check."""
     views = [_kept(p, options) for p in posed]
-    beside = _beside([p.index for p in posed], told)
+    priors = _priors([p.index for p in posed], measured)
     numbers = [_ERRORS[name] for name in options.calibrate]
-    refined = refine(views, poses, options.refine, calibrate=numbers, beside=beside)
-    return refined, lambda: _suspicion(
-        InSubmap(views, np.arange(len(views)), refined, beside), options
+    refined = refine(views, poses, options.refine, calibrate=numbers, priors=priors)
+    return refined, lambda: _calibration_check(
+        RefinedSubmap(views, np.arange(len(views)), refined, priors), options
     )
 
 
@@ -261,27 +280,27 @@ def _in_submaps(
     options: Joint,
     posed: Sequence[PosedView[PreparedView]],
     poses: Float64,
-    told: Told,
+    measured: SensorPriors,
     store: ViewStore[PreparedView],
-) -> tuple[Refined, Callable[[], Suspicion]]:
-    """Refine views submap by submap; returns also what tells what they say of their camera."""
+) -> tuple[Refined, Callable[[], CalibrationCheck]]:
+    """Refine submap by submap; also returns a function that computes the calibration check."""
     ids = [p.index for p in posed]
-    refined, said = refine_submaps(
+    refined, checks = refine_submaps(
         [_Seen.of(_kept(p, options), store.outlines) for p in posed],
         poses,
         options.refine,
         options.submap,
         lambda some: [_kept(posed[k], options) for k in some],
-        lambda some: _beside(ids if some is None else [ids[k] for k in some], told),
-        partial(_suspicion, options=options),
+        lambda some: _priors(ids if some is None else [ids[k] for k in some], measured),
+        partial(_calibration_check, options=options),
         [_ERRORS[name] for name in options.calibrate],
     )
-    return refined, lambda: of_submaps(said)
+    return refined, lambda: of_submaps(checks)
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A view's outline, which may be on disk."""
+    """The outline of a view, possibly on disk."""
 
     middle: Float64
     kept: Spilled[Outline]
@@ -300,19 +319,26 @@ def _kept(posed: PosedView[PreparedView], options: Joint) -> KeptView:
     return KeptView.of(posed.view.with_pixel_variance().without_caches(), options.refine.points)
 
 
-def _suspicion(one: InSubmap, options: Joint) -> Suspicion:
-    """What refined views say of their camera."""
+def _calibration_check(one: RefinedSubmap, options: Joint) -> CalibrationCheck:
+    """Check the calibration by refined views; with estimated errors only the loop's gap."""
     refined = one.refined
     if not options.calibrate:
-        return suspicion(one.views, refined, options.refine, one.beside)
+        return check_calibration(one.views, refined, options.refine, one.priors)
     gap = loop_gap(one.views, refined, refined.poses, refined.errors, options.refine)
-    return Suspicion(gap=gap)
+    return CalibrationCheck(gap=gap)
 
 
-def measured_by(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
-    """What pairs measure by themselves, with what all of them together can know.
+def pairwise_measurements(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
+    """Return the measurements of single pairs, with reduced information.
 
-    What is wrong with a view is wrong in all its pairs, so that many know little more than one.
+    All pairs of a view share its errors, so the information is divided by their number.
+
+    Parameters
+    ----------
+    ids
+        Frame indices of the views.
+    refined
+        Result of their joint alignment.
     """
     pairs = refined.pairs
     partners = np.bincount(pairs.ravel(), minlength=len(ids))
@@ -325,19 +351,19 @@ def measured_by(ids: Sequence[int], refined: Refined) -> tuple[Measured, ...]:
     )
 
 
-def _beside(ids: Sequence[int], told: Told) -> Beside:
-    """What other sensors say of the views, on the scale of what their pixels say."""
+def _priors(ids: Sequence[int], measured: SensorPriors) -> Priors:
+    """Measurements of external sensors as priors on the views, scaled to the pixels' noise."""
     place = {index: k for k, index in enumerate(ids)}
-    steps = told.between(ids)
+    steps = measured.between(ids)
     m = len(steps)
-    gravity = told.gravity_of(ids)
+    gravity = measured.gravity_of(ids)
     if gravity is not None:
         gravity = replace(
             gravity,
             sigma=gravity.sigma / np.sqrt(_SHARED_NOISE),
             gate=gravity.gate * _SHARED_NOISE,
         )
-    return Beside(
+    return Priors(
         np.array([(place[s.i], place[s.j]) for s in steps], np.intp).reshape(m, 2),
         np.array([s.T_i_j for s in steps]).reshape(m, 4, 4),
         np.array([s.information * _SHARED_NOISE for s in steps]).reshape(m, 6, 6),
@@ -346,14 +372,14 @@ def _beside(ids: Sequence[int], told: Told) -> Beside:
 
 
 def without_losers(before: Float64, after: Float64, lost: Bool) -> Float64:
-    """Poses (N, 4, 4) `after`, but views that lost support stay where a neighbour had them.
+    """Return the refined poses, with views that lost support fixed to their nearest neighbour.
 
     Parameters
     ----------
-    before
-        (N, 4, 4) poses that were refined.
+    before, after
+        (N, 4, 4) poses before and after the refinement.
     lost
-        (N,) views that lost support.
+        (N,) mask of the views that lost support.
     """
     out = after.copy()
     good = np.flatnonzero(~lost)
@@ -364,10 +390,12 @@ def without_losers(before: Float64, after: Float64, lost: Bool) -> Float64:
 
 
 def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
-    """Points (N, 3) of a camera's frame where they are, if the camera errs like this.
+    """Correct points for errors of the camera.
 
     Parameters
     ----------
+    points
+        (N, 3) m, in the camera's frame.
     errors
         As in `Refinement.errors`.
     """
@@ -381,12 +409,14 @@ def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:
 
 
 def moved_to(unchanged: Refinement, at: Intp, after: Float64) -> Refinement:
-    """What is kept of a refinement by which the poses at positions `at` (ascending) become `after`.
+    """Return the accepted refinement in which the poses at positions `at` become `after`.
 
     Parameters
     ----------
     unchanged
-        As it would be told if it were not kept.
+        The refinement as if it were rejected.
+    at
+        (M,) ascending positions of the refined views.
     after
         (M, 4, 4) T_world_camera.
     """
@@ -401,10 +431,19 @@ def moved_to(unchanged: Refinement, at: Intp, after: Float64) -> Refinement:
 
 
 def followed(poses: Float64, at: Intp, after: Float64) -> Float64:
-    """All poses (N, 4, 4), when those at positions `at` (ascending) have become `after`.
+    """Move all poses along with some that were refined.
 
-    Each frame keeps its motion relative to the views before and after it, and lies between what
-    the two say by its place between them.
+    Each frame keeps its motion relative to the views before and after it, interpolated between the
+    two by its position between them.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) of all frames, before.
+    at
+        (M,) ascending positions of the refined poses.
+    after
+        (M, 4, 4) refined poses.
     """
     every = np.arange(len(poses))
     right = np.clip(np.searchsorted(at, every), 0, len(at) - 1)

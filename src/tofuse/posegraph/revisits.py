@@ -14,6 +14,7 @@ from tofuse.geometry import se3
 from tofuse.kernels.executors import executor
 from tofuse.parts import part
 from tofuse.posegraph.appearance import ALIKE, Appearance
+from tofuse.posegraph.covariances import relative_covariance
 from tofuse.posegraph.graph import LoopRecord
 from tofuse.posegraph.loops import (
     ClosedLoop,
@@ -23,8 +24,7 @@ from tofuse.posegraph.loops import (
     given_loop,
     in_order,
 )
-from tofuse.posegraph.trust import relative_covariance
-from tofuse.posegraph.views import (
+from tofuse.posegraph.view_store import (
     KeptView,
     Outline,
     Outlined,

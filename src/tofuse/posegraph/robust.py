@@ -20,7 +20,7 @@ Robust = Literal["none", "huber", "cauchy", "geman-mcclure", "dcs", "switchable"
 
 @dataclass(frozen=True)
 class Settings:
-    """How to minimise.
+    """Options of the minimisation.
 
     Attributes
     ----------
@@ -30,21 +30,20 @@ class Settings:
         Threshold on an edge's squared error in units of its information: at 100, ten standard
         deviations. (That of a good edge is a chi-square variable with six degrees of freedom,
         above 40 only once in two million; but few are so good.)
-    slack
-        The information may overstate what the loops are worth: by so much, as a ratio of standard
-        deviations, the threshold may grow, if the median error of the accepted loops asks for
-        it. Of "truncated" alone.
+    max_inflation
+        Largest factor on the loops' standard deviations, as stated information is often too large;
+        estimated from the quartile of the loops' errors. Of "truncated" alone.
     rotation
-        Numbers that stand for a rotation, see `tofuse.posegraph.charts`.
+        Parametrisation of rotations, see `tofuse.posegraph.charts`.
     tolerance
-        Stop when a step lowers the objective by less than this share of it.
+        Iterations stop when a step lowers the objective by a smaller fraction.
     max_iterations
-        At most so many steps, in each of the stages of "truncated".
+        Largest number of steps, in each of the stages of "truncated".
     """
 
     robust: Robust = "truncated"
     gate: float = 100.0
-    slack: float = 3.0
+    max_inflation: float = 3.0
     rotation: Rotation = "tangent"
     tolerance: float = 1e-6
     max_iterations: int = 100

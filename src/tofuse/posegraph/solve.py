@@ -1,8 +1,8 @@
 """Least squares over a pose graph, on plain arrays: sparse Levenberg-Marquardt on SE(3).
 
-The objective is the sum over all edges of ``e^T Omega e`` with ``e = log(Z^-1 T_i^-1 T_j)``, in
-which edges that close loops may be judged by a robust kernel (`tofuse.posegraph.robust`), and of
-what gravity says of single poses. Poses are perturbed on the right. With ``E = exp(e)``::
+The objective is the sum over all edges of ``e^T Omega e`` with ``e = log(Z^-1 T_i^-1 T_j)``, with
+an optional robust kernel on loop edges (`tofuse.posegraph.robust`), and of the errors of gravity at
+single poses. Poses are perturbed on the right. With ``E = exp(e)``::
 
     log(E exp(xi)) = e + J_r^-1(e) xi,    xi = d_j - Ad(T_j_i) d_i
 
@@ -18,15 +18,15 @@ import numpy as np
 from tofuse.arrays import Bool, Float64, Intp
 from tofuse.posegraph import robust
 from tofuse.posegraph.descent import Descent, Problem
+from tofuse.posegraph.gnc import GraduatedNonConvexity
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.robust import Settings
 from tofuse.posegraph.sparse import Factor, first_of_parts
-from tofuse.posegraph.truncated import Truncated
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What came out.
+    """Result of the minimisation.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class Solution:
     chi2
         (m,) squared errors of the edges, weighted by their full information.
     weights
-        (m,) share of its information with which each edge counted in the end.
+        (m,) final weight of each edge, 0 to 1.
     history
-        The objective at the start and after every step. It falls at every step, unless
-        "truncated" had to choose among the edges: it is that of the edges chosen in the end, those
-        that it left out counting as much as an edge at the threshold.
+        The objective at the start and after every step. It falls at every step, unless "truncated"
+        selects among the edges: then it is that of the finally accepted edges, and rejected ones
+        count as an edge at the threshold.
     converged
         Whether the stopping rule was met.
     """
@@ -67,7 +67,7 @@ def solve(
     gravity: Gravity | None = None,
     settings: Settings | None = None,
 ) -> Solution:
-    """Find the poses that fit the measured relative poses best, starting from those given.
+    """Minimise the objective over the poses, starting from `poses`.
 
     Parameters
     ----------
@@ -78,11 +78,11 @@ def solve(
     measurements, information
         (m, 4, 4) measured T_i_j and (m, 6, 6) information of ``log(Z^-1 T_i^-1 T_j)``.
     loop
-        (m,) mask of the edges that the robust kernel judges; none unless given.
+        (m,) mask of the edges with the robust kernel; none by default.
     fixed
-        (n,) mask of poses that don't move; the first of each connected part unless given.
+        (n,) mask of fixed poses; by default the first of each connected part.
     gravity
-        Directions measured by single cameras.
+        Directions of gravity measured at single poses.
     settings
         Kernel, thresholds and stopping rule.
     """
@@ -92,7 +92,7 @@ def solve(
     fixed = first_of_parts(len(poses), pairs) if fixed is None else np.asarray(fixed, bool)
     problem = Problem(pairs, measurements, information, fixed, gravity, settings.rotation)
     if settings.robust == "truncated" and loop.any():
-        found = Truncated(problem, poses, loop, settings)
+        found = GraduatedNonConvexity(problem, poses, loop, settings)
         converged = found.run()
         log = found.descent.log
         history = tuple(float(np.minimum(x, found.limit).sum()) + extra for x, extra in log)

@@ -1,10 +1,10 @@
-"""Refinement of more views than fit into memory: in submaps, and by a graph of what they measured.
+"""Joint alignment of more views than fit into memory: in submaps, and by a graph of their pairs.
 
-Views are cut into submaps by where they look, so that visits of one place are in one submap however
-far apart in time. Each is refined in itself (`refine`), together with those views of its neighbours
-that it overlaps with. What every pair measured then makes one sparse graph of all views: its least
-squares are those of all pairs at once, about where each submap has them. A submap whose views come
-to support each other less says that they stay as they were to each other.
+Views are divided into submaps by the place that they see, so that all visits of a place are in one
+submap. Each is refined by itself (`refine`), together with overlapping views of its neighbours. The
+measurements of all pairs then make one sparse graph of all views, whose least squares are those of
+all pairs, linearised at the result of each submap. If the views of a submap come to support each
+other less, their relative poses are kept as they were.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.kernels.executors import executor
 from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.refine import (
+from tofuse.posegraph.joint_alignment import (
     UNITS,
-    Beside,
+    Priors,
     Refined,
     RefineOptions,
     Support,
-    chosen,
     refine,
+    spread_evenly,
     support_of,
 )
-from tofuse.posegraph.views import KeptView, Outlined, looked_at, overlaps
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.view_store import KeptView, Outlined, looked_at, overlaps
 
 A = TypeVar("A")
 
-# Views of its neighbours that a submap takes in, at most, as a share of its own.
+# Largest number of views of its neighbours in a submap, as a fraction of its own.
 _BORDER = 0.25
-# How firmly a view is held beside the one before it where nothing else holds it.
-_HELD = 1e-3
+# Information of a weak prior on the motion between views, in units of 1 cm and 1 degree.
+_WEAK_PRIOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Submap:
     views
         (N,) positions of its own views and of those of its neighbours, ascending.
     pairs
-        (M, 2) positions i < j of the views, among all, that are compared here.
+        (M, 2) positions i < j of the views, among all, that are compared in this submap.
     """
 
     views: Intp
@@ -58,21 +58,21 @@ class Submap:
 
 
 @dataclass(frozen=True, eq=False)
-class InSubmap:
-    """One submap as it was refined: its views, where they are among all, and what was found."""
+class RefinedSubmap:
+    """A refined submap: its views, their positions among all, the result, and the priors."""
 
     views: Sequence[KeptView]
     at: Intp
     refined: Refined
-    beside: Beside
+    priors: Priors
 
 
-def cut(middles: Float64, most: int) -> Intp:
-    """(N,) number of the part that each of the places (N, 3) is in, of at most `most` places each.
+def cut(places: Float64, max_size: int) -> Intp:
+    """(N,) part of each of the places (N, 3), with at most `max_size` places in each part.
 
-    Halves, or as near to it as numbers allow, across the longest axis, again and again.
+    By recursive bisection, as evenly as possible, across the longest axis.
     """
-    label = np.zeros(len(middles), np.intp)
+    label = np.zeros(len(places), np.intp)
     count = 0
 
     def split(rows: Intp, parts: int) -> None:
@@ -81,7 +81,7 @@ def cut(middles: Float64, most: int) -> Intp:
             label[rows] = count
             count += 1
             return
-        centred = middles[rows] - middles[rows].mean(0)
+        centred = places[rows] - places[rows].mean(0)
         axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         order = rows[np.argsort(centred @ axis, kind="stable")]
@@ -90,17 +90,17 @@ def cut(middles: Float64, most: int) -> Intp:
         split(np.sort(order[:at]), first)
         split(np.sort(order[at:]), parts - first)
 
-    split(np.arange(len(middles)), max(1, -(-len(middles) // most)))
+    split(np.arange(len(places)), max(1, -(-len(places) // max_size)))
     return label
 
 
-def submaps(middles: Float64, pairs: Intp, most: int) -> list[Submap]:
-    """Cut views that look at places (N, 3), and overlap in pairs (M, 2), into submaps.
+def submaps(places: Float64, pairs: Intp, max_size: int) -> list[Submap]:
+    """Divide views that see places (N, 3), and overlap in pairs (M, 2), into submaps.
 
-    A pair is compared in the submap of one of its views: that of the later one, as far as the other
-    one is among those that most pairs of that submap ask for.
+    A pair is compared in the submap of its later view, if the other view belongs to it or is among
+    the views of neighbours with most pairs there.
     """
-    label = cut(middles, most)
+    label = cut(places, max_size)
     found = []
     for part in range(label.max() + 1):
         mine = label[pairs[:, 1]] == part
@@ -117,36 +117,38 @@ def refine_submaps(
     outlines: Sequence[Outlined],
     poses: Float64,
     options: RefineOptions,
-    most: int,
+    max_size: int,
     load: Callable[[Intp], list[KeptView]],
-    beside: Callable[[Intp | None], Beside],
-    ask: Callable[[InSubmap], A],
+    priors: Callable[[Intp | None], Priors],
+    evaluate: Callable[[RefinedSubmap], A],
     calibrate: Sequence[int] = (),
 ) -> tuple[Refined, list[A]]:
-    """Refine all views, submap by submap; see `refine`. Returns also what each one answered.
+    """Refine all views submap by submap, see `refine`; also returns `evaluate` of each submap.
 
     Parameters
     ----------
     outlines
         Of the N views.
     poses
-        (N, 4, 4) T_world_camera to start from; the first stays.
-    most
-        Views of a submap, without those of its neighbours.
+        (N, 4, 4) initial T_world_camera; the first stays.
+    options
+        As for `refine`.
+    max_size
+        Largest number of views of a submap, without those of its neighbours.
     load
-        Gives views by their positions. Those of one submap are asked for at a time.
-    beside
-        Gives what is known beside them of views by their positions, None for all.
-    ask
-        Is asked about each submap once it was refined, maybe in another process.
+        Returns views by their positions; called for one submap at a time.
+    priors
+        Returns the priors on views by their positions, None for all.
+    evaluate
+        Called with each refined submap, possibly in another process.
     calibrate
-        Errors of the camera that are estimated: in each submap by itself, and the median counts.
+        Errors of the camera to estimate: in each submap by itself, of which the median is taken.
     """
-    pairs = chosen(overlaps(outlines, poses, options.overlap)[0], options.neighbours)
-    parts = [s for s in submaps(looked_at(outlines, poses), pairs, most) if len(s.pairs)]
+    pairs = spread_evenly(overlaps(outlines, poses, options.overlap)[0], options.neighbours)
+    parts = [s for s in submaps(looked_at(outlines, poses), pairs, max_size) if len(s.pairs)]
 
     def arguments(k: int) -> tuple[Any, ...]:
-        # The views go before those of the next submap come.
+        # Only one submap's views are in memory at a time.
         part = parts[k]
         return (
             load(part.views),
@@ -154,8 +156,8 @@ def refine_submaps(
             poses[part.views],
             options,
             calibrate,
-            beside(part.views),
-            ask,
+            priors(part.views),
+            evaluate,
         )
 
     made = executor().map(_refined_alone, len(parts), arguments, large=True)
@@ -171,7 +173,7 @@ def refine_submaps(
     asked = np.concatenate([part.pairs for part, _ in found])
     T_i_j = np.concatenate([r.measured for _, r in found])
     information = np.concatenate([r.information for _, r in found])
-    solved = _solved(poses, asked, T_i_j, information, beside(None))
+    solved = _solved(poses, asked, T_i_j, information, priors(None))
     after = [
         support_of(load(part.views), solved[part.views], refined, options)
         for part, refined in found
@@ -191,7 +193,7 @@ def refine_submaps(
 
 
 def fell(gained: Float64) -> bool:
-    """Whether the support of views (N,) fell on average by more than chance explains."""
+    """Whether gains (N,) of the views' support are significantly negative on average."""
     error = float(gained.std(ddof=1)) / np.sqrt(len(gained))
     return float(gained.mean()) < -error
 
@@ -202,19 +204,19 @@ def _refined_alone(
     poses: Float64,
     options: RefineOptions,
     calibrate: Sequence[int],
-    beside: Beside,
-    ask: Callable[[InSubmap], A],
+    priors: Priors,
+    evaluate: Callable[[RefinedSubmap], A],
 ) -> tuple[Refined, A]:
-    """One submap by itself, from its views' poses (N, 4, 4), and what it answers."""
+    """Refine one submap by itself, from poses (N, 4, 4), and evaluate it."""
     local = np.searchsorted(part.views, part.pairs)
     start = se3.inverse(poses[0]) @ poses
-    refined = refine(views, start, options, calibrate=calibrate, beside=beside, pairs=local)
-    answer = ask(InSubmap(views, part.views, refined, beside))
-    return _believed(refined, start), answer
+    refined = refine(views, start, options, calibrate=calibrate, priors=priors, pairs=local)
+    answer = evaluate(RefinedSubmap(views, part.views, refined, priors))
+    return _or_unchanged(refined, start), answer
 
 
-def _believed(refined: Refined, start: Float64) -> Refined:
-    """What a submap says; where its views agree no better for it, that they stay as they were."""
+def _or_unchanged(refined: Refined, start: Float64) -> Refined:
+    """The result of a submap; its initial poses if the support of its views fell."""
     n = len(start)
     if not fell(refined.after.of_views(n) - refined.before.of_views(n)):
         return refined
@@ -227,24 +229,24 @@ def _believed(refined: Refined, start: Float64) -> Refined:
 
 
 def _solved(
-    poses: Float64, pairs: Intp, measured: Float64, information: Float64, beside: Beside
+    poses: Float64, pairs: Intp, measured: Float64, information: Float64, priors: Priors
 ) -> Float64:
-    """Poses (N, 4, 4) at which all pairs together are satisfied best; the first stays."""
+    """Least-squares poses (N, 4, 4) of all pairs; the first stays."""
     before = np.arange(len(poses) - 1)
-    held = np.stack([before, before + 1], 1)
-    # Hardly anything: where no pair joins two parts of the path, they stay as they were.
-    weak = np.tile(np.diag(_HELD / UNITS**2), (len(held), 1, 1))
-    edges = np.concatenate([pairs, beside.pairs, held])
+    steps = np.stack([before, before + 1], 1)
+    # Parts of the path that no pair connects keep their relative pose.
+    weak = np.tile(np.diag(_WEAK_PRIOR / UNITS**2), (len(steps), 1, 1))
+    edges = np.concatenate([pairs, priors.pairs, steps])
     graph = PoseGraph(
         ids=np.arange(len(poses)),
         poses=poses,
         edges=edges,
         measurements=np.concatenate(
-            [measured, beside.measured, se3.inverse(poses[:-1]) @ poses[1:]]
+            [measured, priors.measured, se3.inverse(poses[:-1]) @ poses[1:]]
         ),
-        information=np.concatenate([information, beside.information, weak]),
+        information=np.concatenate([information, priors.information, weak]),
         loop=np.zeros(len(edges), bool),
-        gravity=beside.gravity,
+        gravity=priors.gravity,
     )
     return LevenbergMarquardt().optimise(graph).graph.poses
 

@@ -30,22 +30,23 @@ _LARGER = 3.0
 
 @dataclass(frozen=True)
 class Level:
-    """One stage, coarse to fine: every `stride`-th pixel, at most so many iterations.
+    """One level, coarse to fine: every `stride`-th pixel, at most `iterations` iterations.
 
-    `slack_m` is added to the sigma of a distance, `photo_slack` to that of the log albedo.
+    `inflation_m` is added to the sigma of a distance, `photometric_inflation` to that of the log
+    albedo.
     """
 
     stride: int
     iterations: int
-    slack_m: float
-    photo_slack: float
+    inflation_m: float
+    photometric_inflation: float
 
     def __post_init__(self) -> None:
         if not 1 <= self.stride <= 64:
             raise ValueError(f"stride is {self.stride}, not 1 to 64")
         if not 1 <= self.iterations <= 1000:
             raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
-        for name in ("slack_m", "photo_slack"):
+        for name in ("inflation_m", "photometric_inflation"):
             if not 0 <= getattr(self, name) < 1e3:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -72,12 +73,12 @@ class ProjectiveOptions:
     common_tilt, common_slope
         Errors fixed to the camera, which bend both views alike and so fake information: standard
         deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
-    most_sigma_m
+    max_sigma_m
         What the sigma of a typical distance may become where the views disagree, m. Noise that
         neighbouring pixels share is not seen by the fits of planes, but by this.
     tolerance
         A level ends when a step is smaller, in units of 1 cm and 1 degree.
-    settled
+    convergence
         An alignment has converged if its last step was smaller, in the same units.
     """
 
@@ -94,17 +95,17 @@ class ProjectiveOptions:
     held: float = 1.0
     common_tilt: float = 0.03
     common_slope: float = 0.1
-    most_sigma_m: float = 0.02
+    max_sigma_m: float = 0.02
     tolerance: float = 0.01
-    settled: float = 0.1
+    convergence: float = 0.1
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.levels) <= 20:
             raise ValueError(f"levels holds {len(self.levels)}; give 1 to 20")
-        for name in ("robust", "prior_m", "prior_rad", "held", "most_sigma_m"):
+        for name in ("robust", "prior_m", "prior_rad", "held", "max_sigma_m"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
-        for name in ("max_angle", "common_tilt", "common_slope", "tolerance", "settled"):
+        for name in ("max_angle", "common_tilt", "common_slope", "tolerance", "convergence"):
             if not 0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 or more")
 
@@ -254,7 +255,7 @@ def align(
         Log albedo of the targets minus the source's to begin with; seen at the start unless given.
     usual_scale
         Noise scale that alignments of this camera usually have, if it is known: sigmas may become
-        three times as large as that, also where this exceeds `most_sigma_m`.
+        three times as large as that, also where this exceeds `max_sigma_m`.
     """
     T_world_predicted = np.ascontiguousarray(T_world_predicted)
     T0 = T_world_predicted if start is None else np.ascontiguousarray(start)
@@ -271,7 +272,7 @@ def align(
     most = 10.0  # times the sigmas that the views claim
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
-        most = max(3.0, options.most_sigma_m / median(sigma), _LARGER * usual_scale)
+        most = max(3.0, options.max_sigma_m / median(sigma), _LARGER * usual_scale)
     near = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
     views = tuple(t.view.target for t in targets)
     lookups = tuple(t.view.projection.lookup for t in targets)
@@ -293,8 +294,8 @@ def align(
             guessed,
             most,
             level.iterations,
-            level.slack_m * near,
-            level.photo_slack,
+            level.inflation_m * near,
+            level.photometric_inflation,
             options.robust,
             math.cos(options.max_angle),
             number > 0,  # at the coarsest level the views are not yet where they belong
@@ -310,7 +311,7 @@ def align(
     noise_scale = steps.scale_of_distances(total[kernels.HISTOGRAM :])
     return Aligned(
         T_world_source=T,
-        converged=size < options.settled,
+        converged=size < options.convergence,
         iterations=iterations,
         information=steps.information(total),
         cross=steps.cross_information(total) - doubt,

@@ -6,8 +6,8 @@ import numpy as np
 
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
+from tofuse.posegraph.calibration_check import in_words
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import in_words
 from tofuse.report import plots, words
 from tofuse.report.subject import Figure, Subject, Values
 
@@ -223,7 +223,7 @@ def _camera_check(r: Refinement | None) -> str:
             for name, value in r.errors.items()
         ]
         out = f"Errors of the camera were estimated with them: {', '.join(told)}. "
-    s = r.suspicion
+    s = r.calibration_check
     if s is None:
         return out.strip()
     if s.errors:

@@ -12,9 +12,9 @@ from tofuse.files.ply import read_ply
 from tofuse.fusion.cloud import Cloud
 from tofuse.fusion.mesh import Mesh
 from tofuse.posegraph.accuracy import Accuracy, WorstFrame
+from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.g2o import read_g2o
 from tofuse.posegraph.graph import GraphPart, LoopRecord
-from tofuse.posegraph.outside import OutsideRecord
 from tofuse.results.folder import component_name, finish_interrupted, is_result
 from tofuse.results.output import main_poses, read_run_json
 from tofuse.results.types import (
@@ -76,7 +76,7 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
         {name: each["removed"] for name, each in run["filters"].items()},
         run["seconds"],
         parts=tuple(_part(each) for each in run["optimiser"]),
-        outside=tuple(OutsideRecord(**s) for s in run["outside"]),
+        outside=tuple(SensorRecord(**s) for s in run["outside"]),
         accuracy=_accuracy(run["accuracy"]),
         calibrated=_calibration(run.get("self_calibration")),
     )

@@ -26,9 +26,9 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.texture import Textured
 from tofuse.kernels.threads import job_pool
 from tofuse.posegraph.accuracy import Accuracy
+from tofuse.posegraph.calibration_check import CalibrationCheck
 from tofuse.posegraph.g2o import write_g2o
 from tofuse.posegraph.refinement import Refinement
-from tofuse.posegraph.suspicion import Suspicion
 from tofuse.results import tiles
 from tofuse.results.folder import TILES, TILESET, OutputFolder, component_name, is_result
 from tofuse.results.types import Component, Reason, Reconstruction, SelfCalibration
@@ -380,7 +380,7 @@ def _refinement(r: Refinement | None) -> dict[str, Any] | None:
         "support_before": r.support[0],
         "support_after": r.support[1],
         "camera": r.errors,
-        "suspicion": _suspicion(r.suspicion),
+        "suspicion": _suspicion(r.calibration_check),
     }
 
 
@@ -397,7 +397,7 @@ def _calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
     }
 
 
-def _suspicion(s: Suspicion | None) -> dict[str, Any] | None:
+def _suspicion(s: CalibrationCheck | None) -> dict[str, Any] | None:
     """The check of the camera's calibration; None where it was not made."""
     if s is None:
         return None

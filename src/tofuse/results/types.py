@@ -16,9 +16,9 @@ from tofuse.fusion.mesh import Mesh
 from tofuse.fusion.upright import T_up_world
 from tofuse.odometry.base import Status
 from tofuse.posegraph.accuracy import Accuracy
+from tofuse.posegraph.external_sensors import SensorRecord
 from tofuse.posegraph.graph import GraphPart, LoopRecord, PoseGraph
 from tofuse.posegraph.joining import Join
-from tofuse.posegraph.outside import OutsideRecord
 from tofuse.posegraph.refinement import Refinement
 from tofuse.results.ranges import Range
 from tofuse.results.samples import FrameSample
@@ -160,7 +160,7 @@ class Diagnostics:
     cloud_before: Cloud | None = None
     refinement: Refinement | None = None
     parts: tuple[GraphPart, ...] = ()
-    outside: tuple[OutsideRecord, ...] = ()
+    outside: tuple[SensorRecord, ...] = ()
     samples: tuple[FrameSample, ...] = ()
     accuracy: Accuracy = Accuracy()  # noqa: RUF009 - immutable
     calibrated: SelfCalibration | None = None

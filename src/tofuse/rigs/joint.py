@@ -18,8 +18,8 @@ from tofuse.arrays import Float64, Intp
 from tofuse.geometry import se3
 from tofuse.kernels import rig as kernels
 from tofuse.kernels.threads import run_chunks
-from tofuse.posegraph.refine import UNITS, Round
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.joint_alignment import UNITS, Round
+from tofuse.posegraph.view_store import KeptView
 
 # Unknowns of a camera: its pose, in units of 1 cm and 1 degree, and its depth offset, in cm.
 _SIZE = 7
@@ -59,7 +59,7 @@ class JointOptions:
         Errors of points this far apart are still alike (by 1/e), as a share of the depth.
     steepness
         As in `registration.uncertainty`.
-    settled
+    convergence
         Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
     """
 
@@ -70,7 +70,7 @@ class JointOptions:
     offset_sigma_m: float = 0.01
     reach: float = 0.31
     steepness: float = 0.3
-    settled: float = 0.002
+    convergence: float = 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def refine_together(
     system = _System(views, poses, options or JointOptions())
     for stage in system.options.rounds:
         for _ in range(stage.iterations):
-            if system.step(stage.slack_m) < system.options.settled:
+            if system.step(stage.inflation_m) < system.options.convergence:
                 break
     return system.placed()
 

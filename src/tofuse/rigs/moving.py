@@ -16,9 +16,9 @@ from tofuse.errors import InputError, RegistrationError
 from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
-from tofuse.posegraph.refine import RefineOptions, refine
+from tofuse.posegraph.joint_alignment import RefineOptions, refine
 from tofuse.posegraph.refinement import followed
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.view_store import KeptView
 from tofuse.results.types import Reconstruction
 from tofuse.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
 from tofuse.rigs.inputs import Camera

@@ -20,7 +20,7 @@ import numpy as np
 from tofuse.arrays import Float64
 from tofuse.geometry import se3
 from tofuse.kernels.threads import run_all
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.view_store import KeptView
 from tofuse.registration.agreement import Comparison
 from tofuse.registration.base import PROBABLE
 from tofuse.registration.confidence import BELIEVED, Evidence

@@ -23,7 +23,7 @@ from tofuse.pipeline.run import Options, resolve
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.nearby import Nearby
 from tofuse.posegraph.refinement import Known, NoRefinement
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import Disagreement, Rig, read_rig

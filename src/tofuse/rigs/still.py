@@ -15,7 +15,7 @@ from tofuse.arrays import Float64
 from tofuse.errors import InputError
 from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.view_store import KeptView
 from tofuse.recordings.background import FarSurface, far_surface
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.noise import noise_model_for

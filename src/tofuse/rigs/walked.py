@@ -17,10 +17,10 @@ from tofuse.geometry import se3
 from tofuse.pipeline.progress import Progress, Silent
 from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.build import Measured
-from tofuse.posegraph.refine import Bodies, RefineOptions, refine
-from tofuse.posegraph.refinement import followed, measured_by
+from tofuse.posegraph.joint_alignment import Bodies, RefineOptions, refine
+from tofuse.posegraph.refinement import followed, pairwise_measurements
 from tofuse.posegraph.submaps import fell
-from tofuse.posegraph.views import KeptView, Spacing
+from tofuse.posegraph.view_store import KeptView, Spacing
 from tofuse.recordings.frames import RangeFrame
 from tofuse.recordings.recording import Recording
 from tofuse.recordings.rig import RigCamera
@@ -242,7 +242,7 @@ def refined(
     out = poses.copy()
     out[known] = followed(poses[known], np.searchsorted(known, used), after)
     apart = disagreements_of(views, of_view, done.poses, done.pairs)
-    measured = measured_by([int(recording.indices[k]) for k in frames], done)
+    measured = pairwise_measurements([int(recording.indices[k]) for k in frames], done)
     out = np.asarray(se3.inverse(out[known[0]]) @ out, np.float64)
     return Walked(out, T_rig_frame, apart, measured)
 

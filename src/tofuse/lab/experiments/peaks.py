@@ -28,8 +28,8 @@ from tofuse.pipeline.reconstruct import reconstruct
 from tofuse.posegraph.build import Measured, chain
 from tofuse.posegraph.castellani import Castellani
 from tofuse.posegraph.graph import Optimiser
-from tofuse.posegraph.planes import Planes
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.plane_refinement import Planes
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.recording import ArraySource, Recording
 from tofuse.registration.coarse_to_fine import CoarseToFine
 from tofuse.registration.icp import algorithm_1

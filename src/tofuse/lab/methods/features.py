@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from tofuse.arrays import Float64, Int64
 from tofuse.errors import RegistrationError
 from tofuse.lab.methods.keypoints import Detector, Keypoints, Light, keypoints
-from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.parts import part
 from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 from tofuse.registration.sample_consensus import (
     ConsensusOptions,
     Pairs,

@@ -17,10 +17,10 @@ from tofuse.arrays import Bool, Float64
 from tofuse.geometry import se3
 from tofuse.kernels.icp import transform_points
 from tofuse.kernels.kdtree import KdTree
-from tofuse.posegraph.outside import Told
-from tofuse.posegraph.planes import KeptPoints
+from tofuse.posegraph.external_sensors import SensorPriors
+from tofuse.posegraph.plane_refinement import KeptPoints
 from tofuse.posegraph.refinement import Refinement, Refiner, Refining, moved_to
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame, Frame
 from tofuse.registration.prepared_view import PreparedView
 from tofuse.registration.shape import shape_at
@@ -130,7 +130,9 @@ class _Relaxation(Refiner):
         """See `Refiner.push`."""
         self._store.push(KeptPoints.of(view, self._method.points), T_component_camera)
 
-    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
         """See `Refiner.finish`; kept unless the views' points are less near than before."""
         row = {int(index): k for k, index in enumerate(ids)}
         kept = [posed.view for posed in self._store.of(row)]

@@ -17,6 +17,7 @@ from tofuse.recordings.frames import Frame, RangeFrame
 from tofuse.registration.agreement import agreement
 from tofuse.registration.base import Registrar, Registration
 from tofuse.registration.plane_detection import Plane, detect_planes
+from tofuse.registration.prepared_view import PreparedView, SurfaceOptions, prepare_view
 
 # Sine of the angle that two normals must differ by to fix a rotation, and volume that three must
 # span to fix a point.

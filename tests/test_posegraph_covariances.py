@@ -9,15 +9,15 @@ import pytest
 
 from tofuse.geometry import se3
 from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import Optimisation, PoseGraph
-from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.trust import (
-    LEFT_OUT,
+from tofuse.posegraph.covariances import (
+    MIN_WEIGHT,
+    accepted_only,
     loop_errors,
     pose_covariances,
     relative_covariance,
-    without_left_out,
 )
+from tofuse.posegraph.graph import Optimisation, PoseGraph
+from tofuse.posegraph.levenberg import LevenbergMarquardt
 from walks import round_walk, step_of, true_poses
 
 N = 12
@@ -95,13 +95,13 @@ def test_parts_that_nothing_joins_are_not_known() -> None:
 def test_left_out_edges_are_gone() -> None:
     graph = walk()
     weights = np.ones(len(graph.edges))
-    assert without_left_out(Optimisation(graph, (), True)).graph is graph
-    weights[-2:] = LEFT_OUT / 2, 2 * LEFT_OUT
-    kept = without_left_out(Optimisation(graph, (), True, weights))
+    assert accepted_only(Optimisation(graph, (), True)).graph is graph
+    weights[-2:] = MIN_WEIGHT / 2, 2 * MIN_WEIGHT
+    kept = accepted_only(Optimisation(graph, (), True, weights))
     assert kept.graph.loop.sum() == 1
     assert kept.graph.edges[-1].tolist() == [2, 9]
     assert kept.weights is not None
-    assert kept.weights[-1] == 2 * LEFT_OUT
+    assert kept.weights[-1] == 2 * MIN_WEIGHT
 
 
 def test_the_covariance_between_two_poses_of_a_chain_is_that_of_the_edges_between() -> None:

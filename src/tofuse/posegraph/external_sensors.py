@@ -1,8 +1,8 @@
-"""What other sensors than the camera say of its poses, as weighted edges of the graph.
+"""Measurements of the poses by external sensors, as weighted edges of the graph.
 
-They are weighed by how well they agree with what was tracked, in units of both their errors: an
-accelerometer that is moved measures more than gravity, wheels slip, and a file may be of another
-camera or in other axes.
+They are weighted by their agreement with odometry from images, in units of the errors of both: a
+moving accelerometer measures more than gravity, wheels slip, and a file may belong to another
+camera or use other axes.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _MEDIAN = 5.3481  # of a chi-square variable with six degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
-class Sensed:
-    """What a recording holds of frames with a pose, beside their views.
+class SensorData:
+    """Measurements of external sensors for the frames that have a pose.
 
     Attributes
     ----------
@@ -35,10 +35,10 @@ class Sensed:
     odometry
         (N, 4, 4) T_odometry_camera, NaN where there is none.
     gravity
-        (N, 4) direction in which things fall in the camera's frame and its sigma in rad, NaN
-        where there is none.
+        (N, 4) unit vector of gravity in the camera's frame and its sigma in rad, NaN where there
+        is none.
     parts
-        (N,) number of the recording, of several joined ones: each has its own odometry.
+        (N,) number of the recording, if several are joined: each has its own odometry.
     """
 
     ids: Intp
@@ -48,10 +48,10 @@ class Sensed:
 
 
 @dataclass(frozen=True)
-class OutsideRecord:
-    """What became of a sensor: how many measurements there were and were used, and in words.
+class SensorRecord:
+    """Use of a sensor: numbers of its measurements and of those used, and a sentence on it.
 
-    `scale` is how many times its stated errors were taken, None where they are taken as stated.
+    `scale` is the factor on its stated errors, None where they are not scaled.
     """
 
     sensor: str
@@ -62,36 +62,36 @@ class OutsideRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What sensors say of the poses, in frame indices.
+class SensorPriors:
+    """Weighted measurements of the poses by external sensors, by frame index.
 
     Attributes
     ----------
     steps
-        Relative poses of frames in a row, with their information.
+        Relative poses of consecutive frames, with their information.
     ids
-        Frames of which the direction of gravity is known.
+        Frames with a measured direction of gravity.
     gravity
-        (K, 4) as in `Sensed`; the sigmas are not those of the recording alone.
+        (K, 4) as in `SensorData`, with inflated sigmas.
     gate
         See `Gravity.gate`.
     records
-        For people, one for each sensor.
+        One for each sensor, for the report.
     """
 
     steps: tuple[Measured, ...] = ()
     ids: tuple[int, ...] = ()
     gravity: Float64 | None = None
     gate: float = np.inf
-    records: tuple[OutsideRecord, ...] = ()
+    records: tuple[SensorRecord, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.steps or self.ids)
 
-    def joined(self, other: Told) -> Told:
-        """Both together; of gravity there is one."""
+    def joined(self, other: SensorPriors) -> SensorPriors:
+        """Return the measurements of both; of gravity, those of the first that has any."""
         mine = self if self.ids else other
-        return Told(
+        return SensorPriors(
             (*self.steps, *other.steps),
             mine.ids,
             mine.gravity,
@@ -100,7 +100,7 @@ class Told:
         )
 
     def gravity_of(self, ids: Sequence[int]) -> Gravity | None:
-        """Gravity as the vertices `ids` of a graph know it."""
+        """Gravity at the vertices `ids` of a graph; None if none of them has it."""
         if self.gravity is None:
             return None
         row = {index: k for k, index in enumerate(self.ids)}
@@ -111,18 +111,18 @@ class Told:
         return Gravity(vertices, self.gravity[rows, :3], self.gravity[rows, 3], None, self.gate)
 
     def up(self, graph: PoseGraph) -> Float64 | None:
-        """Return the unit vector (3,) against gravity in the graph's world, None without any."""
+        """Return the unit vector (3,) opposite to gravity in the graph's world, or None."""
         known = self.gravity_of(graph.ids.tolist())
         if known is None:
             return None
         down = (graph.poses[known.vertices, :3, :3] @ known.directions[:, :, None])[..., 0]
-        # A median: an accelerometer that is shaken measures more than gravity.
+        # A median, since a shaken accelerometer measures more than gravity.
         up = -np.median(down, axis=0)
         length = float(np.linalg.norm(up))
         return up / length if length > 0.1 else None
 
     def between(self, ids: Sequence[int]) -> list[Measured]:
-        """Relative poses of some frames in a row (ascending), where all steps between are known."""
+        """Relative poses of successive frames of `ids` (ascending) without gaps between them."""
         following = {step.i: step for step in self.steps}
         out = []
         for i, j in pairwise(ids):
@@ -136,57 +136,57 @@ class Told:
         return out
 
 
-class Outside(Protocol):
-    """A sensor beside the camera, and how it is believed."""
+class ExternalSensor(Protocol):
+    """A sensor next to the camera, and the weighting of its measurements."""
 
     part_kind: ClassVar[str] = "outside"
 
-    def tell(self, sensed: Sensed, graph: PoseGraph) -> Told:
-        """Return what it says, given the graph of what was tracked, without loops."""
+    def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
+        """Return its weighted measurements, given the graph of odometry without loops."""
         ...
 
 
 @part("outside", "gravity")
 @dataclass(frozen=True)
-class GravityEdges(Outside):
-    """Holds roll and pitch by the direction in which things fall.
+class GravityEdges(ExternalSensor):
+    """Constrains roll and pitch by the direction of gravity.
 
     Attributes
     ----------
     shared_rad
-        Sigma of that error which all frames share, such as the accelerometer's zero and how it
-        is mounted: however many frames, the vertical is not known better.
+        Sigma of the error that all frames share (bias and mounting of the accelerometer), a lower
+        bound on that of the vertical, however many frames there are.
     gate
         Squared error in units of sigma beyond which a direction hardly counts.
-    least
-        With fewer frames that know it, gravity is left out.
+    min_frames
+        With fewer measured frames, gravity is not used.
     """
 
     shared_rad: float = 0.01
     gate: float = 25.0
-    least: int = 3
+    min_frames: int = 3
 
     def __post_init__(self) -> None:
         if not 1e-6 <= self.shared_rad <= 1:
             raise ValueError(f"shared_rad is {self.shared_rad}, not 1e-6 to 1")
         if not self.gate > 0:
             raise ValueError(f"gate is {self.gate}, not above 0")
-        if self.least < 1:
-            raise ValueError(f"least is {self.least}, not 1 or more")
+        if self.min_frames < 1:
+            raise ValueError(f"min_frames is {self.min_frames}, not 1 or more")
 
-    def tell(self, sensed: Sensed, graph: PoseGraph) -> Told:
-        """See `Outside.tell`."""
+    def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
+        """See `ExternalSensor.measure`."""
         known = np.flatnonzero(np.isfinite(sensed.gravity).all(1))
         count = len(known)
         if count == 0:
-            return Told()
-        if count < self.least:
-            text = f"only {count} frames know what is down, {self.least} are needed"
-            return Told(records=(OutsideRecord("gravity", count, 0, None, text),))
+            return SensorPriors()
+        if count < self.min_frames:
+            text = f"only {count} frames measure gravity, {self.min_frames} are needed"
+            return SensorPriors(records=(SensorRecord("gravity", count, 0, None, text),))
         measured = sensed.gravity[known].copy()
         measured[:, 3] = np.hypot(measured[:, 3], self.shared_rad)
-        # By so much each one is worth less, so that all together are not worth more than one
-        # could be that had the shared error alone.
+        # Factor on each variance, so that all measurements together have no more information than
+        # a single one with the shared error alone.
         less = 1 + float((self.shared_rad**2 / measured[:, 3] ** 2).sum())
         seen = (graph.poses[known, :3, :3] @ measured[:, :3, None])[..., 0]
         every = Gravity(known, measured[:, :3], measured[:, 3], None, self.gate)
@@ -196,35 +196,35 @@ class GravityEdges(Outside):
         measured[:, 3] *= np.sqrt(less)
         ids = tuple(int(index) for index in sensed.ids[known])
         text = f"{used} of {count} directions of gravity agree with the path"
-        record = OutsideRecord("gravity", count, used, None, text)
-        return Told((), ids, measured, self.gate / less, (record,))
+        record = SensorRecord("gravity", count, used, None, text)
+        return SensorPriors((), ids, measured, self.gate / less, (record,))
 
 
 @part("outside", "odometry")
 @dataclass(frozen=True)
-class OdometryEdges(Outside):
-    """Joins frames in a row by the motion between their poses in an odometry file.
+class OdometryEdges(ExternalSensor):
+    """Connects consecutive frames by the motion between their poses in an odometry file.
 
-    Its errors are compared with those of tracking. If its median motion misses by more than both
-    explain, it counts with as many times its errors as it takes; a single step that misses by far
-    is left out.
+    Its errors are compared with those of tracking. If the median misfit is larger than the errors
+    of both explain, those of the odometry are scaled until they do; single steps with a far larger
+    misfit are rejected.
 
     Attributes
     ----------
     share, share_rad
-        Standard deviation of a step, as a share of its length and of its angle.
-    least_m, least_rad
-        And what is added to it, m and rad.
+        Standard deviation of a step, as a fraction of its length and of its angle.
+    min_m, min_rad
+        Constant part of it, m and rad.
     limit
-        Odometry that asks for more times its errors is not used at all.
+        Largest factor on its errors; odometry that needs more is not used.
     gate
-        Squared error of a step, in units of both their errors, beyond which it is left out.
+        Squared error of a step, in units of the errors of both, beyond which it is rejected.
     """
 
     share: float = 0.05
     share_rad: float = 0.05
-    least_m: float = 0.002
-    least_rad: float = 0.002
+    min_m: float = 0.002
+    min_rad: float = 0.002
     limit: float = 5.0
     gate: float = 40.0
 
@@ -232,32 +232,32 @@ class OdometryEdges(Outside):
         for name in ("share", "share_rad"):
             if not 0 <= getattr(self, name) <= 10:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 0 to 10")
-        for name in ("least_m", "least_rad"):
+        for name in ("min_m", "min_rad"):
             if not 1e-6 <= getattr(self, name) <= 10:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 1e-6 to 10")
         if not (self.limit >= 1 and self.gate > 0):
             raise ValueError("limit must be 1 or more, and gate above 0")
 
-    def tell(self, sensed: Sensed, graph: PoseGraph) -> Told:
-        """See `Outside.tell`."""
+    def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
+        """See `ExternalSensor.measure`."""
         there = np.asarray(np.isfinite(sensed.odometry).all((1, 2)))
         both = there[:-1] & there[1:] & (sensed.parts[:-1] == sensed.parts[1:])
         first = np.flatnonzero(both)
         if not len(first):
-            return Told()
+            return SensorPriors()
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         C = self._covariance(measured)
         scale = self._scale(sensed, graph, C, first)
         if scale is None:
             text = (
-                f"the odometry's motions miss those that were tracked by more than {self.limit:g} "
-                "times its errors, so it was not used"
+                f"the odometry differs from the tracked motion by more than {self.limit:g} times "
+                "its errors, so it was not used"
             )
-            return Told(records=(OutsideRecord("odometry", len(first), 0, None, text),))
+            return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
         C = C * scale**2
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
-        held = _covariance_to_reference(graph)
-        away = _squared(se3.log(se3.inverse(tracked) @ measured), C + held[first] + held[first + 1])
+        own = _covariance_to_reference(graph)
+        away = _squared(se3.log(se3.inverse(tracked) @ measured), C + own[first] + own[first + 1])
         keep = np.flatnonzero(away <= self.gate)
         steps = tuple(
             Measured(
@@ -268,26 +268,26 @@ class OdometryEdges(Outside):
             )
             for k in keep
         )
-        text = f"{len(keep)} of {len(first)} steps of the odometry count, "
-        text += "with the errors stated" if scale == 1 else f"with {scale:.1f} times its errors"
-        record = OutsideRecord("odometry", len(first), len(keep), scale, text)
-        return Told(steps, records=(record,))
+        text = f"{len(keep)} of {len(first)} steps of the odometry are used, "
+        text += "with the stated errors" if scale == 1 else f"with {scale:.1f} times its errors"
+        record = SensorRecord("odometry", len(first), len(keep), scale, text)
+        return SensorPriors(steps, records=(record,))
 
     def _covariance(self, steps: Float64) -> Float64:
         """(K, 6, 6) of motions (K, 4, 4)."""
         sigma = np.empty((len(steps), 6))
         length, angle = np.linalg.norm(steps[:, :3, 3], axis=1), se3.angle(steps)
-        sigma[:, :3] = (self.least_m + self.share * length)[:, None]
-        sigma[:, 3:] = (self.least_rad + self.share_rad * angle)[:, None]
+        sigma[:, :3] = (self.min_m + self.share * length)[:, None]
+        sigma[:, 3:] = (self.min_rad + self.share_rad * angle)[:, None]
         return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
 
-    def _scale(self, sensed: Sensed, graph: PoseGraph, C: Float64, first: Intp) -> float | None:
-        """How many times the stated errors explain the misfit; None beyond the limit.
+    def _scale(self, sensed: SensorData, graph: PoseGraph, C: Float64, first: Intp) -> float | None:
+        """Factor on the stated errors that explains the misfit; None beyond the limit.
 
-        Compared are the motions that were measured: from a reference to a frame.
+        The motions from a reference to a frame are compared, as the tracker measured them.
         """
         i, j = graph.edges.T
-        # Variances add up along the way; a step without odometry breaks it.
+        # Variances add up along the path; a step without odometry breaks it.
         step = np.full((len(sensed.ids), 6), np.inf)
         step[first + 1] = np.diagonal(C, axis1=1, axis2=2)
         whole = [bool(np.isfinite(step[a + 1 : b + 1]).all()) for a, b in graph.edges]
@@ -310,25 +310,27 @@ class OdometryEdges(Outside):
             return None
         low, high = 1.0, self.limit
         for _ in range(30):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if median(middle) > _MEDIAN else (low, middle)
+            mid = 0.5 * (low + high)
+            low, high = (mid, high) if median(mid) > _MEDIAN else (low, mid)
         return high
 
 
-def told_by(sensors: Sequence[Outside], sensed: Sensed, graph: PoseGraph) -> Told:
-    """Everything that some sensors say of a graph of what was tracked."""
-    told = Told()
+def measure_all(
+    sensors: Sequence[ExternalSensor], sensed: SensorData, graph: PoseGraph
+) -> SensorPriors:
+    """Return the measurements of all sensors, given the graph of odometry without loops."""
+    measured = SensorPriors()
     for sensor in sensors:
-        told = told.joined(sensor.tell(sensed, graph))
-    return told
+        measured = measured.joined(sensor.measure(sensed, graph))
+    return measured
 
 
-def with_outside(graph: PoseGraph, told: Told) -> PoseGraph:
-    """The graph with what sensors say: steps as edges behind the others, and gravity."""
-    if not told:
+def with_sensors(graph: PoseGraph, measured: SensorPriors) -> PoseGraph:
+    """Return the graph with the measurements: steps as further edges, and gravity."""
+    if not measured:
         return graph
     place = {int(index): k for k, index in enumerate(graph.ids)}
-    steps = told.steps
+    steps = measured.steps
     m = len(steps)
     pairs = np.array([(place[s.i], place[s.j]) for s in steps], np.intp).reshape(m, 2)
     return replace(
@@ -341,12 +343,12 @@ def with_outside(graph: PoseGraph, told: Told) -> PoseGraph:
             [graph.information, np.array([s.information for s in steps]).reshape(m, 6, 6)]
         ),
         loop=np.concatenate([graph.loop, np.zeros(m, bool)]),
-        gravity=told.gravity_of(graph.ids.tolist()),
+        gravity=measured.gravity_of(graph.ids.tolist()),
     )
 
 
 def _covariance_to_reference(graph: PoseGraph) -> Float64:
-    """(N, 6, 6) of each frame relative to the one that it was aligned with; 0 for those without."""
+    """(N, 6, 6) of each frame relative to its reference; 0 for those without one."""
     out = np.zeros((len(graph.ids), 6, 6))
     out[graph.edges[:, 1]] = np.linalg.inv(graph.information)
     return out

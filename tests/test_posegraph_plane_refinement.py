@@ -14,8 +14,8 @@ from tofuse.lab.experiments.bound import mean_distance, mean_distances, pose_cov
 from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, peaks_bound_of_one, run_peaks
 from tofuse.lab.simulation.peaks import peaks_views
 from tofuse.posegraph.common_planes import PlaneOptions, refine_clouds
-from tofuse.posegraph.planes import Planes
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.plane_refinement import Planes
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import CloudFrame
 
 

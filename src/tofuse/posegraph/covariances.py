@@ -1,4 +1,4 @@
-"""How well a pose graph knows its poses, and whether its measurements say the same."""
+"""Covariances of the poses of a graph, and consistency of its loops."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from tofuse.posegraph.descent import Problem
 from tofuse.posegraph.graph import Optimisation, PoseGraph
 from tofuse.posegraph.sparse import first_of_parts, parts_of
 
-# A loop that counts with less of its information is left out.
-LEFT_OUT = 0.05
+# A loop with a smaller weight is rejected.
+MIN_WEIGHT = 0.05
 
 
-def without_left_out(optimisation: Optimisation) -> Optimisation:
-    """What an optimiser made of a graph, without the edges that it left out."""
+def accepted_only(optimisation: Optimisation) -> Optimisation:
+    """Return the result of an optimisation without the edges that it rejected."""
     if optimisation.weights is None:
         return optimisation
-    kept = optimisation.weights >= LEFT_OUT
+    kept = optimisation.weights >= MIN_WEIGHT
     graph = optimisation.graph
     return replace(
         optimisation,
@@ -38,12 +38,14 @@ def without_left_out(optimisation: Optimisation) -> Optimisation:
 def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
     """(N, 6, 6) covariances of the poses relative to one of them, as right perturbations.
 
-    NaN where nothing joins a pose to that, or the measurements do not constrain it.
+    NaN where a pose is not connected to it, or not constrained.
 
     Parameters
     ----------
+    graph
+        The optimised graph of N poses.
     origin
-        Position of the pose that is taken to be known.
+        Position of the pose that is fixed.
     """
     out = np.full((len(graph.ids), 6, 6), np.nan)
     if not len(out):
@@ -65,16 +67,16 @@ def pose_covariances(graph: PoseGraph, origin: int = 0) -> Float64:
 def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
     """Covariance (6, 6) of the motion between two poses of a chain, as a right perturbation of j.
 
-    Along a chain of measurements C_j = Ad(T_j_i) C_i Ad(T_j_i)^T + C_i_j; what was measured between
-    the two is left when the first part is taken away. Where the two are on different branches this
-    may be negative in some direction, which then counts as 0.
+    Along a chain of measurements C_j = Ad(T_j_i) C_i Ad(T_j_i)^T + C_i_j, which is solved for
+    C_i_j. Where the two are on different branches it may be negative in some direction; its
+    negative eigenvalues are set to 0.
 
     Parameters
     ----------
     T_i_j
         (4, 4).
     C_i, C_j
-        (6, 6) relative to the first pose, as right perturbations. NaN gives 0: nothing is known.
+        (6, 6) relative to the first pose, as right perturbations. NaN (unknown) gives 0.
     """
     A = se3.adjoint(se3.inverse(T_i_j))
     C = C_j - A @ C_i @ A.T
@@ -85,9 +87,16 @@ def relative_covariance(T_i_j: Float64, C_i: Float64, C_j: Float64) -> Float64:
 
 
 def joint_covariance(graph: PoseGraph, some: Intp) -> Float64 | None:
-    """(6v, 6v) covariance of some poses together, relative to the first one of the graph.
+    """(6v, 6v) joint covariance of v poses, relative to the first one of the graph.
 
     None where the measurements do not constrain all poses of the graph.
+
+    Parameters
+    ----------
+    graph
+        The optimised graph.
+    some
+        (v,) positions of the poses.
     """
     problem = _problem(graph, first_of_parts(len(graph.ids), graph.edges))
     factor = problem.factor(graph.poses, np.ones(len(graph.edges)))
@@ -97,15 +106,17 @@ def joint_covariance(graph: PoseGraph, some: Intp) -> Float64 | None:
 
 
 def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
-    """(L,) squared errors of the loops against odometry alone, in units of both their covariances.
+    """(L,) squared Mahalanobis distances of the loops from odometry alone.
 
-    A chi-square variable with six degrees of freedom, where both are right; NaN for loops that
-    join what odometry does not.
+    Chi-square with six degrees of freedom if both covariances are right; NaN for loops between
+    poses that odometry does not connect.
 
     Parameters
     ----------
+    graph
+        With L loops.
     sequential
-        (N, 4, 4) poses as odometry has them.
+        (N, 4, 4) poses of odometry alone.
     """
     loops = np.flatnonzero(graph.loop)
     out = np.full(len(loops), np.nan)

@@ -12,7 +12,7 @@ from tofuse.geometry import se3
 from tofuse.parts import part
 from tofuse.posegraph.build import Measured
 from tofuse.posegraph.common_planes import CHANCE, Aligned, PlaneOptions, refine_clouds
-from tofuse.posegraph.outside import Told
+from tofuse.posegraph.external_sensors import SensorPriors
 from tofuse.posegraph.refinement import (
     Refinement,
     Refiner,
@@ -20,7 +20,7 @@ from tofuse.posegraph.refinement import (
     moved_to,
     without_losers,
 )
-from tofuse.posegraph.views import Spacing, ViewStore
+from tofuse.posegraph.view_store import Spacing, ViewStore
 from tofuse.recordings.frames import Frame
 from tofuse.registration.prepared_view import PreparedView
 
@@ -87,7 +87,9 @@ class _Planes(Refiner):
         """See `Refiner.push`."""
         self._store.push(KeptPoints.of(view, self._options.points), T_component_camera)
 
-    def finish(self, ids: Sequence[int], poses: Float64, told: Told | None = None) -> Refinement:
+    def finish(
+        self, ids: Sequence[int], poses: Float64, measured: SensorPriors | None = None
+    ) -> Refinement:
         """See `Refiner.finish`."""
         row = {int(index): k for k, index in enumerate(ids)}
         views = [posed.view for posed in self._store.of(row)]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from test_posegraph_refine import OPTIONS, path, surfaces
+from test_posegraph_joint_alignment import OPTIONS, path, surfaces
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
-from tofuse.posegraph.refine import Beside, Refined, refine, response
-from tofuse.posegraph.suspicion import Gap, longest_loop, suspicion
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.calibration_check import Gap, check_calibration, longest_loop
+from tofuse.posegraph.joint_alignment import Priors, Refined, refine, response
+from tofuse.posegraph.view_store import KeptView
 
 
 def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
@@ -23,10 +23,10 @@ def kept(offset: float, views: int = 12) -> tuple[list[KeptView], Refined]:
 def test_a_camera_that_errs_is_suspected(monkeypatch):
     views, refined = kept(0.06)
     # Where there are many pairs, some of them and of their points tell as much.
-    monkeypatch.setattr("tofuse.posegraph.suspicion._ENOUGH_PAIRS", len(refined.pairs) // 2)
-    some = suspicion(views, refined, OPTIONS, Beside.nothing())
+    monkeypatch.setattr("tofuse.posegraph.calibration_check._ENOUGH_PAIRS", len(refined.pairs) // 2)
+    some = check_calibration(views, refined, OPTIONS, Priors.none())
     monkeypatch.undo()
-    found = suspicion(views, refined, OPTIONS, Beside.nothing())
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert found.alarm
     assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
     assert found.sigmas["offset"] < 0.01
@@ -46,7 +46,7 @@ def test_a_camera_that_errs_is_suspected(monkeypatch):
 
 def test_a_camera_that_does_not_err_is_not():
     views, refined = kept(0.0)
-    found = suspicion(views, refined, OPTIONS, Beside.nothing())
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert not found.alarm
     assert found.gap is None
 
@@ -69,7 +69,7 @@ def test_a_focal_length_that_nothing_holds_is_not_known():
 
 def test_few_views_suspect_nothing():
     views, refined = kept(0.06, views=5)
-    found = suspicion(views, refined, OPTIONS, Beside.nothing())
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
     assert not found.alarm
     assert not found.errors
 
@@ -103,7 +103,7 @@ def test_the_kinect_loop_raises_the_alarm(shared_data):
     assert "calibration_alarm" in {r.code for r in result.diagnostics.reasons}
     refinement = result.diagnostics.refinement
     assert refinement is not None
-    found = refinement.suspicion
+    found = refinement.calibration_check
     assert found is not None
     assert found.errors["focal"] == pytest.approx(-0.05, abs=0.015)
     assert found.gap is not None

@@ -1,4 +1,4 @@
-"""Gravity and odometry beside the camera: how they are weighed, and that wrong ones do no harm."""
+"""Gravity and odometry priors the camera: how they are weighed, and that wrong ones do no harm."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 from tofuse.geometry import se3
 from tofuse.kernels import refinement as kernels
 from tofuse.posegraph.build import Measured, build_graph
-from tofuse.posegraph.graph import PoseGraph
-from tofuse.posegraph.levenberg import LevenbergMarquardt
-from tofuse.posegraph.outside import (
+from tofuse.posegraph.covariances import pose_covariances
+from tofuse.posegraph.external_sensors import (
     GravityEdges,
     OdometryEdges,
-    Sensed,
-    Told,
-    told_by,
-    with_outside,
+    SensorData,
+    SensorPriors,
+    measure_all,
+    with_sensors,
 )
-from tofuse.posegraph.refine import Beside, RefineOptions, refine
-from tofuse.posegraph.trust import pose_covariances
-from tofuse.posegraph.views import KeptView
+from tofuse.posegraph.graph import PoseGraph
+from tofuse.posegraph.joint_alignment import Priors, RefineOptions, refine
+from tofuse.posegraph.levenberg import LevenbergMarquardt
+from tofuse.posegraph.view_store import KeptView
 
 N = 60
 SIGMA = np.array([0.004] * 3 + [0.004] * 3)
@@ -54,8 +54,8 @@ def tracked(
     return build_graph(range(N), np.stack(chain), steps)
 
 
-def sensed(odometry: np.ndarray | None = None, gravity: np.ndarray | None = None) -> Sensed:
-    return Sensed(
+def sensed(odometry: np.ndarray | None = None, gravity: np.ndarray | None = None) -> SensorData:
+    return SensorData(
         np.arange(N),
         np.full((N, 4, 4), np.nan) if odometry is None else odometry,
         np.full((N, 4), np.nan) if gravity is None else gravity,
@@ -82,14 +82,14 @@ def ate(poses: np.ndarray, right: np.ndarray) -> float:
 NODDING = np.array([0, 0, 0, 0.004, 0, 0])
 
 
-def solved(graph: PoseGraph, told: Told) -> np.ndarray:
-    return LevenbergMarquardt().optimise(with_outside(graph, told)).graph.poses
+def solved(graph: PoseGraph, told: SensorPriors) -> np.ndarray:
+    return LevenbergMarquardt().optimise(with_sensors(graph, told)).graph.poses
 
 
 def test_gravity_takes_out_the_drift_of_roll_and_pitch():
     right = truth()
     graph = tracked(right, NODDING, stated=STATED)
-    told = told_by((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
+    told = measure_all((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
     held = solved(graph, told)
     assert tilt(graph.poses, right) > np.radians(2.5)
     assert tilt(held, right) < 0.4 * tilt(graph.poses, right)
@@ -97,9 +97,9 @@ def test_gravity_takes_out_the_drift_of_roll_and_pitch():
     assert told.records[0].used == N
     up = told.up(graph.with_poses(held))
     assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
-    assert Told().up(graph) is None
+    assert SensorPriors().up(graph) is None
     # It says nothing of the heading, nor of where the cameras are.
-    C, free = pose_covariances(with_outside(graph, told)), pose_covariances(graph)
+    C, free = pose_covariances(with_sensors(graph, told)), pose_covariances(graph)
     assert C[-1, 3, 3] + C[-1, 5, 5] < 0.6 * (free[-1, 3, 3] + free[-1, 5, 5])
     assert C[-1, 4, 4] > 0.5 * free[-1, 4, 4]
 
@@ -112,23 +112,25 @@ def test_an_accelerometer_in_motion_does_not_count_for_gravity():
     lying[20:40, :3] += 0.33 * right[20:40, 0, :3]
     lying[:, :3] /= np.linalg.norm(lying[:, :3], axis=1)[:, None]
     believed = replace(GravityEdges(), gate=np.inf)
-    robust = tilt(solved(graph, told_by((GravityEdges(),), sensed(gravity=lying), graph)), right)
-    plain = tilt(solved(graph, told_by((believed,), sensed(gravity=lying), graph)), right)
+    robust = tilt(
+        solved(graph, measure_all((GravityEdges(),), sensed(gravity=lying), graph)), right
+    )
+    plain = tilt(solved(graph, measure_all((believed,), sensed(gravity=lying), graph)), right)
     assert robust < 0.5 * tilt(graph.poses, right)
     assert robust < 0.7 * plain
-    record = told_by((GravityEdges(),), sensed(gravity=lying), graph).records[0]
+    record = measure_all((GravityEdges(),), sensed(gravity=lying), graph).records[0]
     assert 35 <= record.used <= 45
 
 
 def test_the_vertical_is_never_known_better_than_the_error_that_all_frames_share():
     right = truth()
     graph = tracked(right, 0 * NODDING)
-    told = told_by((GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph)
+    told = measure_all((GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph)
     assert told.gravity is not None
     together = (told.gravity[:, 3] ** -2.0).sum() ** -0.5
     assert 0.0095 < together < 0.0115
     few = sensed(gravity=np.where(np.arange(N)[:, None] < 2, seen_down(right), np.nan))
-    none = told_by((GravityEdges(),), few, graph)
+    none = measure_all((GravityEdges(),), few, graph)
     assert not none
     assert "only 2 frames" in none.records[0].text
 
@@ -148,16 +150,16 @@ def test_good_odometry_helps_and_wrong_odometry_does_no_harm():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     before = ate(graph.poses, right)
-    good = told_by((OdometryEdges(share=0.01, share_rad=0.01),), sensed(odometer(right)), graph)
+    good = measure_all((OdometryEdges(share=0.01, share_rad=0.01),), sensed(odometer(right)), graph)
     assert len(good.steps) == N - 1
     assert ate(solved(graph, good), right) < 0.6 * before
     # Of another camera: in other axes, and half as long again.
     other = odometer(right) @ se3.exp(np.array([0, 0, 0, 0, 1.2, 0]))
     other[:, :3, 3] *= 1.5
-    wrong = told_by((OdometryEdges(),), sensed(other), graph)
+    wrong = measure_all((OdometryEdges(),), sensed(other), graph)
     assert not wrong
     assert "not used" in wrong.records[0].text
-    assert with_outside(graph, wrong) is graph
+    assert with_sensors(graph, wrong) is graph
 
 
 def test_odometry_counts_with_the_errors_that_it_has():
@@ -165,7 +167,7 @@ def test_odometry_counts_with_the_errors_that_it_has():
     right = truth()
     graph = tracked(right, 0 * NODDING)
     noisy = odometer(right, 0.1)
-    told = told_by((OdometryEdges(share=0.03, share_rad=0.03),), sensed(noisy), graph)
+    told = measure_all((OdometryEdges(share=0.03, share_rad=0.03),), sensed(noisy), graph)
     record = told.records[0]
     assert record.scale is not None
     assert 1.5 < record.scale < 5
@@ -178,13 +180,13 @@ def test_a_jump_of_the_odometry_is_left_out():
     jumped = odometer(right)
     jumped[30:] = jumped[30:] @ np.eye(4)
     jumped[30:, :3, 3] += [0.5, 0, 0.2]
-    told = told_by((OdometryEdges(),), sensed(jumped), graph)
+    told = measure_all((OdometryEdges(),), sensed(jumped), graph)
     assert {step.i for step in told.steps} == set(range(N - 1)) - {29}
     # Nor are steps made up where odometry is missing, or another recording begins.
     holes = odometer(right)
     holes[10] = np.nan
     parts = (np.arange(N) >= 40).astype(np.intp)
-    told = told_by((OdometryEdges(),), replace(sensed(holes), parts=parts), graph)
+    told = measure_all((OdometryEdges(),), replace(sensed(holes), parts=parts), graph)
     assert {step.i for step in told.steps} == set(range(N - 1)) - {9, 10, 39}
     steps = told.between([0, 4, 8, 12, 39, 42])
     assert [(s.i, s.j) for s in steps] == [(0, 4), (4, 8), (12, 39)]
@@ -194,10 +196,10 @@ def test_a_jump_of_the_odometry_is_left_out():
 
 def test_without_files_nothing_changes():
     graph = tracked(truth(), NODDING)
-    told = told_by((GravityEdges(), OdometryEdges()), sensed(), graph)
+    told = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)
     assert not told
     assert told.records == ()
-    assert with_outside(graph, told) is graph
+    assert with_sensors(graph, told) is graph
 
 
 @pytest.mark.parametrize(
@@ -237,9 +239,9 @@ def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
         rolled[k] = rolled[k] @ se3.exp(np.array([0, 0, 0, 0, 0, 0.02 * k]))
     options = RefineOptions(photometric=False)
     down = np.array([0, 1.0, 0])
-    gravity = told_by(
+    gravity = measure_all(
         (GravityEdges(),),
-        Sensed(
+        SensorData(
             np.arange(6),
             np.full((6, 4, 4), np.nan),
             np.concatenate(
@@ -249,16 +251,16 @@ def test_views_that_hold_no_tilt_take_it_from_gravity_in_the_refinement():
         ),
         build_graph(range(6), rolled, []),
     ).gravity_of(range(6))
-    beside = replace(Beside.nothing(), gravity=gravity)
+    priors = replace(Priors.none(), gravity=gravity)
     free = refine(views, rolled, options)
-    held = refine(views, rolled, options, beside=beside)
+    held = refine(views, rolled, options, priors=priors)
 
     def off(found: np.ndarray) -> float:
         return float(se3.angle(se3.inverse(poses[-1]) @ found[-1]))
 
     assert off(free.poses) > 0.05
     assert off(held.poses) < 0.01
-    # Nothing beside them: the same to the last bit.
-    same = refine(views, rolled, options, beside=Beside.nothing(), calibrate=[kernels.FOCAL])
+    # Nothing priors them: the same to the last bit.
+    same = refine(views, rolled, options, priors=Priors.none(), calibrate=[kernels.FOCAL])
     again = refine(views, rolled, options, calibrate=[kernels.FOCAL])
     np.testing.assert_array_equal(same.poses, again.poses)

@@ -1,21 +1,21 @@
-"""Least squares in which loops count in full or not at all, and which ones is found out.
+"""Truncated least squares: each loop counts in full or is rejected, by graduated non-convexity.
 
-1. All loops count. Where every one fits, that is the result, and it is that of least squares.
+1. All loops are used. If every one fits, the result is that of least squares.
 2. Otherwise graduated non-convexity (Yang et al. 2020): the threshold of a Geman-McClure kernel
-   falls from the largest error by half at every step, so that the worst loops lose their weight
-   first, and the others come to fit better. Then loops are taken in or left out by their errors
+   starts at the largest error and is halved at every step, so that the worst loops lose their
+   weight first and the others fit better. Then loops are accepted or rejected by their errors
    until nothing changes.
-3. A false loop can hide: where odometry is weak, it bends to fit it. So every loop is held against
-   what all the others say of it, with the uncertainty that they leave. What is added to the sum of
-   squared errors by letting the loop count has a chi-square distribution if it is true::
+3. A false loop can hide where odometry is weak and bends to fit it (masking). So every loop is
+   tested against all other edges, with the covariance that they leave. What accepting the loop
+   adds to the sum of squared errors has a chi-square distribution if the loop is true::
 
        d = m^T W (I - C W)^-1 m
 
    with m the loop's error, W its information, C the covariance of the relative pose that it
-   measures, all in the same tangent space. The worst are left out and the rest solved again, and
-   those that fit after all are taken in.
+   measures, all in the same tangent space. The worst loops are rejected, the rest is solved again,
+   and loops that fit after all are accepted.
 
-Information often promises too much. So the threshold grows with the errors of the better half of
+Stated information is often too large. So the threshold grows with the errors of the better half of
 the loops, up to a limit.
 """
 
@@ -30,18 +30,17 @@ from tofuse.posegraph.descent import Descent, Problem
 from tofuse.posegraph.robust import Settings
 
 _QUARTILE = 3.4546  # of a chi-square variable with six degrees of freedom
-_ROUNDS = 20  # at most so many times loops are taken in or left out
-_DENSE = 3.0  # edges for each pose, above which no loop can bend the others to its will
-_WORTH = (
-    0.01  # share of the objective that leaving loops out must save: few that hardly matter stay
-)
+_MAX_ROUNDS = 20  # of accepting and rejecting loops
+_DENSE = 3.0  # edges per pose, above which no single loop can bend the others
+# Fraction of the objective that rejecting loops must save; otherwise all are accepted.
+_MIN_SAVING = 0.01
 
 
-class Truncated:
-    """The search for the loops that count.
+class GraduatedNonConvexity:
+    """Selection of the loops that are accepted.
 
-    After `run`, `descent` holds the poses, `weights` (m,) is 1 or 0 for each edge, and `limit`
-    (m,) is what an edge's squared error counts at most in the objective.
+    After `run`, `descent` has the poses, `weights` (m,) is 1 or 0 for each edge, and `limit` (m,)
+    is the largest contribution of an edge's squared error to the objective.
     """
 
     def __init__(self, problem: Problem, poses: Float64, loop: Bool, settings: Settings) -> None:
@@ -51,24 +50,24 @@ class Truncated:
         self.limit = np.full(len(loop), np.inf)
 
     def run(self) -> bool:
-        """Find loops and poses; whether the last descent met its stopping rule."""
+        """Select loops and solve for the poses; whether the last descent met its stopping rule."""
         loop, descent = self.loop, self.descent
         converged = self._with(self.weights)
         plain, everything = descent.state(), float(descent.chi2.sum())
         if everything <= self.settings.gate:
-            return converged  # no loop can have added more than there is
+            return converged  # no single loop can exceed the gate
         gate = self._gate(descent.chi2[loop])
         if not (descent.chi2[loop] <= gate).all():
             self._graduate()
-            accepted = descent.chi2[loop] <= self.settings.gate * self.settings.slack**2
+            accepted = descent.chi2[loop] <= self.settings.gate * self.settings.max_inflation**2
             gate = self._gate(descent.chi2[loop][accepted])
-            converged = self._settle(gate)
+            converged = self._iterate(gate)
         if len(loop) <= _DENSE * len(self.problem.fixed):
             converged = self._unmask(converged)
         if (self.weights == 1).all():
             return converged
         limit = np.where(loop, gate, np.inf)
-        if np.minimum(descent.chi2, limit).sum() > (1 - _WORTH) * everything:
+        if np.minimum(descent.chi2, limit).sum() > (1 - _MIN_SAVING) * everything:
             descent.restore(plain)
             self.weights = np.ones(len(loop))
             return True
@@ -82,9 +81,9 @@ class Truncated:
         )
 
     def _gate(self, errors: Float64) -> float:
-        """Threshold on squared errors, grown by what those of the better half show."""
+        """Threshold on squared errors, inflated by the spread of the better half of them."""
         spread = float(np.quantile(errors, 0.25)) / _QUARTILE if len(errors) else 1.0
-        return self.settings.gate * float(np.clip(spread, 1.0, self.settings.slack**2))
+        return self.settings.gate * float(np.clip(spread, 1.0, self.settings.max_inflation**2))
 
     def _graduate(self) -> None:
         loop, descent = self.loop, self.descent
@@ -100,9 +99,9 @@ class Truncated:
 
             descent.run(total, weights, 1e-3, 2)
 
-    def _settle(self, gate: float) -> bool:
-        """Take in and leave out by the loops' errors until nothing changes."""
-        for _ in range(_ROUNDS):
+    def _iterate(self, gate: float) -> bool:
+        """Accept and reject loops by their errors until nothing changes."""
+        for _ in range(_MAX_ROUNDS):
             before = self.weights
             self.weights = np.where(self.loop & (self.descent.chi2 > gate), 0.0, 1.0)
             converged = self._with(self.weights)
@@ -111,16 +110,16 @@ class Truncated:
         return False
 
     def _unmask(self, converged: bool) -> bool:
-        """Take in and leave out by what the other edges say of each loop."""
+        """Accept and reject loops by their errors against all other edges."""
         seen = set()
-        for _ in range(_ROUNDS + int(self.loop.sum())):
+        for _ in range(_MAX_ROUNDS + int(self.loop.sum())):
             d = self._against_the_others()
             if d is None:
                 return converged
             counts = self.loop & (self.weights > 0)
             gate = self._gate(d[counts])
             if (counts & (d > gate)).any():
-                # The worst first: they make others look bad.
+                # The worst first, as they raise the errors of others.
                 worst = counts & (d > max(gate, d[counts].max() / 2))
                 weights = np.where(worst, 0.0, self.weights)
             else:
@@ -134,7 +133,7 @@ class Truncated:
         return False
 
     def _against_the_others(self) -> Float64 | None:
-        """(m,) squared errors of loops against all other edges; None if that can't be told."""
+        """(m,) squared errors of loops against all other edges; None if the system is singular."""
         problem, descent = self.problem, self.descent
         factor = problem.factor(descent.poses, self.weights)
         if factor is None:
@@ -152,10 +151,10 @@ class Truncated:
         root = vector * np.sqrt(np.maximum(value, 0))[:, None]  # W = root root^T
         Rt = np.swapaxes(root, 1, 2)
         m = (Rt @ (se3.jacobian(e) @ e[..., None]))[..., 0]
-        # Of a loop that counts C has seen it already; of one that does not it has not.
+        # C includes an accepted loop, but not a rejected one.
         sign = np.where(self.weights[self.loop] > 0, -1.0, 1.0)
-        held, axes = np.linalg.eigh(np.eye(6) + sign[:, None, None] * (Rt @ C @ root))
+        scale, axes = np.linalg.eigh(np.eye(6) + sign[:, None, None] * (Rt @ C @ root))
         along = (np.swapaxes(axes, 1, 2) @ m[..., None])[..., 0]
         d = np.zeros(len(self.loop))
-        d[self.loop] = (along**2 / np.maximum(held, 1e-9)).sum(axis=1)
+        d[self.loop] = (along**2 / np.maximum(scale, 1e-9)).sum(axis=1)
         return d

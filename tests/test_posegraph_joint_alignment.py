@@ -14,9 +14,9 @@ from tofuse.kernels import refinement as kernels
 from tofuse.kernels.threads import threads
 from tofuse.posegraph.accuracy import Shown, accuracy_of
 from tofuse.posegraph.build import build_graph
-from tofuse.posegraph.refine import Bodies, RefineOptions, chosen, refine
+from tofuse.posegraph.joint_alignment import Bodies, RefineOptions, refine, spread_evenly
 from tofuse.posegraph.refinement import Joint, NoRefinement, followed, without_errors
-from tofuse.posegraph.views import KeptView, Spacing, ViewStore, overlaps
+from tofuse.posegraph.view_store import KeptView, Spacing, ViewStore, overlaps
 from tofuse.registration.prepared_view import prepare_view
 
 OPTIONS = RefineOptions()
@@ -141,10 +141,10 @@ def test_overlaps_are_those_of_views_that_look_at_the_same_side(swing):
 def test_partners_are_spread_evenly():
     pairs = np.array([(i, 9) for i in range(9)] + [(3, 4)])
     pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
-    kept = chosen(pairs, 3)
+    kept = spread_evenly(pairs, 3)
     assert kept[kept[:, 1] == 9, 0].tolist() == [0, 4, 8]
     assert (3, 4) in map(tuple, kept.tolist())
-    assert len(chosen(pairs[:0], 3)) == 0
+    assert len(spread_evenly(pairs[:0], 3)) == 0
 
 
 def test_frames_in_between_follow():

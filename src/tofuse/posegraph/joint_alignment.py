@@ -1,10 +1,10 @@
-"""Refinement over all overlapping views at once (eq 2.8), and self-calibration.
+"""Joint alignment of all overlapping views (eq 2.8), and self-calibration.
 
-Every pair of overlapping views gives the normal equations of its relative pose; by the adjoint
-they become equations in both poses, and one sparse system moves all of them. Then the points look
-for their partners again, until nothing moves: the thesis's wish to run its code "iterated"
-(chapter 8), with planes and albedo in place of points. Errors of the camera that all views share
-can be unknowns of the same system.
+Every pair of overlapping views gives the normal equations of its relative pose. The adjoint turns
+them into equations in both poses, and one sparse system updates all poses. Correspondences are
+then found anew, until convergence: the iteration that chapter 8 of the thesis suggests, with
+planes and albedo in place of points. Errors of the camera that all views share can be unknowns of
+the same system.
 """
 
 from __future__ import annotations
@@ -24,60 +24,61 @@ from tofuse.posegraph import robust, shared_error
 from tofuse.posegraph.descent import vertical
 from tofuse.posegraph.graph import Gravity
 from tofuse.posegraph.sparse import PairSystem
-from tofuse.posegraph.views import KeptView, overlaps
+from tofuse.posegraph.view_store import KeptView, overlaps
 
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 _PAIRS_A_CHUNK = 8
-# So many pairs, about, are asked by how much patches disagree.
-_PAIRS_ASKED = 200
-# Few residuals tell no scale.
-_LEAST_COMPARED = 50
+# Approximate number of pairs from which the disagreement of patches is estimated.
+_PAIRS_SAMPLED = 200
+# Residuals that an estimate of scale needs.
+_MIN_COMPARED = 50
 _UPPER = np.triu_indices(kernels.UNKNOWNS)
-# How firmly poses and errors are held where they are, in units of 1 cm and 1 degree, and of 0.01.
-_STILL, _ERROR_UNIT = 1e-3, 0.01
+# Information of a weak prior at the current estimate, for poses in units of 1 cm and 1 degree, and
+# for errors in units of 0.01.
+_WEAK_PRIOR, _ERROR_UNIT = 1e-3, 0.01
 _DAMPING = 1e-6
-# Motion, in these units, that changes little about which views overlap.
-_MOVED = 2.0
+# Overlaps are computed anew after a larger motion, in these units.
+_MAX_MOTION = 2.0
 
 
 @dataclass(frozen=True)
 class Round:
-    """Iterations with the same forgiveness: as in `registration.projective.Level`."""
+    """Iterations with the same noise inflation: as in `registration.projective.Level`."""
 
     iterations: int
-    slack_m: float
-    photo_slack: float
+    inflation_m: float
+    photometric_inflation: float
 
     def __post_init__(self) -> None:
         if not 1 <= self.iterations <= 1000:
             raise ValueError(f"iterations is {self.iterations}, not 1 to 1000")
-        if not (0 <= self.slack_m < 1e3 and 0 <= self.photo_slack < 1e3):
-            raise ValueError("slack_m and photo_slack must be 0 or more")
+        if not (0 <= self.inflation_m < 1e3 and 0 <= self.photometric_inflation < 1e3):
+            raise ValueError("inflation_m and photometric_inflation must be 0 or more")
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """How views are refined together.
+    """Options of the joint alignment.
 
     Attributes
     ----------
     rounds
-        Coarse and wide to fine; which views overlap is found anew for each if any has moved by
-        more than about 2 cm or 2 degrees.
+        From coarse to fine. Before each, overlaps are computed anew if any view has moved by more
+        than about 2 cm or 2 degrees.
     overlap
-        Least share of each other that two views must see.
+        Smallest overlap of a pair, as a fraction of the views.
     neighbours
-        At most so many earlier partners of each view, spread evenly over those that overlap.
+        Largest number of earlier partners of each view, spread evenly over those that overlap.
     points
-        About so many points of each view.
-    robust, max_angle, photometric, most_sigma_m
+        Approximate number of points of each view.
+    robust, max_angle, photometric, max_sigma_m
         As in `ProjectiveOptions`.
-    settled
-        Iterations end when nothing moves by more, in units of 1 cm and 1 degree.
+    convergence
+        Iterations end when no view moves by more, in units of 1 cm and 1 degree.
     shared
-        Errors of depth that the pixels of a patch share are taken to be so many times as large as
-        patches disagree (in the last round, of views that have albedo, and where no error of the
-        camera is estimated); 0: there are none. See `shared_error`.
+        Depth errors that the pixels of a patch share, as a multiple of the disagreement of the
+        patches; 0: none. Only in the last round, between views with albedo, and where no error of
+        the camera is estimated. See `shared_error`.
     """
 
     rounds: tuple[Round, ...] = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(5, 0.0, 0.0))
@@ -87,19 +88,19 @@ class RefineOptions:
     robust: float = 3.5
     max_angle: float = 0.7
     photometric: bool = True
-    most_sigma_m: float = 0.02
-    settled: float = 0.02
+    max_sigma_m: float = 0.02
+    convergence: float = 0.02
     shared: float = 1.0
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.rounds) <= 20:
-            raise ValueError(f"rounds holds {len(self.rounds)}; give 1 to 20")
+            raise ValueError(f"there are {len(self.rounds)} rounds; give 1 to 20")
         if not 0 < self.overlap <= 1:
             raise ValueError(f"overlap is {self.overlap}, not above 0 and up to 1")
         for name in ("neighbours", "points"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, not 1 or more")
-        for name in ("robust", "max_angle", "most_sigma_m", "settled"):
+        for name in ("robust", "max_angle", "max_sigma_m", "convergence"):
             if not 1e-6 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"{name} is {getattr(self, name)}, not above 0")
         if not 0 <= self.shared <= 100:
@@ -108,15 +109,15 @@ class RefineOptions:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """How well each directed pair agrees.
+    """Support of each directed pair.
 
     Attributes
     ----------
     target, source
         (P,) positions of the views.
     good
-        (P,) sum over its residuals, of 1 where there is none to 0 where it is beyond the robust
-        limit, less twice the points in free space.
+        (P,) sum over its residuals, each from 1 (zero) to 0 (at the robust limit or beyond), minus
+        twice the number of points in free space.
     terms
         (P,) number of its residuals.
     """
@@ -127,36 +128,36 @@ class Support:
     terms: Float64
 
     def of_views(self, count: int) -> Float64:
-        """(N,) support of each view by all that it overlaps with, up to 1."""
-        total, most = np.zeros(count), np.zeros(count)
+        """(N,) support of each of `count` views by all overlapping ones, 1 at most."""
+        total, terms = np.zeros(count), np.zeros(count)
         for ends in (self.target, self.source):
             np.add.at(total, ends, self.good)
-            np.add.at(most, ends, self.terms)
-        return total / np.maximum(most, 1)
+            np.add.at(terms, ends, self.terms)
+        return total / np.maximum(terms, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """What a refinement found.
+    """Result of a joint alignment.
 
     Attributes
     ----------
     poses
         (N, 4, 4) T_world_camera; the first has not moved.
     errors
-        (ERRORS,) of the camera, in the order of `kernels.refinement`; 0 where not asked for.
+        (ERRORS,) of the camera, in the order of `kernels.refinement`; 0 where not estimated.
     pairs
-        (M, 2) positions of the views i < j that took part.
+        (M, 2) positions of the overlapping views i < j.
     moved
         Largest motion of each iteration, in units of 1 cm and 1 degree.
     before, after
-        Support at the poses to start from and at those found, with the same sigmas.
+        Support at the initial and at the refined poses, with the same sigmas.
     measured, information
-        (M, 4, 4) T_i_j that each pair would have if it were alone, and (M, 6, 6) of its right
-        perturbation, as far as the noise of the views and what their patches share tell.
+        (M, 4, 4) T_i_j that minimises the residuals of each pair alone, and (M, 6, 6) information
+        of its right perturbation, from the noise of the views and the errors that patches share.
     scales
-        (2M, 3) exposure, and factors of the sigmas of distance and albedo, of each pair there and
-        then of each back.
+        (2M, 3) exposure, and factors of the sigmas of distance and albedo, of the pairs (i, j),
+        then of the pairs (j, i).
     """
 
     poses: Float64
@@ -171,15 +172,15 @@ class Refined:
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
-    """What is known of the views' poses beside what they show.
+class Priors:
+    """Measurements of the poses that don't come from the views: odometry, gravity.
 
     Attributes
     ----------
     pairs, measured, information
-        (M, 2) positions i, j of views, (M, 4, 4) their T_i_j and (M, 6, 6) the information of it.
+        (M, 2) positions i, j of views, (M, 4, 4) T_i_j and (M, 6, 6) its information.
     gravity
-        Directions in which things fall, or None.
+        Directions of gravity, or None.
     """
 
     pairs: Intp
@@ -188,21 +189,21 @@ class Beside:
     gravity: Gravity | None = None
 
     @classmethod
-    def nothing(cls) -> Beside:
-        """Nothing is known."""
+    def none(cls) -> Priors:
+        """Return no priors."""
         return cls(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Which views are fixed to each other, as those of a rig's cameras at one instant are.
+    """Rigid bodies of views, as those of a rig's cameras at one instant.
 
     Attributes
     ----------
     of
         (N,) number of the body of each view; 0 is that of the first.
     T_body_view
-        (N, 4, 4) how it is fixed there.
+        (N, 4, 4) pose of each view in its body.
     """
 
     of: Intp
@@ -217,22 +218,22 @@ class Bodies:
         """(N, 4, 4) T_world_view, by the poses (M, 4, 4) of their bodies."""
         return np.asarray(bodies[self.of] @ self.T_body_view, np.float64)
 
-    def apart(self, pairs: Intp) -> Intp:
-        """Those of the pairs (M, 2) of views that can move against each other."""
+    def across(self, pairs: Intp) -> Intp:
+        """Those of the pairs (M, 2) of views that belong to different bodies."""
         i, j = self.of[pairs].T
         return pairs[i != j]
 
 
 @dataclass(eq=False)
 class _Pairs:
-    """Directed pairs, what is known of each, and what was summed last."""
+    """Directed pairs, the scales of each, and its latest normal equations."""
 
     target: Intp
     source: Intp
     exposure: Float64
     scale_g: Float64
     scale_p: Float64
-    most: Float64
+    max_scale: Float64
     system: PairSystem
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
 
@@ -243,30 +244,34 @@ def refine(
     options: RefineOptions,
     *,
     calibrate: Sequence[int] = (),
-    beside: Beside | None = None,
+    priors: Priors | None = None,
     pairs: Intp | None = None,
     bodies: Bodies | None = None,
 ) -> Refined:
-    """Move all views until they agree with all that they overlap with.
+    """Align all views jointly with the views that they overlap with.
 
     Parameters
     ----------
+    views
+        N views of one recording.
     poses
-        (N, 4, 4) T_world_camera to start from; the first stays.
+        (N, 4, 4) initial T_world_camera; the first stays.
+    options
+        See `RefineOptions`.
     calibrate
         Errors of the camera to estimate as well, by their number in `kernels.refinement`.
-    beside
-        What is known of the poses beside what the views show.
+    priors
+        Measurements by other sensors.
     pairs
-        (M, 2) positions of the views i < j that are compared; unless given, those that overlap,
-        found anew for each round before which something has moved.
+        (M, 2) positions of the views i < j to compare; by default those that overlap, computed
+        anew before a round if views have moved.
     bodies
-        Which views move together, if any do. What `beside` knows is then of them.
+        Views that move rigidly together, if any. `priors` then refers to the bodies.
     """
     start = poses
     if bodies is not None:
         start = poses = bodies.views(bodies.poses(poses))
-    beside = beside or Beside.nothing()
+    priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS)
     known = np.ones(kernels.ERRORS, np.int64)
     known[list(calibrate)] = 0
@@ -274,25 +279,25 @@ def refine(
     state = _no_pairs()
     since = np.inf
     for stage in options.rounds:
-        if since >= _MOVED:
+        if since >= _MAX_MOTION:
             near = pairs
             if near is None:
                 near = overlaps(views, poses, options.overlap)[0]
-                near = near if bodies is None else bodies.apart(near)
-                near = chosen(near, options.neighbours)
-            state = _directed(views, near, options, state, beside, bodies)
+                near = near if bodies is None else bodies.across(near)
+                near = spread_evenly(near, options.neighbours)
+            state = _directed(views, near, options, state, priors, bodies)
             since = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
             _evaluate(views, poses, errors, known, state, stage, options)
             if stage is options.rounds[-1] and not calibrate:
                 _allow_for_shared(views, poses, state, options)
-            step, change = _solve(poses, state, known, beside, bodies)
+            step, change = _solve(poses, state, known, priors, bodies)
             poses = _moved(poses, step, bodies)
             errors = errors + change
             _rescale(state, stage)
             moved.append(float(np.abs(step / UNITS).max()))
             since += moved[-1] if pairs is None else 0.0
-            if moved[-1] < options.settled:
+            if moved[-1] < options.convergence:
                 break
     half = len(state.target) // 2
     pairs = np.stack([state.target[:half], state.source[:half]], 1)
@@ -300,7 +305,7 @@ def refine(
     after = _support(views, poses, errors, known, state, last, options)
     if not calibrate:
         _allow_for_shared(views, poses, state, options)
-    measured = _alone(poses, pairs, state)
+    measured = _pairwise_measurements(poses, pairs, state)
     before = _support(views, start, np.zeros_like(errors), known, state, last, options)
     scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
     return Refined(poses, errors, pairs, tuple(moved), before, after, *measured, scales)
@@ -310,7 +315,7 @@ def support_of(
     views: Sequence[KeptView], poses: Float64, refined: Refined, options: RefineOptions
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
-    state = _directed(views, refined.pairs, options, _no_pairs(), Beside.nothing())
+    state = _directed(views, refined.pairs, options, _no_pairs(), Priors.none())
     state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
     known = (refined.errors == 0).astype(np.int64)
     return _support(views, poses, refined.errors, known, state, options.rounds[-1], options)
@@ -318,29 +323,36 @@ def support_of(
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What each pair says of single errors of the camera, when all poses follow them.
+    """Sensitivity of each pair to single errors of the camera, all poses being free to follow.
 
     Attributes
     ----------
     gradient, information
-        (M, ERRORS) of each pair i < j, both directions together: the first derivative of half its
-        squared residuals where no error is assumed, and half the second.
+        (M, ERRORS) of each pair i < j, both directions together: first derivative of half its
+        squared residuals at zero error, and half the second.
     """
 
     gradient: Float64
     information: Float64
 
     def estimate(self) -> Float64:
-        """(ERRORS,) errors that fit best, each by itself, as far as one step tells."""
+        """(ERRORS,) least-squares estimate of each error alone, by one Gauss-Newton step."""
         return np.asarray(
             -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
         )
 
     def sigma(self, pairs: Intp, views: int) -> Float64:
-        """(ERRORS,) standard deviations, by how much views (of pairs (M, 2)) differ in it.
+        """(ERRORS,) standard deviations, from the spread between views (sandwich estimator).
 
-        Noise that neighbouring pixels share, and errors of single views, are in it; errors that
-        all views have in common are not.
+        It includes noise that neighbouring pixels share and errors of single views, but not errors
+        that all views have in common.
+
+        Parameters
+        ----------
+        pairs
+            (M, 2) positions of the views.
+        views
+            Number of views.
         """
         left = self.gradient + self.information * self.estimate()
         of_view = np.zeros((views, left.shape[1]))
@@ -356,36 +368,41 @@ def response(
     pairs: Intp,
     options: RefineOptions,
     *,
-    beside: Beside | None = None,
+    priors: Priors | None = None,
 ) -> Response:
-    """Tell what refined views say of errors of the camera that they share.
+    """Compute the sensitivity of refined views to errors of the camera that they share.
 
     Parameters
     ----------
+    views, options
+        As for `refine`.
     poses
-        (N, 4, 4), as they fit best without any error.
+        (N, 4, 4) T_world_camera, refined without any error.
     pairs
         (M, 2) positions of views i < j.
+    priors
+        Measurements by other sensors.
     """
-    beside = beside or Beside.nothing()
+    priors = priors or Priors.none()
     none, asked = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
     stage = options.rounds[-1]
-    state = _directed(views, pairs, options, _no_pairs(), beside)
+    state = _directed(views, pairs, options, _no_pairs(), priors)
     _evaluate(views, poses, none, np.ones_like(asked), state, stage, options)
     _without_exposure(state)
     _rescale(state, stage)
     _evaluate(views, poses, none, asked, state, stage, options)
     H, g = _without_exposure(state)
-    m = len(beside.pairs)
+    m = len(priors.pairs)
     i, j = state.system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]
-    more_H, more_g = _steps(T_i_j[len(H) :], beside)
-    still = np.tile(np.diag(_STILL / UNITS**2), (len(poses), 1, 1)), np.zeros((len(poses), 6))
+    more_H, more_g = _steps(T_i_j[len(H) :], priors)
+    n = len(poses)
+    prior = np.tile(np.diag(_WEAK_PRIOR / UNITS**2), (n, 1, 1)), np.zeros((n, 6))
     matrix, gradient = state.system.relative(
-        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, still
+        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, prior
     )
     factor = state.system.factor(matrix, gradient, _DAMPING)
-    assert factor is not None, "the poses are held, so the system is not singular"
+    assert factor is not None, "every pose has a prior, so the system is not singular"
     A = se3.adjoint(se3.inverse(T_i_j[: len(H)]))
 
     def relative(step: Float64) -> Float64:
@@ -405,7 +422,7 @@ def response(
     return Response(first[:half] + first[half:], second[:half] + second[half:])
 
 
-def alone(
+def align_pairs(
     views: Sequence[KeptView],
     pairs: Intp,
     T_i_j: Float64,
@@ -414,33 +431,42 @@ def alone(
     *,
     iterations: int = 8,
 ) -> Float64:
-    """(M, 4, 4) relative poses T_i_j of pairs (M, 2), each aligned by itself.
+    """(M, 4, 4) relative poses T_i_j of pairs, each aligned by itself.
 
     Parameters
     ----------
+    views, options
+        As for `refine`.
+    pairs
+        (M, 2) positions of views.
     T_i_j
-        (M, 4, 4) to start from.
+        (M, 4, 4) initial guesses.
     errors
-        (ERRORS,) that the camera is taken to have.
+        (ERRORS,) assumed errors of the camera.
+    iterations
+        Of Gauss-Newton.
     """
     count = len(pairs)
     both = [views[int(k)] for k in pairs.ravel()]
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
     state = _directed(
-        both, np.arange(2 * count).reshape(-1, 2), options, _no_pairs(), Beside.nothing()
+        both, np.arange(2 * count).reshape(-1, 2), options, _no_pairs(), Priors.none()
     )
     known, stage = (errors == 0).astype(np.int64), options.rounds[-1]
     for _ in range(iterations):
         _evaluate(both, poses, errors, known, state, stage, options)
-        step, _ = _solve(poses, state, np.ones_like(known), Beside.nothing())
+        step, _ = _solve(poses, state, np.ones_like(known), Priors.none())
         poses = se3.orthonormalise(poses @ se3.exp(step))
         _rescale(state, stage)
     return np.asarray(se3.inverse(poses[::2]) @ poses[1::2], np.float64)
 
 
-def chosen(pairs: Intp, neighbours: int) -> Intp:
-    """At most so many earlier partners of each view, spread evenly, first and last included."""
+def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
+    """At most `neighbours` earlier partners of each view, evenly spread, first and last included.
+
+    `pairs` are (M, 2) positions i < j.
+    """
     keep = [np.zeros(0, np.intp)]
     for j in np.unique(pairs[:, 1]):
         rows = np.flatnonzero(pairs[:, 1] == j)
@@ -451,7 +477,7 @@ def chosen(pairs: Intp, neighbours: int) -> Intp:
 
 
 def _moved(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64:
-    """Poses after a step of the views, or of their bodies; the first stays."""
+    """Apply a step to the views, or to their bodies; the first stays."""
     free = poses if bodies is None else bodies.poses(poses)
     out = se3.orthonormalise(free @ se3.exp(step))
     out[0] = free[0]
@@ -469,24 +495,24 @@ def _directed(
     pairs: Intp,
     options: RefineOptions,
     before: _Pairs,
-    beside: Beside,
+    priors: Priors,
     bodies: Bodies | None = None,
 ) -> _Pairs:
-    """Both directions of each pair, with what was known of them before."""
+    """Both directions of each pair, with their scales so far."""
     target = np.concatenate([pairs[:, 0], pairs[:, 1]])
     source = np.concatenate([pairs[:, 1], pairs[:, 0]])
     n = len(target)
-    most = np.maximum(3.0, options.most_sigma_m / np.array([v.sigma for v in views]))
+    max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
     ends = np.stack([target, source], 1)
     count = len(views)
     if bodies is not None:
         ends, count = bodies.of[ends], int(bodies.of.max()) + 1
     first = np.arange(count) == 0
-    system = PairSystem(count, np.concatenate([ends, beside.pairs]), fixed=first)
+    system = PairSystem(count, np.concatenate([ends, priors.pairs]), fixed=first)
     unknown = np.zeros(n), np.ones(n), np.full(n, 0.1)
-    state = _Pairs(target, source, *unknown, most[source], system)
-    lit = np.array([v.surface.has_albedo for v in views]) & options.photometric
-    state.scale_p[~(lit[target] & lit[source])] = 0.0
+    state = _Pairs(target, source, *unknown, max_scale[source], system)
+    photometric = np.array([v.surface.has_albedo for v in views]) & options.photometric
+    state.scale_p[~(photometric[target] & photometric[source])] = 0.0
     row = {ts: k for k, ts in enumerate(zip(before.target, before.source, strict=True))}
     old = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
     for name in ("exposure", "scale_g", "scale_p"):
@@ -508,7 +534,7 @@ def _evaluate(
     rows = np.empty((len(state.target), kernels.SIZE))
     cosine = float(np.cos(options.max_angle))
 
-    # All pairs of a target in turn: then the target need not be fetched again.
+    # Pairs of one target in succession, so that it stays in the cache.
     order = np.argsort(state.target, kind="stable")
 
     def work(a: int, b: int) -> None:
@@ -523,7 +549,7 @@ def _evaluate(
                 state.exposure[k],
                 state.scale_g[k],
                 state.scale_p[k],
-                stage.slack_m,
+                stage.inflation_m,
                 options.robust,
                 cosine,
                 errors,
@@ -538,24 +564,24 @@ def _evaluate(
 def _allow_for_shared(
     views: Sequence[KeptView], poses: Float64, state: _Pairs, options: RefineOptions
 ) -> None:
-    """Take off the normal equations what can't be told from errors that patches share.
+    """Remove from the normal equations what depth errors shared by patches could explain.
 
-    Only where albedo tells as well: without it there is nothing that errs less to rely on.
+    Only where there are photometric residuals: without them nothing more accurate is left.
     """
-    lit = np.flatnonzero(state.scale_p > 0)
-    if options.shared == 0 or not len(lit):
+    photometric = np.flatnonzero(state.scale_p > 0)
+    if options.shared == 0 or not len(photometric):
         return
-    T = se3.inverse(poses[state.target[lit]]) @ poses[state.source[lit]]
-    depth = np.array([v.surface.depth for v in views])[state.target[lit]]
+    T = se3.inverse(poses[state.target[photometric]]) @ poses[state.source[photometric]]
+    depth = np.array([v.surface.depth for v in views])[state.target[photometric]]
     growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
-    sums = np.empty((len(lit), shared_error.PATCHES, patch_kernels.PATCH_SIZE))
+    sums = np.empty((len(photometric), shared_error.PATCHES, patch_kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
 
     def sum_up(which: Intp) -> None:
         def work(a: int, b: int) -> None:
             for k in which[a:b]:
-                source = views[state.source[lit[k]]]
-                target = views[state.target[lit[k]]].surface
+                source = views[state.source[photometric[k]]]
+                target = views[state.target[photometric[k]]].surface
                 patch_kernels.patch_sums(
                     source.points,
                     source.patches,
@@ -563,7 +589,7 @@ def _allow_for_shared(
                     target.projection.lookup,
                     target.projection.frame,
                     np.ascontiguousarray(T[k]),
-                    state.scale_g[lit[k]],
+                    state.scale_g[photometric[k]],
                     options.robust,
                     cosine,
                     sums[k],
@@ -571,12 +597,12 @@ def _allow_for_shared(
 
         run_chunks(work, len(which), -(-len(which) // _PAIRS_A_CHUNK))
 
-    # Views of one recording come from one camera: they err alike.
+    # Views of one recording come from one camera: their errors are alike.
     alike = shared_error.alike(views[0].surface)
-    every = np.arange(len(lit))
-    some = every[:: -(-len(lit) // _PAIRS_ASKED)]
+    every = np.arange(len(photometric))
+    some = every[:: -(-len(photometric) // _PAIRS_SAMPLED)]
     sum_up(some)
-    found = shared_error.disagreement(sums[some], state.rows[lit[some]], alike)
+    found = shared_error.disagreement(sums[some], state.rows[photometric[some]], alike)
     variance = options.shared**2 * found.variance(growth[some]) * growth
     if not variance.any():
         return
@@ -584,9 +610,11 @@ def _allow_for_shared(
 
     def work(a: int, b: int) -> None:
         for k in range(a, b):
-            patch_kernels.discount_shared_errors(sums[k], alike, variance[k], state.rows[lit[k]])
+            patch_kernels.discount_shared_errors(
+                sums[k], alike, variance[k], state.rows[photometric[k]]
+            )
 
-    run_chunks(work, len(lit), -(-len(lit) // _PAIRS_A_CHUNK))
+    run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
 
 
 def _support(
@@ -603,60 +631,57 @@ def _support(
     return Support(state.target, state.source, good, state.rows[:, kernels.TERMS])
 
 
-def _alone(poses: Float64, pairs: Intp, state: _Pairs) -> tuple[Float64, Float64]:
-    """What each pair measures by itself: T_i_j, and its information."""
+def _pairwise_measurements(poses: Float64, pairs: Intp, state: _Pairs) -> tuple[Float64, Float64]:
+    """T_i_j that each pair alone measures, and its information."""
     H, g = _without_exposure(state)
     H, g = H[:, :6, :6], g[:, :6]
     half = len(pairs)
     T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
-    # The way back moves against the way there, as seen from the other end.
+    # A perturbation of T_i_j is the opposite one of T_j_i, in the other frame.
     A = -se3.adjoint(T_i_j)
     At = np.swapaxes(A, 1, 2)
     H = H[:half] + At @ H[half:] @ A
     g = g[:half] + (At @ g[half:, :, None])[..., 0]
-    scaled = H * np.outer(UNITS, UNITS) + _STILL * np.eye(6)
+    scaled = H * np.outer(UNITS, UNITS) + _WEAK_PRIOR * np.eye(6)
     step = -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS
     return T_i_j @ se3.exp(step), scaled / np.outer(UNITS, UNITS)
 
 
 def _solve(
-    poses: Float64, state: _Pairs, known: Int64, beside: Beside, bodies: Bodies | None = None
+    poses: Float64, state: _Pairs, known: Int64, priors: Priors, bodies: Bodies | None = None
 ) -> tuple[Float64, Float64]:
-    """One Gauss-Newton step: (N, 6) right perturbations of the poses, and that of the errors.
-
-    Of bodies, if there are any.
-    """
+    """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors."""
     H, g = _without_exposure(state)
     if bodies is not None:
-        # A source's view moves as its body does, seen from where it is fixed.
+        # A perturbation of the body is one of its view, by the adjoint.
         A = np.tile(np.eye(H.shape[1]), (len(H), 1, 1))
         A[:, :6, :6] = se3.adjoint(se3.inverse(bodies.T_body_view[state.source]))
         At = np.swapaxes(A, 1, 2)
         H, g = At @ H @ A, (At @ g[..., None])[..., 0]
         poses = bodies.poses(poses)
     free = 6 + np.flatnonzero(known == 0)
-    n, m = len(poses), len(beside.pairs)
+    n, m = len(poses), len(priors.pairs)
     system = state.system
     i, j = system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]
-    more_H, more_g = _steps(T_i_j[len(H) :], beside)
-    # Just enough that a view which nothing holds stays.
-    still = np.tile(np.diag(_STILL / UNITS**2), (n, 1, 1)), np.zeros((n, 6))
+    more_H, more_g = _steps(T_i_j[len(H) :], priors)
+    # Just enough that an unconstrained view stays.
+    prior = np.tile(np.diag(_WEAK_PRIOR / UNITS**2), (n, 1, 1)), np.zeros((n, 6))
     shared = _Shared(
         [system.gradient(np.concatenate([H[:, :6, k], np.zeros((m, 6))]), T_i_j) for k in free],
         H[:, free[:, None], free].sum(0),
         g[:, free].sum(0),
     )
-    firm = _STILL / _ERROR_UNIT**2 + _DAMPING * shared.small.diagonal()
-    if beside.gravity is not None:
+    firm = _WEAK_PRIOR / _ERROR_UNIT**2 + _DAMPING * shared.small.diagonal()
+    if priors.gravity is not None:
         firm = np.append(firm, np.zeros(2))
-        _add_gravity(poses, beside.gravity, still, shared, system)
+        _add_gravity(poses, priors.gravity, prior, shared, system)
     matrix, gradient = system.relative(
-        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, still
+        np.concatenate([H[:, :6, :6], more_H]), np.concatenate([g[:, :6], more_g]), T_i_j, prior
     )
     factor = system.factor(matrix, gradient, _DAMPING)
-    assert factor is not None, "the poses are held, so the system is not singular"
-    # Poses by themselves, and how they follow what they share: then that has a small system.
+    assert factor is not None, "every pose has a prior, so the system is not singular"
+    # Schur complement: the shared unknowns have a small dense system.
     columns, small, right = shared.columns, shared.small, shared.right
     step = _finite(factor.step())
     follow = np.zeros((len(columns), n, 6))
@@ -674,18 +699,18 @@ def _solve(
 
 @dataclass(eq=False)
 class _Shared:
-    """Equations of unknowns that all poses share: their columns, own block, and gradient."""
+    """Normal equations of unknowns that all poses share: columns, own block, and gradient."""
 
     columns: list[Float64]
     small: Float64
     right: Float64
 
 
-def _steps(T_i_j: Float64, beside: Beside) -> tuple[Float64, Float64]:
-    """Normal equations of the relative poses that are known beside what the views show."""
-    e = se3.log(se3.inverse(beside.measured) @ T_i_j)
+def _steps(T_i_j: Float64, priors: Priors) -> tuple[Float64, Float64]:
+    """Normal equations of the priors on relative poses."""
+    e = se3.log(se3.inverse(priors.measured) @ T_i_j)
     J = se3.jacobian_inverse(e)
-    JtW = np.swapaxes(J, 1, 2) @ beside.information
+    JtW = np.swapaxes(J, 1, 2) @ priors.information
     return JtW @ J, (JtW @ e[..., None])[..., 0]
 
 
@@ -696,13 +721,13 @@ def _add_gravity(
     shared: _Shared,
     system: PairSystem,
 ) -> None:
-    """Add what gravity says of single poses, and of the vertical in the world, which they share."""
+    """Add gravity's equations of single poses, and of the world's vertical, which they share."""
     at, d = gravity.vertices, gravity.directions
     R = poses[at, :3, :3]
     seen = (R @ d[..., None])[..., 0]
     down = vertical(seen, gravity)
     down /= np.linalg.norm(down)
-    across = np.linalg.svd(down[None])[2][1:].T  # (3, 2) directions in which it may turn
+    across = np.linalg.svd(down[None])[2][1:].T  # (3, 2) tangent directions
     e = seen - down
     known = 1 / gravity.sigma**2
     if np.isfinite(gravity.gate):
@@ -724,12 +749,12 @@ def _add_gravity(
 
 
 def _finite(step: Float64 | None) -> Float64:
-    assert step is not None, "what went into the system is finite"
+    assert step is not None, "the system is finite"
     return step
 
 
 def _without_exposure(state: _Pairs) -> tuple[Float64, Float64]:
-    """Normal equations of each pair without its exposure, which moves to where it fits best."""
+    """Normal equations of each pair without its exposure, which is eliminated and updated."""
     m, e = len(state.target), kernels.EXPOSURE
     H = np.zeros((m, kernels.UNKNOWNS, kernels.UNKNOWNS))
     H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.H : kernels.G]
@@ -746,12 +771,13 @@ def _without_exposure(state: _Pairs) -> tuple[Float64, Float64]:
 
 
 def _rescale(state: _Pairs, stage: Round) -> None:
-    """Take the sigmas of each pair from its residuals, as the tracker does."""
+    """Estimate the sigmas of each pair from its residuals, as the tracker does."""
     counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
-    enough = counts.sum(1) >= _LEAST_COMPARED
+    enough = counts.sum(1) >= _MIN_COMPARED
     seen = np.array([steps.scale_of_distances(row) for row in counts[enough]])
-    state.scale_g[enough] = np.clip(seen, 0.7, state.most[enough])
+    state.scale_g[enough] = np.clip(seen, 0.7, state.max_scale[enough])
     weight = state.rows[:, kernels.WEIGHT_P]
     seen = np.sqrt(state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9) / 0.72)
-    lit = (weight > 0) & (state.scale_p > 0)
-    state.scale_p[lit] = np.clip(np.hypot(seen, stage.photo_slack), 0.005, 0.5)[lit]
+    used = (weight > 0) & (state.scale_p > 0)
+    scale = np.clip(np.hypot(seen, stage.photometric_inflation), 0.005, 0.5)
+    state.scale_p[used] = scale[used]

@@ -1,0 +1,289 @@
+"""Self-calibration check: whether all views together indicate an error of the camera.
+
+A wrong focal length or a depth offset bends the trajectory, and no single registration shows it.
+But where views overlap, and most of all where a path closes a loop, their residuals can't all be
+small. So each error is estimated by itself, with all poses free to follow. An error that lets the
+views agree better is a proposal. It is an alarm if it exceeds the calibration error of usual
+cameras, and if it closes a loop that pairwise alignments of neighbours leave open.
+
+The focal length stands for other errors too: a constant offset of the depth has much the same
+effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tofuse.arrays import Float64, Intp
+from tofuse.geometry import se3
+from tofuse.kernels import refinement as kernels
+from tofuse.posegraph.joint_alignment import (
+    Priors,
+    Refined,
+    RefineOptions,
+    Round,
+    align_pairs,
+    refine,
+    response,
+    spread_evenly,
+)
+from tofuse.posegraph.view_store import KeptView
+
+# Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
+# calibrated to better than that. Makers specify depth offsets of up to a centimetre.
+TOLERANCES = {"focal": 0.02, "offset": 0.02}
+# Significance of an error in standard deviations, for an alarm and for a closer look; and the
+# fraction of the tolerance that one Gauss-Newton step, which falls short, must show for the latter.
+_SIGNIFICANT, _LIKELY, _MIN_FIRST_STEP = 4.0, 2.5, 0.2
+# A loop is closed if its error is below this, m and rad.
+_CLOSED = (0.01, np.radians(0.5))
+# Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
+_MAX_SIGMA = 0.4
+# Change of the views' support that the choice of points alone explains.
+_CHANCE = 0.003
+# The spread between views is not known from fewer.
+_MIN_VIEWS = 8
+_NUMBERS = {"focal": kernels.FOCAL, "offset": kernels.OFFSET}
+# The solution may be far from the start.
+_ROUNDS = (Round(2, 0.02, 0.1), Round(2, 0.005, 0.03), Round(4, 0.0, 0.0))
+# This many pairs determine errors that all views share; of more, about as many, with every n-th
+# point, are used.
+_ENOUGH_PAIRS, _EVERY = 500, 3
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A loop of views of which consecutive ones overlap, and the two ends too.
+
+    `before` and `after` are its closure errors (m, rad) by pairwise alignments, without and with
+    the estimated errors of the camera. `depth` is that of the views, m.
+    """
+
+    i: int
+    j: int
+    before: tuple[float, float]
+    after: tuple[float, float]
+    depth: float = 0.0
+
+    @property
+    def closes(self) -> bool:
+        """Whether the estimated errors explain it: one part is halved, the other is not larger.
+
+        Or points at the views' depth move by less than half the distance. A gap of less than a
+        centimetre and half a degree has no significance, as not every error bends every path.
+        """
+        seen = [m + self.depth * rad for m, rad in (self.after, self.before)]
+        least = _CLOSED[0] + self.depth * _CLOSED[1]
+        if self.depth and seen[0] < 0.5 * seen[1] and seen[1] > least:
+            return True
+        parts = list(zip(self.before, self.after, _CLOSED, strict=True))
+        if any(b > max(a, least) for a, b, least in parts):
+            return False
+        return all(a < least for a, _, least in parts) or any(b < 0.5 * a for a, b, _ in parts)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether it is significant, and the estimated errors do not explain it."""
+        wide = any(a >= least for a, least in zip(self.before, _CLOSED, strict=True))
+        return wide and not self.closes
+
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """Evidence of the views for errors of the camera that all of them share.
+
+    Attributes
+    ----------
+    alarm
+        Whether the camera's calibration should be checked.
+    errors, sigmas
+        Estimates of each error by itself, as in `Refinement.errors`, and their standard deviations
+        from the spread between views. They are proposals and change nothing. Only significant
+        ones; in case of an alarm, all that the views determine.
+    support
+        Mean support of the views without and with the significant error that raises it most, see
+        `joint_alignment.Support`.
+    gap
+        Closure error of the longest loop; None if there is none, or no error is significant.
+    best
+        Name of the error that raises the support most; empty if no error is significant.
+    focal_sigma
+        Standard deviation of the focal length estimated from the views, as a fraction; None if
+        there are too few views.
+    """
+
+    alarm: bool = False
+    errors: dict[str, float] = field(default_factory=dict)
+    sigmas: dict[str, float] = field(default_factory=dict)
+    support: tuple[float, float] | None = None
+    gap: Gap | None = None
+    best: str = ""
+    focal_sigma: float | None = None
+
+    @property
+    def undetermined(self) -> bool:
+        """Whether a wrong focal length would not show in this recording."""
+        return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
+
+    @property
+    def unconfirmed(self) -> dict[str, float]:
+        """Errors that raise the support and that no loop confirms or contradicts."""
+        if self.alarm or (self.gap is not None and self.gap.contradicts):
+            return {}
+        sigmas = self.sigmas
+        return {n: e for n, e in self.errors.items() if n in sigmas and _large(n, e, sigmas[n])}
+
+
+def _determined(name: str, sigma: float) -> bool:
+    return sigma < _MAX_SIGMA * TOLERANCES[name]
+
+
+def _large(name: str, error: float, sigma: float) -> bool:
+    return abs(error) > max(TOLERANCES[name], _SIGNIFICANT * sigma)
+
+
+def check_calibration(
+    views: Sequence[KeptView], refined: Refined, options: RefineOptions, priors: Priors
+) -> CalibrationCheck:
+    """Estimate the errors of the camera from refined views.
+
+    Parameters
+    ----------
+    views, refined, options, priors
+        Of the joint alignment without errors of the camera, see `refine`.
+    """
+    pairs, poses = refined.pairs, refined.poses
+    if not len(pairs) or len(views) < _MIN_VIEWS:
+        return CalibrationCheck()
+    sensitivity = response(views, poses, pairs, options, priors=priors)
+    estimate, sigma = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
+    determined = [name for name, k in _NUMBERS.items() if _determined(name, sigma[k])]
+    focal_sigma = float(sigma[kernels.FOCAL])
+    likely = [
+        name
+        for name in determined
+        if abs(estimate[_NUMBERS[name]])
+        > max(_LIKELY * sigma[_NUMBERS[name]], _MIN_FIRST_STEP * TOLERANCES[name])
+    ]
+    if not likely:
+        return CalibrationCheck(focal_sigma=focal_sigma)
+    few, some = list(views), pairs
+    if len(pairs) > _ENOUGH_PAIRS:
+        few = [KeptView(v.surface, np.ascontiguousarray(v.points[::_EVERY])) for v in views]
+        some = spread_evenly(pairs, -(-options.neighbours * _ENOUGH_PAIRS // len(pairs)))
+    patient = replace(options, rounds=_ROUNDS)
+
+    def estimated(name: str) -> Refined:
+        # The overlaps are known; the poses only follow.
+        number = [_NUMBERS[name]]
+        return refine(few, poses, patient, calibrate=number, priors=priors, pairs=some)
+
+    found = {name: estimated(name) for name in likely}
+    name_of_best = max(found, key=lambda name: _gain(found[name], views))
+    best = found[name_of_best]
+    large = any(
+        _large(name, one.errors[_NUMBERS[name]], sigma[_NUMBERS[name]])
+        for name, one in found.items()
+    )
+    gap = loop_gap(views, refined, best.poses, best.errors, options) if large else None
+    alarm = gap is not None and gap.closes and _gain(best, views) > _CHANCE
+    if alarm:  # alternative explanations
+        found |= {name: estimated(name) for name in determined if name not in found}
+    support = float(best.before.of_views(len(views)).mean())
+    return CalibrationCheck(
+        alarm,
+        {name: float(found[name].errors[k]) for name, k in _NUMBERS.items() if name in found},
+        {name: float(sigma[k]) for name, k in _NUMBERS.items() if name in found},
+        (support, support + _gain(best, views)),
+        gap,
+        name_of_best,
+        focal_sigma,
+    )
+
+
+def of_submaps(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
+    """Combine the checks of the submaps of one recording.
+
+    They share the camera, so a true error shows in most of them. Of the alarms, that with the
+    median error is returned.
+    """
+    alarms = sorted((s for s in checks if s.alarm), key=lambda s: s.errors.get(s.best, 0.0))
+    if 2 * len(alarms) > len(checks):
+        return alarms[len(alarms) // 2]
+    quiet = [s for s in checks if not s.alarm]
+    # One submap that determines the camera speaks for all of them.
+    quiet.sort(key=lambda s: (s.gap is None, s.undetermined))
+    return quiet[0] if quiet else CalibrationCheck()
+
+
+def _gain(found: Refined, views: Sequence[KeptView]) -> float:
+    n = len(views)
+    return float(found.after.of_views(n).mean() - found.before.of_views(n).mean())
+
+
+def loop_gap(
+    views: Sequence[KeptView],
+    refined: Refined,
+    poses: Float64,
+    errors: Float64,
+    options: RefineOptions,
+) -> Gap | None:
+    """Closure errors of the longest loop, without and with errors of the camera; None without one.
+
+    Parameters
+    ----------
+    views, options
+        As for `refine`.
+    refined
+        Result without errors of the camera.
+    poses, errors
+        (N, 4, 4) and (ERRORS,) result with them.
+    """
+    ends = longest_loop(refined.pairs)
+    if ends is None:
+        return None
+    i, j = ends
+    chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
+    pairs = np.concatenate([chain, [[i, j]]])
+    gaps = []
+    for at, wrong in ((refined.poses, np.zeros(kernels.ERRORS)), (poses, errors)):
+        T = se3.inverse(at[pairs[:, 0]]) @ at[pairs[:, 1]]
+        T = align_pairs(views, pairs, T, options, wrong)
+        chained = np.eye(4)
+        for step in T[:-1]:
+            chained = chained @ step
+        miss = se3.inverse(T[-1]) @ chained
+        gaps.append((float(np.linalg.norm(miss[:3, 3])), float(se3.angle(miss))))
+    depth = 0.5 * (views[i].surface.depth + views[j].surface.depth)
+    return Gap(views[i].surface.index, views[j].surface.index, gaps[0], gaps[1], depth)
+
+
+def longest_loop(pairs: Intp) -> tuple[int, int] | None:
+    """The pair (i, j) furthest apart in time between which all consecutive views overlap."""
+    if not len(pairs):
+        return None
+    joined = np.zeros(int(pairs.max()) + 1, bool)
+    joined[pairs[pairs[:, 1] == pairs[:, 0] + 1, 0]] = True
+    broken = np.concatenate([[0], np.cumsum(~joined)])
+    i, j = pairs.T
+    whole = (broken[j] == broken[i]) & (j > i + 1)
+    if not whole.any():
+        return None
+    k = int(np.argmax(np.where(whole, j - i, -1)))
+    return int(i[k]), int(j[k])
+
+
+def in_words(errors: Mapping[str, float]) -> list[str]:
+    """Describe the correction of each error of the camera, as in `CalibrationCheck`, in words."""
+    words = []
+    if "focal" in errors:
+        share = 1 / (1 + errors["focal"]) - 1
+        more = "larger" if share > 0 else "smaller"
+        words.append(f"a focal length {abs(share):.1%} {more}")
+    if "offset" in errors:
+        more = "longer" if errors["offset"] > 0 else "shorter"
+        words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")
+    return words
