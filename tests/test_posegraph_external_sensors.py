@@ -207,9 +207,9 @@ def test_without_files_nothing_changes():
     [
         (GravityEdges, {"shared_rad": 0}),
         (GravityEdges, {"gate": -1}),
-        (GravityEdges, {"least": 0}),
+        (GravityEdges, {"min_frames": 0}),
         (OdometryEdges, {"share": -1}),
-        (OdometryEdges, {"least_m": 0}),
+        (OdometryEdges, {"min_m": 0}),
         (OdometryEdges, {"limit": 0.5}),
     ],
 )
