@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.calibration.noise import NoiseFit, estimate_noise
+from tofuse.calibration.noise_estimation import NoiseFit, estimate_noise
 from tofuse.files.images import read_image
 from tofuse.geometry.cameras import Pinhole
 from tofuse.lab.simulation.effects import Effects

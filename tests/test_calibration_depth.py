@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tofuse.calibration.board import Board
-from tofuse.calibration.depth import DepthFit, calibrate_depth, composed
+from tofuse.calibration.depth import DepthFit, calibrate_depth, compose
 from tofuse.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.cli import main
 from tofuse.errors import InputError
@@ -133,7 +133,7 @@ def test_two_corrections_are_one_after_the_other() -> None:
     first = DepthCorrection(r, wiggle(r))
     second = DepthCorrection(r[::3], 0.01 * r[::3], np.full((1, 50), 0.002, np.float32))
     measured = np.linspace(0.8, 4.2, 50, dtype=np.float32)[None]
-    both = composed(first, second).correct(measured)
+    both = compose(first, second).correct(measured)
     np.testing.assert_allclose(both, second.correct(first.correct(measured)), atol=2e-4)
 
 

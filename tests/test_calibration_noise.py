@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofuse.calibration.noise import estimate_noise
+from tofuse.calibration.noise_estimation import estimate_noise
 from tofuse.cli import main
 from tofuse.errors import InputError
 from tofuse.geometry.cameras import Pinhole
@@ -175,7 +175,7 @@ def test_several_stretches_are_one_estimate() -> None:
         (lambda: still_frames("corner", "sr4000", 8)[:2], "has 2 frames"),
         (lambda: still_frames("corner", "sr4000", 8)[:1] * 6, "repeats the same image"),
         (lambda: [CloudFrame.of(np.eye(3))] * 5, "holds clouds"),
-        (lambda: list(simulate_recording("room", every=3, frames=3)), "nowhere still"),
+        (lambda: list(simulate_recording("room", every=3, frames=3)), "nowhere static"),
         (
             lambda: [replace(f, depth=f.depth * 1000) for f in plain_frames(np.full(80, 0.01))],
             "check depth_unit_m",

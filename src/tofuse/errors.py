@@ -1,10 +1,10 @@
-"""What a person is told when something from outside can't be used."""
+"""Errors with a place, a problem and a remedy, on one line."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-_LONGEST = 600  # characters of a problem: what is quoted of a file may have any length
+_LONGEST = 600  # characters of a problem, as text quoted from a file may have any length
 
 
 def _clipped(text: str) -> str:
@@ -12,10 +12,7 @@ def _clipped(text: str) -> str:
 
 
 class TofuseError(Exception):
-    """Base of every error that the package raises on purpose.
-
-    Says where the problem is, what it is, and what to do about it, on one line.
-    """
+    """Base class of the package's errors: where the problem is, what it is, and a remedy."""
 
     def __init__(
         self, problem: str, *, where: str | Path | None = None, remedy: str | None = None
@@ -29,7 +26,7 @@ class TofuseError(Exception):
 
 
 class Ended(BaseException):
-    """The system asked this process to end, by a signal of that `number`."""
+    """The process is to end because of a signal with this `number`."""
 
     def __init__(self, number: int) -> None:
         self.number = number

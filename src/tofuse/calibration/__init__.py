@@ -1,1 +1,1 @@
-"""What a camera's own recordings tell about it."""
+"""Calibration of a camera from its own recordings: lens, range errors, noise."""

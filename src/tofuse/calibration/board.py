@@ -1,4 +1,4 @@
-"""The inner corners of a checkerboard in an image."""
+"""Detection of the inner corners of a checkerboard in an image."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tofuse.arrays import Float32, Float64, UInt8
 from tofuse.errors import InputError
 from tofuse.recordings.frames import RangeFrame
 
-# Small images are enlarged until they have this many columns: the detector wants large squares.
+# Small images are enlarged to this many columns, as the detector needs large squares.
 _COLUMNS = 640
 _MOST = 4
 _DARKEST, _BRIGHTEST = 1.0, 99.0  # percentiles that become black and white
-# Local contrast is taken over so much of the image's width.
+# Size of the window of local contrast, relative to the image's width.
 _LOCAL = 0.25
 
 
@@ -58,7 +58,7 @@ class Board:
         Raises
         ------
         InputError
-            If it says something else.
+            If the text has another form.
         """
         found = re.fullmatch(r"\s*(\d{1,3})\s*x\s*(\d{1,3})\s*:\s*([\d.eE+-]{1,20})\s*", text)
         try:
@@ -87,10 +87,10 @@ class Board:
         return np.array([[left, left], [right, left], [right, low], [left, low]])
 
 
-def picture(frame: RangeFrame, channel: str) -> Float32 | None:
-    """Image (H, W) of a frame to look for a board in: "amplitude" or "color"; None if it has none.
+def board_image(frame: RangeFrame, channel: str) -> Float32 | None:
+    """Return the image (H, W) of a frame to detect a board in, "amplitude" or "color", or None.
 
-    Colour that is not registered to depth belongs to another lens and is left alone.
+    Colour that is not registered to depth belongs to another lens and is not used.
     """
     if channel == "color":
         image = frame.color_image
@@ -102,14 +102,14 @@ def picture(frame: RangeFrame, channel: str) -> Float32 | None:
 
 
 def find_corners(image: Float32, board: Board) -> Float64 | None:
-    """Pixel coordinates (N, 2) of the inner corners in an image (H, W), or None.
+    """Return the pixel coordinates (N, 2) of the inner corners in an image (H, W), or None.
 
-    The image is stretched between its percentiles, or evened out locally where that does not
-    do, enlarged, and searched by the detector of Duda and Frese (2018), which refines corners to
-    a fraction of a pixel.
+    The contrast is stretched between percentiles, or normalised locally if that fails; the image is
+    enlarged and searched by the detector of Duda and Frese (2018), which refines corners to a
+    fraction of a pixel.
     """
     scale = int(np.clip(np.ceil(_COLUMNS / image.shape[1]), 1, _MOST))
-    for stretched in (_stretched(image), _stretched(_evened(image))):
+    for stretched in (_stretch_contrast(image), _stretch_contrast(_flatten_illumination(image))):
         large = cv2.resize(stretched, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         found, corners = cv2.findChessboardCornersSB(
             large,
@@ -122,7 +122,7 @@ def find_corners(image: Float32, board: Board) -> Float64 | None:
     return None
 
 
-def _stretched(image: Float32) -> UInt8:
+def _stretch_contrast(image: Float32) -> UInt8:
     known = image[np.isfinite(image) & (image > 0)]
     if known.size == 0:
         return np.zeros(image.shape, np.uint8)
@@ -131,8 +131,8 @@ def _stretched(image: Float32) -> UInt8:
     return (np.clip(level, 0, 1) * 255).astype(np.uint8)
 
 
-def _evened(image: Float32) -> Float32:
-    """Divide by the mean around each pixel: a lamp's light falls off."""
+def _flatten_illumination(image: Float32) -> Float32:
+    """Divide by the local mean, which compensates the falloff of the illumination."""
     bright = np.maximum(np.nan_to_num(image), 0) + 1.0
     around = cv2.GaussianBlur(bright, (0, 0), _LOCAL * image.shape[1] / 2)
     return np.asarray(bright / around, np.float32)

@@ -1,4 +1,4 @@
-"""Where a checkerboard is, seen through a lens that is known."""
+"""Pose of a checkerboard seen by a calibrated camera."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from tofuse.geometry.cameras import Camera
 
 
 def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64, float] | None:
-    """Find T_camera_board (4, 4) of corners (N, 2) in pixels, and their rms distance in pixels.
+    """Return T_camera_board (4, 4) from corners (N, 2) in pixels, and their rms error in pixels.
 
-    By the homography of a plane (Collins and Bartoli 2014), refined by Levenberg-Marquardt. None
-    if corners lie where the lens shows nothing.
+    By infinitesimal plane-based pose estimation (Collins and Bartoli 2014), refined by
+    Levenberg-Marquardt. None if corners lie outside the valid area of the lens.
     """
     rays = cv2.remap(
         np.asarray(camera.rays(), np.float32),
@@ -43,7 +43,7 @@ def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64,
 
 
 def pose_of(rvec: NDArray[np.generic], tvec: NDArray[np.generic]) -> Float64:
-    """(4, 4) motion of OpenCV's rotation vector and translation."""
+    """Return the (4, 4) motion of OpenCV's rotation vector and translation."""
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(np.asarray(rvec, float))[0]
     T[:3, 3] = np.asarray(tvec, float).ravel()

@@ -1,4 +1,4 @@
-"""Writing a lens where readers look for it: a camera.json, with what else it says kept."""
+"""Writing a calibrated lens to camera.json, preserving its other fields."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _KEPT = (
 
 
 def recording_fields(recording: Recording) -> dict[str, Any]:
-    """Return what a recording says of its images beside the lens, as fields of camera.json."""
+    """Return the fields of camera.json that describe a recording's images, without the lens."""
     own = Path(recording.path) / "camera.json"
     if is_folder(Path(recording.path)) and is_file(own):
         return {key: value for key, value in read_json(own).items() if key not in _LENS}
@@ -43,27 +43,27 @@ def recording_fields(recording: Recording) -> dict[str, Any]:
 def write_camera_json(
     path: str | Path, camera: Camera, about: dict[str, Any], *, overwrite: bool = False
 ) -> list[Path]:
-    """Write a camera.json, and rays.npy beside it for a table of rays.
+    """Write a camera.json, and a rays.npy in the same folder for a table of rays.
 
     Parameters
     ----------
     path
-        The file, which `--camera` or a native recording's folder takes.
+        The file, for `--camera` or the folder of a native recording.
     camera
         The lens.
     about
-        Other fields; `depth_unit_m` is 0.001 and `depth_kind` "z" where they don't say.
+        Other fields; by default `depth_unit_m` is 0.001 and `depth_kind` is "z".
     overwrite
-        Whether files that are there are replaced.
+        Whether existing files are replaced.
 
     Returns
     -------
-    What was written.
+    The files that were written.
 
     Raises
     ------
     OutputError
-        If a file is there already, or a rays.npy beside it would override the lens.
+        If a file exists already, or a rays.npy in the same folder would override the lens.
     InputError
         If the lens is of no known model.
     """
@@ -71,12 +71,10 @@ def write_camera_json(
     table = path.with_name("rays.npy")
     files = [table, path] if isinstance(camera, RayTable) else [path]
     if not overwrite and (there := [file for file in files if file.exists()]):
-        raise OutputError(
-            "is there already", where=there[0], remedy="give --overwrite to replace it"
-        )
+        raise OutputError("exists already", where=there[0], remedy="give --overwrite to replace it")
     if table.exists() and table not in files:
         raise OutputError(
-            "would override the lens that is written beside it",
+            "would override the lens that is written to the same folder",
             where=table,
             remedy="move it away, or give --out in another folder",
         )
@@ -92,16 +90,16 @@ def write_camera_json(
 
 
 def check_new(path: Path, *, overwrite: bool) -> None:
-    """Refuse a file that is there before anything is computed.
+    """Refuse an existing file before anything is computed.
 
     Raises
     ------
     OutputError
-        If it is there and may not be replaced.
+        If it exists and may not be replaced.
     InputError
         If it is a folder.
     """
     if is_folder(path):
         raise InputError("is a folder", where="--out", remedy="give a file, such as camera.json")
     if path.exists() and not overwrite:
-        raise OutputError("is there already", where=path, remedy="give --overwrite to replace it")
+        raise OutputError("exists already", where=path, remedy="give --overwrite to replace it")

@@ -1,11 +1,10 @@
-"""A camera's systematic errors of range, from pixels that see planes.
+"""Calibration of a camera's systematic range errors from views of planes.
 
-What a pixel p measures of a plane is ``r = t + c(r) + o_p`` with t the true range, c the same
-curve for all pixels and o_p an offset of its own (Lindner and Kolb 2006, who know the planes'
-poses). Curve, offsets and all planes are estimated together, by Gauss-Newton on robust least
-squares; the offsets are eliminated pixel by pixel. Where no plane's pose is known, a curve that
-grows with the range is the same as planes that are farther off: the data says nothing about the
-scale, and a weak prior keeps it.
+On a plane a pixel p measures ``r = t + c(r) + o_p`` with the true range t, a curve c shared by all
+pixels, and an offset o_p of the pixel (Lindner and Kolb 2006, with known poses of the planes).
+Curve, offsets and all planes are estimated jointly, by Gauss-Newton on robust least squares; the
+offsets are eliminated pixel by pixel. Without any known pose, a curve proportional to the range is
+equivalent to more distant planes: the scale is unobservable, and is fixed by a weak prior.
 """
 
 from __future__ import annotations
@@ -25,44 +24,44 @@ from tofuse.geometry.cameras import Camera
 from tofuse.sensor.depth_correction import DepthCorrection
 
 _KNOT_M = 0.04
-_MOST_KNOTS = 200
-_PIXELS = 6000  # that the curve is estimated from; offsets are of all pixels
+_MAX_KNOTS = 200
+_PIXELS = 6000  # used for the curve; offsets are estimated from all pixels
 _ROUNDS = 8
 _HUBER = 2.0  # standard deviations
-# What is believed beforehand, standard deviations in m: of the curve, of its bend from knot to
-# knot, of the offsets; of the curve's mean and slope, where no plane's pose is known.
+# Prior standard deviations in m: of the curve, of its second differences, of the offsets; and of
+# the curve's mean and slope without any known pose.
 _CURVE_M, _BEND_M, _OFFSET_M = 0.1, 0.004, 0.02
-# Where boards' poses tell a slope over the image, pixels are free while planes are estimated: what
-# is believed of thousands of them would outweigh the poses.
+# While planes are estimated with known board poses, pixel offsets are nearly free: otherwise the
+# priors of thousands of pixels would outweigh the poses.
 _ANY_OFFSET_M, _MEAN_OFFSET_M = 1.0, 1e-4
 _MEAN_M, _SLOPE = 0.002, 0.001
-_FLOOR_M = 0.001  # of the noise
-_LEAST_SPREAD_M = 0.3
-_MOST_SHAPE_M = 0.004  # standard deviation of the curve, but for mean and slope
-_SMOOTH = 1 / 50  # of the image's width
+_FLOOR_M = 0.001  # lower limit of the noise
+_MIN_SPREAD_M = 0.3
+_MAX_SHAPE_M = 0.004  # standard deviation of the curve without mean and slope
+_SMOOTH = 1 / 50  # width of the blur, relative to the image's width
 
 
 @dataclass(frozen=True)
 class DepthFit:
-    """A correction of depth, and how well it is known.
+    """A depth correction and its uncertainty.
 
     Attributes
     ----------
     correction
-        What to subtract.
+        Range error to subtract.
     frames, planes
-        Frames that were used, and planes in them.
+        Numbers of frames that were used, and of planes in them.
     range_m
-        Nearest and farthest range that was seen: the curve is held constant beyond.
+        Smallest and largest observed range; the curve is constant beyond.
     before_m, after_m
-        Distance of single pixels from the planes, noise included, root mean square of the middle.
+        Robust rms distance of single pixels from the planes, noise included.
     bias_before_m, bias_after_m
-        The same of means over patches of pixels, of which noise is averaged away.
+        The same for averages over patches of pixels, which suppress noise.
     constant_sigma_m, scale_sigma
-        Standard deviations of the curve's mean in m, and of its slope (a share of the range); where
-        no pose is known, those of what was believed beforehand.
+        Standard deviations of the curve's mean in m, and of its slope relative to the range; those
+        of the priors without any known pose.
     warnings
-        What a person should know, one line each.
+        For the user, one line each.
     """
 
     correction: DepthCorrection = field(repr=False)
@@ -103,54 +102,55 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     Parameters
     ----------
     views
-        Of `board_planes` or `scene_planes`.
+        From `board_planes` or `scene_planes`.
     camera
-        Whose pixels they are.
+        Of the views.
     where
-        What was opened, for messages.
+        Name of the recording, for error messages.
 
     Raises
     ------
     InputError
-        If the planes are all at about one range.
+        If the planes' ranges vary too little, or the curve is too uncertain.
     """
     everything = np.concatenate([view.measured_m for view in views])
     low, high = (float(v) for v in np.quantile(everything, [0.005, 0.995]))
-    if high - low < _LEAST_SPREAD_M:
+    if high - low < _MIN_SPREAD_M:
         raise InputError(
             f"shows planes from {low:.2f} to {high:.2f} m only",
             where=where,
             remedy="record a wall from several distances, over the range that is to be corrected",
         )
-    count = int(np.clip(np.ceil((high - low) / _KNOT_M), 4, _MOST_KNOTS)) + 1
+    count = int(np.clip(np.ceil((high - low) / _KNOT_M), 4, _MAX_KNOTS)) + 1
     knots = np.linspace(low, high, count)
     shape = camera.height, camera.width
-    thinned = [_thinned(view, shape) for view in views]
-    state = _solved(thinned, knots, shape)
-    if not state.shape_sigma < _MOST_SHAPE_M:
+    thinned = [_subsampled(view, shape) for view in views]
+    state = _solve(thinned, knots, shape)
+    if not state.shape_sigma < _MAX_SHAPE_M:
         raise InputError(
-            f"shows {len(views)} planes, which tell the curve to {1000 * state.shape_sigma:.0f} mm",
+            f"shows {len(views)} planes, which determine the curve only to "
+            f"{1000 * state.shape_sigma:.0f} mm",
             where=where,
             remedy="record a wall from 20 places or more, at all distances, tilted to all sides",
         )
     residuals = _residuals(views, knots, state)
     offsets = _offsets(views, residuals, shape)
-    # The mean of the offsets is the curve's.
+    # The mean of the offsets is part of the curve.
     seen = np.unique(np.concatenate([view.pixels for view in views]))
     mean = float(offsets.ravel()[seen].mean())
     offsets -= mean
     curve = state.curve + mean
     after = [r - offsets.ravel()[v.pixels] - mean for r, v in zip(residuals, views, strict=True)]
     flat = np.zeros_like(curve)
-    before = _residuals(views, knots, _own_planes(thinned, knots, flat, shape))
+    before = _residuals(views, knots, _fit_planes(thinned, knots, flat, shape))
     constant, scale = state.sigma
     return DepthFit(
         DepthCorrection(knots, curve, offsets.astype(np.float32)),
         len({view.frame for view in views}),
         len(views),
         (low, high),
-        _middle(np.concatenate(before)),
-        _middle(np.concatenate(after)),
+        _robust_rms(np.concatenate(before)),
+        _robust_rms(np.concatenate(after)),
         _patches(views, before, shape),
         _patches(views, after, shape),
         constant,
@@ -159,11 +159,11 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
     )
 
 
-def composed(first: DepthCorrection, then: DepthCorrection) -> DepthCorrection:
-    """Return one correction for two, the second of which is of what the first has corrected.
+def compose(first: DepthCorrection, then: DepthCorrection) -> DepthCorrection:
+    """Return the composition of two corrections, the second applied after the first.
 
-    The first's offsets move the range at which the second is looked up by millimetres, which
-    changes nothing that counts.
+    The first one's offsets change the range at which the second is evaluated by millimetres, which
+    is neglected.
     """
     ends = [then.range_m[0], then.range_m[-1]]
     back = then.range_m + np.interp(then.range_m, first.range_m, first.bias_m)
@@ -177,7 +177,7 @@ def composed(first: DepthCorrection, then: DepthCorrection) -> DepthCorrection:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Curve (K,) in m, planes (V, 3), deviations of the curve's mean and slope, and of the rest."""
+    """Curve (K,) in m, planes (V, 3), and the sigmas of the curve's mean, slope and shape."""
 
     curve: Float64
     planes: Float64
@@ -185,8 +185,8 @@ class _State:
     shape_sigma: float
 
 
-def _thinned(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
-    """Every so manieth row and column, the same in all views."""
+def _subsampled(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
+    """Return the view on every n-th row and column, the same in all views."""
     step = max(1, round(float(np.sqrt(shape[0] * shape[1] / _PIXELS))))
     row, column = np.divmod(view.pixels, shape[1])
     keep = (row % step == step // 2) & (column % step == step // 2)
@@ -201,20 +201,20 @@ def _thinned(view: PlaneView, shape: tuple[int, int]) -> PlaneView:
     )
 
 
-def _own_planes(
+def _fit_planes(
     views: Sequence[PlaneView], knots: Float64, curve: Float64, shape: tuple[int, int]
 ) -> _State:
-    """Fit the planes alone, to what was measured."""
-    return _solved(views, knots, shape, held=curve)
+    """Fit the planes to the measurements, with the curve fixed."""
+    return _solve(views, knots, shape, held=curve)
 
 
-def _solved(
+def _solve(
     views: Sequence[PlaneView],
     knots: Float64,
     shape: tuple[int, int],
     held: Float64 | None = None,
 ) -> _State:
-    """Gauss-Newton over curve and planes; a curve that is `held` stays, and has no offsets."""
+    """Run Gauss-Newton over curve and planes, or over planes only if the curve `held` is given."""
     many = len(knots)
     counts = [len(view.pixels) for view in views]
     measured = np.concatenate([view.measured_m for view in views])
@@ -225,28 +225,28 @@ def _solved(
     start = np.stack([view.plane for view in views])
     planes, curve = start.copy(), np.zeros(many) if held is None else held.copy()
     offsets = np.zeros(len(pixels))
-    prior = _prior(knots, posed=_posed(views))
-    believed = _ANY_OFFSET_M if _posed(views) else _OFFSET_M
+    prior = _prior(knots, posed=_has_known_pose(views))
+    believed = _ANY_OFFSET_M if _has_known_pose(views) else _OFFSET_M
     size = many + 3 * len(views)
     n = len(measured)
     covariance = np.zeros((many, many))
     scale = 1.0
     for _ in range(_ROUNDS):
         true = 1 / np.einsum("nc,nc->n", planes[which], rays)
-        left, share = _between(_expected(true, knots, curve), knots)
+        left, share = _interval(_measured_of_true(true, knots, curve), knots)
         bias = curve[left] * (1 - share) + curve[left + 1] * share
         residual = measured - true - bias - offsets[pixel]
-        scale = max(_middle(residual / sigma), 0.1)
+        scale = max(_robust_rms(residual / sigma), 0.1)
         weight = 1 / (sigma * scale) ** 2
         weight *= np.minimum(1, _HUBER * scale * sigma / np.maximum(np.abs(residual), 1e-12))
-        # Columns: two knots, three numbers of the plane. d(true) = -true^2 ray . d(plane).
+        # Columns: two knots, three parameters of the plane. d(true) = -true^2 ray . d(plane).
         slope = -(true**2)[:, None] * rays
         columns = np.stack([left, left + 1, *(many + 3 * which + a for a in range(3))], 1)
         values = np.concatenate([np.stack([1 - share, share], 1), slope], 1)
         A = csr_array((values.ravel(), columns.ravel(), np.arange(0, 5 * n + 1, 5)), (n, size))
         AtW = (diags_array(weight) @ A).T.tocsr()
         normal = (AtW @ A).toarray()
-        # Without the offsets: they are solved for afterwards.
+        # The offsets are solved for afterwards.
         target = residual + offsets[pixel]
         right = AtW @ target
         by_pixel = csr_array((weight, (pixel, np.arange(n))), (len(pixels), n))
@@ -256,7 +256,7 @@ def _solved(
             normal -= (coupled.T @ (diags_array(1 / total) @ coupled)).toarray()
             alone = (by_pixel @ target) / total
             right -= coupled.T @ alone
-            # Their mean is the curve's: held at 0, by the formula of Sherman and Morrison.
+            # Their mean is part of the curve and fixed to 0, by the Sherman-Morrison formula.
             held_mean = 1 / ((len(total) * _MEAN_OFFSET_M) ** 2 + (1 / total).sum())
             together = coupled.T @ (1 / total)
             normal += held_mean * np.outer(together, together)
@@ -269,7 +269,7 @@ def _solved(
             right[own] += view.information @ (start[k] - planes[k])
         free = slice(0, None) if held is None else slice(many, None)
         step = np.zeros(size)
-        # Columns of a plane and of the curve are of other sizes.
+        # Scale the columns, as those of planes and curve have different units.
         unit = 1 / np.sqrt(np.maximum(np.diag(normal)[free], 1e-12))
         scaled = normal[free, free] * unit[:, None] * unit
         step[free] = unit * np.linalg.solve(scaled + 1e-10 * np.eye(len(unit)), unit * right[free])
@@ -281,68 +281,72 @@ def _solved(
             inverse = np.linalg.inv(scaled + 1e-10 * np.eye(len(unit)))
             covariance = (inverse * unit[:, None] * unit)[:many, :many]
     weights = (np.bincount(left, minlength=many) + 1e-9).astype(np.float64)
-    rest = np.eye(many) - _line(knots) @ _level(knots, np.ones(many))
+    rest = np.eye(many) - _mean_and_slope_basis(knots) @ _mean_and_slope_projector(
+        knots, np.ones(many)
+    )
     variances = np.diag(rest @ covariance @ rest.T)
     shape_sigma = float(np.sqrt(max(np.average(variances, weights=weights), 0)))
-    return _State(curve, planes, _deviations(knots, weights, covariance), shape_sigma)
+    return _State(curve, planes, _mean_and_slope_sigma(knots, weights, covariance), shape_sigma)
 
 
-def _deviations(knots: Float64, weights: Float64, covariance: Float64) -> tuple[float, float]:
-    """Standard deviations of the curve's mean, and of its slope, over the ranges that were seen."""
-    functionals = _level(knots, weights)
+def _mean_and_slope_sigma(
+    knots: Float64, weights: Float64, covariance: Float64
+) -> tuple[float, float]:
+    """Return the sigmas of the curve's mean and slope over the observed ranges."""
+    functionals = _mean_and_slope_projector(knots, weights)
     variances = np.diag(functionals @ covariance @ functionals.T)
     constant, slope = np.sqrt(np.maximum(variances, 0))
     return float(constant), float(slope)
 
 
-def _line(knots: Float64) -> Float64:
-    """(K, 2) a constant and a slope about the middle, as curves."""
+def _mean_and_slope_basis(knots: Float64) -> Float64:
+    """Return a constant and a centred slope as curves, (K, 2)."""
     return np.stack([np.ones_like(knots), knots - knots.mean()], 1)
 
 
-def _level(knots: Float64, weights: Float64) -> Float64:
-    """(2, K) what takes mean and slope of a curve, by weighted least squares."""
+def _mean_and_slope_projector(knots: Float64, weights: Float64) -> Float64:
+    """Return the matrix (2, K) that fits mean and slope to a curve by weighted least squares."""
     base = np.stack([np.ones_like(knots), knots - np.average(knots, weights=weights)], 1)
     return np.asarray(np.linalg.solve((base.T * weights) @ base, base.T * weights))
 
 
-def _expected(true: Float64, knots: Float64, curve: Float64) -> Float64:
-    """Ranges that a true range is measured as, without noise.
+def _measured_of_true(true: Float64, knots: Float64, curve: Float64) -> Float64:
+    """Return the noise-free measurements (N,) of true ranges (N,), at which the curve is evaluated.
 
-    Where the curve is looked up: at what was measured, noise would look like a slope of the curve.
+    Evaluated at the noisy measurements, noise would bias the slope of the curve.
     """
     return np.asarray(true + np.interp(true + np.interp(true, knots, curve), knots, curve))
 
 
-def _between(measured: Float64, knots: Float64) -> tuple[Intp, Float64]:
-    """(N,) knot before each range, and how far it is on the way to the next."""
+def _interval(measured: Float64, knots: Float64) -> tuple[Intp, Float64]:
+    """Return the knot before each range (N,), and its fraction of the interval to the next one."""
     place = (measured - knots[0]) / (knots[1] - knots[0])
     left = np.clip(np.floor(place), 0, len(knots) - 2).astype(np.intp)
     return left, np.clip(place - left, 0, 1)
 
 
-def _posed(views: Sequence[PlaneView]) -> bool:
+def _has_known_pose(views: Sequence[PlaneView]) -> bool:
     """Whether the pose of any plane is known."""
     return any(float(np.trace(view.information)) > 1 for view in views)
 
 
 def _prior(knots: Float64, *, posed: bool) -> Float64:
-    """(K, K) information about a curve: small, bent little from knot to knot, and maybe level."""
+    """Return the prior information (K, K) of a curve: small, smooth, and unless `posed` level."""
     many = len(knots)
     bend = np.diff(np.eye(many), 2, axis=0)
     information = np.eye(many) / (_CURVE_M**2 * many) + bend.T @ bend / _BEND_M**2
     if not posed:
-        level = _level(knots, np.ones(many)) / np.array([[_MEAN_M], [_SLOPE]])
+        level = _mean_and_slope_projector(knots, np.ones(many)) / np.array([[_MEAN_M], [_SLOPE]])
         information += level.T @ level
     return np.asarray(information)
 
 
 def _residuals(views: Sequence[PlaneView], knots: Float64, state: _State) -> list[Float64]:
-    """What remains of each pixel's range without its offset, view by view."""
+    """Return the range residuals of each view's pixels, without their offsets."""
     out = []
     for view, plane in zip(views, state.planes, strict=True):
         true = 1 / (view.directions @ plane)
-        bias = np.interp(_expected(true, knots, state.curve), knots, state.curve)
+        bias = np.interp(_measured_of_true(true, knots, state.curve), knots, state.curve)
         out.append(view.measured_m - true - bias)
     return out
 
@@ -350,29 +354,28 @@ def _residuals(views: Sequence[PlaneView], knots: Float64, state: _State) -> lis
 def _offsets(
     views: Sequence[PlaneView], residuals: Sequence[Float64], shape: tuple[int, int]
 ) -> Float64:
-    """(H, W) offsets: what is smooth over the image, and of a pixel's own as much as it is known.
+    """Estimate the offsets (H, W): a smooth part over the image, and a shrunken part per pixel.
 
-    The share of what a pixel measured alone follows from how much more pixels differ than their
-    noise (empirical Bayes).
+    The shrinkage follows from how much more pixels differ than by their noise (empirical Bayes).
     """
     size = shape[0] * shape[1]
     sums, weights = np.zeros(size), np.zeros(size)
     joined = np.concatenate(residuals)
     sigma = np.hypot(np.concatenate([view.sigma_m for view in views]), _FLOOR_M)
-    scale = max(_middle(joined / sigma), 0.1)
+    scale = max(_robust_rms(joined / sigma), 0.1)
     for view, residual in zip(views, residuals, strict=True):
         own = np.hypot(view.sigma_m, _FLOOR_M) * scale
-        # The residual holds the offset itself: only what is far off is an outlier.
+        # The residual contains the offset, so the outlier threshold is large.
         far = 3 * _OFFSET_M + 3 * own
         weight = np.where(np.abs(residual) < far, 1 / own**2, 0)
         np.add.at(sums, view.pixels, weight * residual)
         np.add.at(weights, view.pixels, weight)
     sums, weights = sums.reshape(shape), weights.reshape(shape)
     mean = np.divide(sums, weights, out=np.zeros(shape), where=weights > 0)
-    smooth = _filled(sums, weights, max(2.0, _SMOOTH * shape[1]))
+    smooth = _blur_and_fill(sums, weights, max(2.0, _SMOOTH * shape[1]))
     seen = weights > 0
     apart = (mean - smooth)[seen]
-    limit = 3 * max(_middle(apart), 1e-6)
+    limit = 3 * max(_robust_rms(apart), 1e-6)
     typical = np.abs(apart) < limit
     variance = float(np.mean(apart[typical] ** 2 - 1 / weights[seen][typical]))
     own_share = np.zeros(shape)
@@ -381,8 +384,8 @@ def _offsets(
     return np.asarray(smooth + own_share * (mean - smooth))
 
 
-def _filled(sums: Float64, weights: Float64, width: float) -> Float64:
-    """Blur a weighted mean; where nothing was seen, wider and wider."""
+def _blur_and_fill(sums: Float64, weights: Float64, width: float) -> Float64:
+    """Blur a weighted mean, with increasing widths where there is no data."""
     out = np.zeros(sums.shape)
     missing = np.ones(sums.shape, bool)
     least = 1e-3 * float(weights.max())
@@ -396,15 +399,15 @@ def _filled(sums: Float64, weights: Float64, width: float) -> Float64:
     return out
 
 
-def _middle(values: Float64) -> float:
-    """Root mean square of a normal distribution with these values' median."""
+def _robust_rms(values: Float64) -> float:
+    """Return the rms of the normal distribution with the same median absolute value."""
     return float(np.median(np.abs(values))) / 0.6745
 
 
 def _patches(
     views: Sequence[PlaneView], residuals: Sequence[Float64], shape: tuple[int, int]
 ) -> float:
-    """Root mean square of the medians over patches of a tenth of the image's width."""
+    """Return the rms of the medians over patches of a tenth of the image's width."""
     side = max(4, shape[1] // 10)
     medians = []
     for view, residual in zip(views, residuals, strict=True):
@@ -419,13 +422,13 @@ def _patches(
 
 def _warnings(views: Sequence[PlaneView], covered: float) -> list[str]:
     out = []
-    if not _posed(views):
+    if not _has_known_pose(views):
         out.append(
-            "planes at unknown poses do not tell the scale of the range, and hardly a constant "
-            "offset: both are left as they are; a checkerboard (--board) tells them"
+            "planes at unknown poses do not determine the scale of the range, and hardly a "
+            "constant offset: both are unchanged; a checkerboard (--board) determines them"
         )
     if covered < 0.9:
-        out.append(f"{100 * (1 - covered):.0f} % of the pixels saw no plane: interpolated")
+        out.append(f"{100 * (1 - covered):.0f} % of the pixels saw no plane and were interpolated")
     if len({view.frame for view in views}) < 8:
         out.append("few views: 20 or more at all distances are better")
     return out

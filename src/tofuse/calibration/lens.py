@@ -1,4 +1,4 @@
-"""A camera's intrinsics and distortion, from images of a checkerboard (Zhang 2000, OpenCV)."""
+"""Calibration of intrinsics and distortion from images of a checkerboard (Zhang 2000, OpenCV)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tofuse.arrays import Float64
-from tofuse.calibration.board import Board, find_corners, picture
+from tofuse.calibration.board import Board, board_image, find_corners
 from tofuse.calibration.board_pose import board_pose, pose_of
 from tofuse.errors import InputError
 from tofuse.geometry import se3
@@ -26,14 +26,14 @@ from tofuse.geometry.cameras import (
 )
 from tofuse.recordings.recording import Recording
 
-LEAST_VIEWS = 4
-_SEARCHED = 160  # frames at most in which the board is looked for
-_USED = 40  # views at most: more take time and tell little
-_MOVED_PX = 3.0  # views in which no corner moved farther are one
-_WORSE = 3.0  # times the median view: a view that does not fit
-_LEAST_WORSE_PX = 0.3
-_LEAST_SPREAD = np.radians(6)  # of the board's normals
-_MOST_SIGMA = 0.01  # of the focal length
+MIN_VIEWS = 4
+_SEARCHED = 160  # maximum number of frames in which the board is searched
+_USED = 40  # maximum number of views
+_MOVED_PX = 3.0  # smallest motion of a corner between distinct views
+_WORSE = 3.0  # ratio to the median view's residual at which a view is an outlier
+_MIN_OUTLIER_PX = 0.3
+_MIN_SPREAD = np.radians(6)  # of the board's normals
+_MAX_SIGMA = 0.01  # of the focal length
 _COVERED = 0.5
 _CELLS = 8
 _INTRINSIC = ("fx", "fy", "cx", "cy")
@@ -57,26 +57,26 @@ class BoardView:
 
 @dataclass(frozen=True)
 class LensFit:
-    """A lens, and how well it is known.
+    """A calibrated lens and its uncertainty.
 
     Attributes
     ----------
     camera
         The lens.
     sigma
-        Standard deviation of each of its numbers by name; those held at 0 have none.
+        Standard deviation of each parameter by name, without those fixed to 0.
     rms_px
-        Distance of the corners from where the lens puts them, root mean square.
+        Rms reprojection error of the corners.
     before_px
-        The same of the lens that the recording came with.
+        The same for the recording's original lens.
     views, rms_by_view_px
-        Frames that were used, and the distance in each.
+        Frames that were used, and the rms reprojection error of each.
     left_out
-        Frames that were not, each with the reason.
+        Frames that were not used, each with the reason.
     covered
-        Share of the image in which corners lay.
+        Fraction of the image that was covered by corners.
     warnings
-        What a person should know, one line each.
+        For the user, one line each.
     """
 
     camera: Pinhole
@@ -109,27 +109,27 @@ class LensFit:
 
 
 def names_of(model: str) -> tuple[str, ...]:
-    """Return the names of a lens model's numbers, as its class has them."""
+    """Return the names of a lens model's parameters, as in its class."""
     return (*_INTRINSIC, *DISTORTION_ORDER[model])
 
 
 def board_views(
     recording: Recording, board: Board, image: str = "amplitude"
 ) -> tuple[list[BoardView], list[tuple[int, str]], Camera]:
-    """Find the board in up to 160 frames of a recording, evenly spaced.
+    """Detect the board in up to 160 evenly spaced frames of a recording.
 
     Parameters
     ----------
     recording
         Depth images with amplitude, or with colour that is registered to depth.
     board
-        What to look for.
+        The checkerboard.
     image
         "amplitude" or "color".
 
     Returns
     -------
-    The views that show the board, the frames that don't with the reason, and the camera.
+    The views that show the board, the other frames with the reason, and the camera.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def board_views(
     left_out: list[tuple[int, str]] = []
     camera: Camera | None = None
     for item in recording.images(_SEARCHED):
-        seen = picture(item, image)
+        seen = board_image(item, image)
         if seen is None:
             other = "color" if image == "amplitude" else "amplitude"
             raise InputError(
@@ -164,9 +164,9 @@ def calibrate_lens(
 ) -> LensFit:
     """Estimate the lens of the depth camera from views of a checkerboard.
 
-    Up to 40 views that differ are used. Views that fit three times worse than the median one are
-    left out, one after another. Of "brown", only as many coefficients are kept as the views tell
-    (by the Bayesian information criterion); the others are 0.
+    Up to 40 distinct views are used. Views with three times the median reprojection error are
+    removed one by one. The number of coefficients of "brown" is selected by the Bayesian
+    information criterion; the others are 0.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def calibrate_lens(
     Raises
     ------
     InputError
-        If the board is seen too seldom, or its views are too alike to tell the lens.
+        If too few views show the board, or they are too similar to determine the lens.
     """
     if model not in MODELS:
         raise InputError(
@@ -188,16 +188,16 @@ def calibrate_lens(
         )
     views, left_out, before = board_views(recording, board, image)
     found = len(views)
-    views, same = _different(views)
+    views, same = _distinct(views)
     left_out += [(k, "is like another view") for k in same]
     _check_count(recording, board, views, found)
     size = before.width, before.height
     while True:
-        fit = _fitted(model, views, board, size, recording.path)
+        fit = _fit_lens(model, views, board, size, recording.path)
         rms = fit.rms_by_view
         worst = int(np.argmax(rms))
-        limit = max(_WORSE * float(np.median(rms)), _LEAST_WORSE_PX)
-        if rms[worst] <= limit or len(views) <= LEAST_VIEWS:
+        limit = max(_WORSE * float(np.median(rms)), _MIN_OUTLIER_PX)
+        if rms[worst] <= limit or len(views) <= MIN_VIEWS:
             break
         left_out.append((views[worst].index, f"misses by {rms[worst]:.2f} px"))
         del views[worst]
@@ -227,8 +227,8 @@ class _Fit:
     squares: float
 
 
-def _different(views: list[BoardView]) -> tuple[list[BoardView], list[int]]:
-    """Views of which none is like another, at most 40 evenly spaced; and those left out."""
+def _distinct(views: list[BoardView]) -> tuple[list[BoardView], list[int]]:
+    """Return at most 40 evenly spaced distinct views, and the frames of the others."""
     kept: list[BoardView] = []
     same: list[int] = []
     for view in views:
@@ -244,7 +244,7 @@ def _different(views: list[BoardView]) -> tuple[list[BoardView], list[int]]:
 
 
 def _check_count(recording: Recording, board: Board, views: list[BoardView], found: int) -> None:
-    if len(views) >= LEAST_VIEWS:
+    if len(views) >= MIN_VIEWS:
         return
     name = f"{board.columns} x {board.rows} inner corners"
     if found == 0:
@@ -254,8 +254,8 @@ def _check_count(recording: Recording, board: Board, views: list[BoardView], fou
             remedy="check --board; have all of the board in view, matt, with a white margin",
         )
     raise InputError(
-        f"shows the board from {len(views)} places that differ (in {found} frames), and "
-        f"{LEAST_VIEWS} is the least",
+        f"shows the board from {len(views)} distinct viewpoints (in {found} frames); at least "
+        f"{MIN_VIEWS} are needed",
         where=recording.path,
         remedy="record it from 15 places or more, tilted to all sides and all over the image",
     )
@@ -266,9 +266,9 @@ def _check_spread(recording: Recording, fit: _Fit) -> None:
     mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
     spread = float(np.sqrt((np.arccos(np.clip(normals @ mean, -1, 1)) ** 2).mean()))
     known = max(fit.sigma["fx"] / fit.camera.fx, fit.sigma["fy"] / fit.camera.fy)
-    if spread < _LEAST_SPREAD or not known < _MOST_SIGMA:
+    if spread < _MIN_SPREAD or not known < _MAX_SIGMA:
         raise InputError(
-            f"shows the board from {len(fit.poses)} places too much alike (tilts differ by "
+            f"shows the board from {len(fit.poses)} viewpoints too similar (tilts differ by "
             f"{np.degrees(spread):.0f} degrees rms, the focal length is known to "
             f"{100 * known:.2g} %)",
             where=recording.path,
@@ -277,7 +277,7 @@ def _check_spread(recording: Recording, fit: _Fit) -> None:
 
 
 def _covered(views: Sequence[BoardView], size: tuple[int, int]) -> float:
-    """Share of the cells of a grid over the image that lie within a view's corners."""
+    """Return the fraction of a grid's cells that lie within the corners of a view."""
     seen = np.zeros((_CELLS, _CELLS), bool)
     v, u = (np.mgrid[0:_CELLS, 0:_CELLS] + 0.5) / _CELLS
     for view in views:
@@ -292,13 +292,13 @@ def _warnings(fit: _Fit, covered: float, views: int) -> list[str]:
     out = []
     if covered < _COVERED:
         out.append(
-            f"corners lay in {100 * covered:.0f} % of the image: the lens is extrapolated "
+            f"corners cover {100 * covered:.0f} % of the image: the lens is extrapolated "
             "elsewhere; record the board near the borders too"
         )
     if views < 10:
-        out.append(f"{views} views were used; 15 or more are safer")
+        out.append(f"{views} views were used; 15 or more are recommended")
     if fit.camera.model == "rational" and views < 15:
-        out.append("a rational lens has 12 numbers; 15 views or more are safer")
+        out.append("a rational lens has 12 parameters; 15 views or more are recommended")
     return out
 
 
@@ -307,7 +307,8 @@ def _rms(values: Float64) -> float:
 
 
 _FREE = cv2.CALIB_FIX_K4 | cv2.CALIB_FIX_K5 | cv2.CALIB_FIX_K6
-# Flags that hold coefficients at 0, and which remain; the last of a model has all of them.
+# Flags that fix coefficients to 0, and the names of the free ones; the last variant is the full
+# one.
 _VARIANTS: dict[str, tuple[tuple[int, tuple[str, ...]], ...]] = {
     "pinhole": (
         (
@@ -326,10 +327,10 @@ _VARIANTS: dict[str, tuple[tuple[int, tuple[str, ...]], ...]] = {
 }
 
 
-def _fitted(
+def _fit_lens(
     model: str, views: Sequence[BoardView], board: Board, size: tuple[int, int], path: str
 ) -> _Fit:
-    """Fit a lens to views; of several variants, that with the least information criterion."""
+    """Fit a lens to views, selecting the variant with the smallest information criterion."""
     try:
         if model == "fisheye":
             return _fisheye(views, board, size)
@@ -343,7 +344,7 @@ def _fitted(
                 best = score, fit
     except (cv2.error, InputError, np.linalg.LinAlgError) as error:
         raise InputError(
-            f"shows the board from {len(views)} places that no {model} lens explains",
+            f"shows the board from {len(views)} viewpoints that no {model} lens fits",
             where=path,
             remedy="tilt it by 20 to 40 degrees to all sides, near and far; check --board",
         ) from error
@@ -382,35 +383,35 @@ def _opencv(
     told = dict(zip((*_INTRINSIC, *order), deviations.tolist(), strict=False))
     sigma = {name: told[name] for name in (*_INTRINSIC, *names)}
     poses = [pose_of(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
-    return _of_poses(camera, sigma, poses, views, board)
+    return _evaluate(camera, sigma, poses, views, board)
 
 
-def _of_poses(
+def _evaluate(
     camera: Pinhole,
     sigma: dict[str, float],
     poses: list[Float64],
     views: Sequence[BoardView],
     board: Board,
 ) -> _Fit:
-    missed = [_missed(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
+    missed = [_reprojection_errors(camera, T, v, board) for T, v in zip(poses, views, strict=True)]
     squares = np.array([(m**2).sum() for m in missed])
     return _Fit(camera, sigma, poses, np.sqrt(squares / len(board.points)), float(squares.sum()))
 
 
-def _missed(camera: Pinhole, T: Float64, view: BoardView, board: Board) -> Float64:
+def _reprojection_errors(camera: Pinhole, T: Float64, view: BoardView, board: Board) -> Float64:
     return camera.project(se3.transform(T, board.points.astype(float))) - view.corners
 
 
 def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
-    """Least squares over lens and poses, started from a lens with one radial coefficient.
+    """Run least squares over lens and poses, initialised by a lens with one radial coefficient.
 
-    OpenCV's own needs a good start, and gives no deviations.
+    OpenCV's own needs a good initial value, and gives no standard deviations.
     """
     flags, names = _VARIANTS["brown"][1]
     start = _opencv("brown", flags, names, views, board, size)
     order = names_of("fisheye")
     lens = np.array([*(getattr(start.camera, n) for n in _INTRINSIC), 0.0, 0.0, 0.0, 0.0])
-    # Steps of about the same effect: pixels, shares, radians.
+    # Parameters are scaled to steps of similar effect: pixels, ratios, radians.
     scale = np.array([*lens[:2], *lens[:2], 1.0, 1.0, 1.0, 1.0])
 
     def camera_of(x: Float64) -> Fisheye:
@@ -422,7 +423,10 @@ def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) ->
 
     def missed(x: Float64) -> Float64:
         camera = camera_of(x)
-        parts = [_missed(camera, T, v, board) for T, v in zip(poses_of(x), views, strict=True)]
+        parts = [
+            _reprojection_errors(camera, T, v, board)
+            for T, v in zip(poses_of(x), views, strict=True)
+        ]
         return np.concatenate(parts).ravel()
 
     def slopes(x: Float64) -> Float64:
@@ -431,7 +435,7 @@ def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) ->
         for k in range(8):
             J[:, k] = (missed(x + step * np.eye(x.size)[k]) - base) / step
         rows = 2 * len(board.points)
-        # A view's pose moves its own corners alone: all views at once.
+        # A pose affects the corners of its own view only, so all poses are perturbed at once.
         for axis in range(6):
             moved = x.copy()
             moved[8 + axis :: 6] += step
@@ -445,4 +449,4 @@ def _fisheye(views: Sequence[BoardView], board: Board, size: tuple[int, int]) ->
     covariance = np.linalg.inv(found.jac.T @ found.jac)[:8, :8] * 2 * found.cost / freedom
     deviations = np.sqrt(np.diag(covariance)) * scale
     sigma = dict(zip(order, deviations.tolist(), strict=True))
-    return _of_poses(camera_of(found.x), sigma, poses_of(found.x), views, board)
+    return _evaluate(camera_of(found.x), sigma, poses_of(found.x), views, board)

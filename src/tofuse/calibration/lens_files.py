@@ -1,4 +1,4 @@
-"""Lenses from other programs' calibration files.
+"""Reading lenses from the calibration files of other programs.
 
 All of these count pixels from 0 at the centre of the first one, as tofuse does: Bouguet's toolbox
 takes 1 off MATLAB's coordinates before it calibrates, OpenCV and ROS start there, and a CalLab file
@@ -31,7 +31,7 @@ from tofuse.recordings.camera_file import checked_lens
 
 _LIMIT = 64 << 20
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?"
-# Over all of the image, skew moves a pixel by less than this: none.
+# Largest displacement of a pixel by skew that is neglected.
 _NO_SKEW_PX = 0.005
 _MATLAB = ("fc", "cc", "alpha_c", "kc", "nx", "ny")
 _CALLAB = ("A", "k1", "k2", "k3", "p1", "p2", "width", "height")
@@ -45,7 +45,7 @@ _ROS_MODELS = {
 
 @dataclass(frozen=True, eq=False)
 class LensFile:
-    """What a calibration file says.
+    """The content of a calibration file.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class LensFile:
     format
         "bouguet", "callab", "opencv" or "ros".
     warnings
-        What a person should know, one line each.
+        For the user, one line each.
     """
 
     camera: Camera
@@ -63,7 +63,7 @@ class LensFile:
 
 
 def read_lens_file(path: str | Path, index: int | None = None) -> LensFile:
-    """Read a lens from a calibration file, whose format is told by what is in it.
+    """Read a lens from a calibration file, whose format is detected by its content.
 
     Parameters
     ----------
@@ -71,12 +71,12 @@ def read_lens_file(path: str | Path, index: int | None = None) -> LensFile:
         Calib_Results.m or .mat of Bouguet's toolbox, a .cal of DLR CalLab, a .yml, .yaml, .xml or
         .json of OpenCV, or a camera_info .yaml of ROS.
     index
-        Which camera, where a CalLab file holds several.
+        Index of the camera, if a CalLab file contains several.
 
     Raises
     ------
     InputError
-        If it is none of these, or says something that can't be.
+        If it is none of these, or its values are invalid.
     """
     path = Path(path)
     if path.suffix.lower() == ".mat":
@@ -90,7 +90,7 @@ def read_lens_file(path: str | Path, index: int | None = None) -> LensFile:
 
 
 def _m_values(text: str) -> dict[str, list[float]]:
-    """Numbers that a MATLAB script assigns; nothing is run."""
+    """Return the numbers that a MATLAB script assigns, without running it."""
     plain = re.sub(r"%.*", "", text)
     out = {}
     for name in _MATLAB:
@@ -156,14 +156,14 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
     if cameras:
         if index is None and len(cameras) > 1:
             raise InputError(
-                f"holds the cameras {', '.join(map(str, cameras))}",
+                f"contains the cameras {', '.join(map(str, cameras))}",
                 where=path,
-                remedy="say which by --index",
+                remedy="choose one by --index",
             )
         chosen = cameras[0] if index is None else index
         if chosen not in cameras:
             raise InputError(
-                f"holds no camera {chosen}",
+                f"contains no camera {chosen}",
                 where=path,
                 remedy=f"give --index {' or '.join(map(str, cameras))}",
             )
@@ -173,7 +173,7 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
     strange = [k for k in strange if k not in _CALLAB]
     if strange:
         raise InputError(
-            f"has coefficients {', '.join(strange)} that are not known here",
+            f"has unknown coefficients {', '.join(strange)}",
             where=path,
             remedy="calibrate with radial and tangential distortion alone",
         )
@@ -192,13 +192,13 @@ def _callab(text: str, index: int | None, path: Path) -> LensFile:
 
 
 def _opencv(text: str, path: Path) -> LensFile:
-    """OpenCV's YAML, XML or JSON, and the camera_info of ROS, which looks the same."""
+    """Read OpenCV's YAML, XML or JSON, and the camera_info of ROS, which is similar."""
     matrix = _array(
         text, ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "intrinsic_matrix")
     )
     if matrix is None or len(matrix) != 9:
         raise InputError(
-            "holds no lens that is known here (fc of Bouguet's toolbox, camera.A of CalLab, "
+            "contains no known lens (fc of Bouguet's toolbox, camera.A of CalLab, "
             "camera_matrix of OpenCV or ROS)",
             where=path,
             remedy="check the file",
@@ -215,7 +215,7 @@ def _opencv(text: str, path: Path) -> LensFile:
         width, height = both
     if width is None or height is None:
         raise InputError(
-            "doesn't say how large the images are",
+            "doesn't state the image size",
             where=path,
             remedy="add image_width and image_height",
         )
@@ -237,7 +237,7 @@ def _opencv(text: str, path: Path) -> LensFile:
 
 
 def _array(text: str, names: tuple[str, ...]) -> list[float] | None:
-    """Numbers of the first of these names, in YAML, JSON or XML; None if there is none."""
+    """Return the numbers of the first of these names, in YAML, JSON or XML; None without any."""
     for name in names:
         xml = re.search(rf"<{name}\b[^>]*>(.*?)</{name}>", text, re.DOTALL)
         if xml:

@@ -1,4 +1,4 @@
-"""Pixels that see planes: of a checkerboard or the wall it hangs on, or found in any scene."""
+"""Views of planes: of a checkerboard or the wall it hangs on, or detected in any scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tofuse.arrays import Bool, Float64, Intp
-from tofuse.calibration.board import Board, find_corners, picture
+from tofuse.calibration.board import Board, board_image, find_corners
 from tofuse.calibration.board_pose import board_pose
 from tofuse.errors import InputError
 from tofuse.geometry import se3
@@ -20,17 +20,17 @@ from tofuse.registration.plane_detection import detect_planes
 from tofuse.registration.prepared_view import SurfaceOptions, prepare_view
 from tofuse.sensor.noise import NoiseModel
 
-_SEARCHED = 60  # frames at most
-# A pixel on a plane is at most this far off: what the correction is for, and noise.
+_SEARCHED = 60  # maximum number of frames
+# Largest distance of a pixel from its plane: systematic error in m, plus noise in sigmas.
 _ERROR_M, _SIGMAS = 0.08, 4.0
-_MOST_SIGMA_M = 0.04  # noisier pixels tell little, and wrap
-_LEAST_PIXELS = 200
-_LEAST_COSINE = 0.3  # of incidence: at a slant, floors mirror and errors of the ray count
-_RIM = 2  # pixels beside the end of a plane, which mix light
-_WORST_PX = 1.0  # a board that misses its corners by more is none
-# How well a board's pose is known: distance as a share and in m, tilt in rad.
+_MAX_SIGMA_M = 0.04  # noisier pixels are uninformative, and may wrap
+_MIN_PIXELS = 200
+_MIN_COSINE = 0.3  # of incidence: oblique floors are specular, and errors of rays matter
+_RIM = 2  # width in pixels of the margin of a plane, where pixels mix light
+_MAX_BOARD_PX = 1.0  # largest reprojection error of a detected board
+# Uncertainty of a board's pose: distance (relative, and in m), tilt in rad.
 _DISTANCE, _DISTANCE_M, _TILT = 5e-4, 2e-4, np.radians(0.2)
-_NOTHING_KNOWN = 1e-12
+_NO_INFORMATION = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +40,11 @@ class PlaneView:
     Attributes
     ----------
     frame
-        Index.
+        Index of the frame.
     plane
-        (3,) in 1/m: the normal over the distance, as known so far.
+        (3,) in 1/m: the normal divided by the distance, an initial estimate.
     information
-        (3, 3) of it.
+        (3, 3) of `plane`; near 0 if its pose is unknown.
     pixels
         (N,) flat indices.
     measured_m, sigma_m
@@ -65,39 +65,39 @@ class PlaneView:
 def board_planes(
     recording: Recording, board: Board, image: str, *, wall: bool
 ) -> tuple[list[PlaneView], Camera]:
-    """Planes whose pose a checkerboard gives.
+    """Return planes whose pose is given by a checkerboard, and the camera.
 
     Parameters
     ----------
     recording, board, image
         As for `board_views`.
     wall
-        Whether the board lies flat on a wall, all of which counts; else only the board does.
+        Whether the board lies flat on a wall, all of which is used; else only the board is.
 
     Raises
     ------
     InputError
-        If the board is never seen.
+        If the board is never detected.
     """
     noise = noise_model_for(recording)
     views, camera = [], None
     for frame in recording.images(_SEARCHED):
         camera = camera or frame.camera
-        seen = picture(frame, image)
+        seen = board_image(frame, image)
         if seen is None:
             raise InputError(
                 f"frame {frame.index} has no {image} on the pixels of its depth",
                 where=recording.path,
-                remedy="give --image, or go by planes: leave --board out",
+                remedy="give --image, or omit --board to use planes of the scene",
             )
         corners = find_corners(seen, board)
         found = None if corners is None else board_pose(frame.camera, corners, board)
-        if found is None or found[1] > _WORST_PX:
+        if found is None or found[1] > _MAX_BOARD_PX:
             continue
         T, _ = found
         normal = T[:3, 2]
         plane = normal / (normal @ T[:3, 3])
-        mask = _near(frame, plane, noise)
+        mask = _on_plane(frame, plane, noise)
         if not wall:
             outline = np.concatenate([board.outline, np.zeros((4, 1))], 1)
             corner_px = frame.camera.project(se3.transform(T, outline))
@@ -112,20 +112,20 @@ def board_planes(
         raise InputError(
             f"shows no board of {board.columns} x {board.rows} inner corners",
             where=recording.path,
-            remedy="check --board; or leave it out to go by planes",
+            remedy="check --board, or omit it to use planes of the scene",
         )
     return views, camera
 
 
 def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[PlaneView], Camera]:
-    """Planes that RANSAC finds in ordinary views (Mure-Dubois and Hugli 2008).
+    """Return planes detected by RANSAC in any views (Mure-Dubois and Hugli 2008), and the camera.
 
     Parameters
     ----------
     recording
         Depth images.
     planes
-        Of each view, at most.
+        Maximum number per view.
     seed
         Of RANSAC.
 
@@ -148,9 +148,9 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
             thickness=0.01,
         ):
             plane = found.normal / found.offset
-            mask = _near(frame, plane, noise) & ~taken
+            mask = _on_plane(frame, plane, noise) & ~taken
             taken |= mask
-            views += _view(frame, plane, np.eye(3) * _NOTHING_KNOWN, mask, noise)
+            views += _view(frame, plane, np.eye(3) * _NO_INFORMATION, mask, noise)
     if camera is None or not views:
         raise InputError(
             "shows no planes",
@@ -160,14 +160,14 @@ def scene_planes(recording: Recording, planes: int, seed: int) -> tuple[list[Pla
     return views, camera
 
 
-def _near(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:
-    """(H, W) which pixels lie on a plane, but for noise and the camera's errors."""
+def _on_plane(frame: RangeFrame, plane: Float64, noise: NoiseModel) -> Bool:
+    """Return the mask (H, W) of pixels on a plane, within noise and systematic errors."""
     points = points_from_z(frame.camera, frame.z).astype(float)
     off = np.abs(points @ plane - 1) / np.linalg.norm(plane)
     sigma = noise.sigma(frame)
-    near = frame.valid & (off < _ERROR_M + _SIGMAS * sigma) & (sigma < _MOST_SIGMA_M)
+    near = frame.valid & (off < _ERROR_M + _SIGMAS * sigma) & (sigma < _MAX_SIGMA_M)
     size = 2 * _RIM + 1
-    # What is one surface has no holes: a rim is left out, single pixels that miss are not one.
+    # The rim of the surface is left out, but not the surroundings of single missing pixels.
     closed = cv2.morphologyEx(near.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     inner = cv2.erode(closed, np.ones((size, size), np.uint8), borderValue=1)
     return np.asarray(near & inner.astype(bool))
@@ -179,13 +179,13 @@ def _view(
     sigma = noise.sigma(frame).astype(float)
     rays = frame.camera.rays().astype(float)
     pixels = np.flatnonzero(mask & (sigma > 0) & np.isfinite(rays).all(-1))
-    if len(pixels) < _LEAST_PIXELS:
+    if len(pixels) < _MIN_PIXELS:
         return []
     own = np.concatenate([rays.reshape(-1, 2)[pixels], np.ones((len(pixels), 1))], 1)
     directions = own / ray_lengths(frame.camera).ravel()[pixels, None]
-    steep = directions @ plane > _LEAST_COSINE * np.linalg.norm(plane)
+    steep = directions @ plane > _MIN_COSINE * np.linalg.norm(plane)
     pixels, directions = pixels[steep], directions[steep]
-    if len(pixels) < _LEAST_PIXELS:
+    if len(pixels) < _MIN_PIXELS:
         return []
     measured = frame.radial_range.astype(float).ravel()[pixels]
     sigmas = sigma.ravel()[pixels]
@@ -193,7 +193,7 @@ def _view(
 
 
 def _board_information(plane: Float64, middle: Float64) -> Float64:
-    """(3, 3) of a plane whose distance is known at a point, and its tilt."""
+    """Return the information (3, 3) of a plane with a board around the point `middle` (3,)."""
     distance = float(np.linalg.norm(middle))
     axis = middle / distance
     along = (_DISTANCE + _DISTANCE_M / distance) / distance  # of plane . axis = 1 / distance

@@ -8,7 +8,7 @@ from typing import Any
 
 from tofuse.calibration.board import Board
 from tofuse.calibration.camera_json import recording_fields, write_camera_json
-from tofuse.calibration.depth import calibrate_depth, composed
+from tofuse.calibration.depth import calibrate_depth, compose
 from tofuse.calibration.lens import calibrate_lens
 from tofuse.calibration.lens_files import read_lens_file
 from tofuse.calibration.plane_views import board_planes, scene_planes
@@ -75,7 +75,7 @@ def depth(arguments: argparse.Namespace) -> Summary:
         f"{100 * fit.scale_sigma:.2f} %",
     ]
     if arguments.out is not None:
-        whole = fit.correction if earlier is None else composed(earlier, fit.correction)
+        whole = fit.correction if earlier is None else compose(earlier, fit.correction)
         make_folder(arguments.out.parent)
         with replacing(arguments.out) as part:
             whole.save(part)

@@ -597,7 +597,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
 
 def noise(arguments: argparse.Namespace) -> int:
     """``tofuse noise``."""
-    from tofuse.calibration.noise import estimate_noise
+    from tofuse.calibration.noise_estimation import estimate_noise
     from tofuse.cli.open_input import open_input
     from tofuse.errors import OutputError
 

@@ -1,7 +1,7 @@
-"""Cameras: which ray each pixel sees, and where a point lands.
+"""Camera models: the ray of each pixel, and the projection of points.
 
 Camera axes are x right, y down, z forward; pixel centres lie at integer coordinates. A camera
-gives `rays()`, the (H, W, 2) table of x/z and y/z, and `project()`. Everything else, such as
+offers `rays()`, the (H, W, 2) table of x/z and y/z, and `project()`. Everything else, such as
 range to x, y, z (eqs 2.3 to 2.5), follows from the rays and is the same for every lens.
 """
 
@@ -21,7 +21,7 @@ from tofuse.errors import InputError
 
 @runtime_checkable
 class Camera(Protocol):
-    """What every camera can do."""
+    """The interface of all camera models."""
 
     @property
     def width(self) -> int:
@@ -34,7 +34,7 @@ class Camera(Protocol):
         ...
 
     def rays(self) -> Float32:
-        """Return the (H, W, 2) table of x/z and y/z of every pixel; NaN where it sees nothing."""
+        """Return the (H, W, 2) table of x/z and y/z of every pixel; NaN where undefined."""
         ...
 
     def project(self, points: ArrayLike) -> Float64:
@@ -43,16 +43,16 @@ class Camera(Protocol):
 
 
 def ray_lengths(camera: Camera) -> Float32:
-    """Length (H, W) of the rays (x/z, y/z, 1): the ratio of radial range to z depth (eq 2.3)."""
+    """Return the length (H, W) of the rays (x/z, y/z, 1): radial range over z depth (eq 2.3)."""
     return _derived(camera)[0]
 
 
 def unknown_rays(camera: Camera) -> Bool | None:
-    """(H, W) whether a pixel's ray is unknown; None if no pixel's is."""
+    """Return the mask (H, W) of pixels whose ray is unknown; None if there are none."""
     return _derived(camera)[1]
 
 
-# What is computed once for a camera, as every frame asks for it.
+# Cache by camera, as these are needed for every frame.
 _computed: WeakKeyDictionary[Camera, tuple[Float32, Bool | None]] = WeakKeyDictionary()
 
 
@@ -68,17 +68,17 @@ def _derived(camera: Camera) -> tuple[Float32, Bool | None]:
 
 
 def z_from_range(camera: Camera, radial_range: ArrayLike) -> Float32:
-    """z depth (H, W) in m of radial range (H, W) in m (eq 2.3); 0 stays 0."""
+    """Convert radial range (H, W) to z depth (H, W), in m (eq 2.3); 0 stays 0."""
     return _zero_nan(np.asarray(radial_range, np.float32) / ray_lengths(camera))
 
 
 def range_from_z(camera: Camera, z: ArrayLike) -> Float32:
-    """Radial range (H, W) in m of z depth (H, W) in m; 0 stays 0."""
+    """Convert z depth (H, W) to radial range (H, W), in m; 0 stays 0."""
     return _zero_nan(np.asarray(z, np.float32) * ray_lengths(camera))
 
 
 def points_from_z(camera: Camera, z: ArrayLike) -> Float32:
-    """Points (H, W, 3) in m of z depth (H, W) in m (eqs 2.4, 2.5); invalid pixels at the origin."""
+    """Convert z depth (H, W) to points (H, W, 3), in m (eqs 2.4, 2.5); the origin where invalid."""
     z = np.asarray(z, np.float32)
     out = np.empty((*z.shape, 3), np.float32)
     out[..., :2] = camera.rays() * z[..., None]
@@ -141,7 +141,7 @@ class Pinhole:
         shape = xy.shape
         xy = xy.reshape(-1, 2)
         out = xy.copy()
-        # Only those that still move; where the lens folds, some never settle.
+        # Only those that have not converged; beyond a fold of the lens, some never do.
         active = np.arange(len(xy))
         step = 1e-6
         for _ in range(30):
@@ -227,7 +227,7 @@ class Fisheye(Pinhole):
         return xy * np.where(r > 1e-9, bent / np.where(r > 1e-9, r, 1), 1.0)[..., None]
 
     def _undistort(self, xy: Float64) -> Float64:
-        # One dimension: solve for the angle, which has no pole, rather than for its tangent.
+        # Solve for the angle, which has no pole, rather than for its tangent.
         bent = np.sqrt((xy * xy).sum(-1))
         theta = np.minimum(bent, 1.5)
         for _ in range(50):
@@ -246,7 +246,7 @@ class Fisheye(Pinhole):
 
 
 def _is_mirrored(table: NDArray[np.generic]) -> bool:
-    """Whether rays (H, W, 2) turn the other way than their pixels, by the sign of the Jacobian."""
+    """Whether rays (H, W, 2) are mirrored, by the sign of their Jacobian."""
     rays = np.asarray(table, float)
     by_u = rays[:-1, 1:] - rays[:-1, :-1]
     by_v = rays[1:, :-1] - rays[:-1, :-1]
@@ -258,7 +258,7 @@ def _is_mirrored(table: NDArray[np.generic]) -> bool:
 class RayTable:
     """A camera known only by its table of rays, (H, W, 2) x/z and y/z, NaN where unknown.
 
-    Projection starts from a pinhole fit and follows the table's slope until it lands.
+    Projection iterates from a pinhole fit by Newton's method.
     """
 
     table: Float32 = field(repr=False)
@@ -299,7 +299,7 @@ class RayTable:
 
     @cached_property
     def _hash(self) -> int:
-        # -0 and 0 are equal, and so must their hashes be; so must those of all NaN.
+        # Equal tables must have equal hashes: -0 equals 0, and all NaN count as equal.
         return hash((self.table.shape, np.nan_to_num(self.table + np.float32(0)).tobytes()))
 
     def rays(self) -> Float32:
@@ -308,7 +308,7 @@ class RayTable:
 
     @cached_property
     def fit(self) -> Pinhole:
-        """The pinhole camera nearest to the table, by least squares on pixel positions."""
+        """Pinhole camera fitted to the table by least squares on pixel positions."""
         v, u = np.mgrid[0 : self.height, 0 : self.width]
         ok = np.isfinite(self.table).all(-1)
         x, y = self.table[ok].astype(float).T
@@ -322,7 +322,7 @@ class RayTable:
 
     @cached_property
     def _filled(self) -> Float64:
-        """The table in float64, with holes taken from the pinhole fit."""
+        """Return the table in float64, with holes filled by the pinhole fit."""
         return np.where(np.isfinite(self.table), self.table, self.fit.rays()).astype(float)
 
     def project(self, points: ArrayLike) -> Float64:
@@ -373,7 +373,7 @@ DISTORTION_ORDER = {
 
 
 def check_intrinsics(camera: Pinhole) -> None:
-    """Raise InputError if a number of the camera is not finite or can't be true."""
+    """Raise InputError if a parameter of the camera is not finite or implausible."""
     for f in fields(camera):
         value = getattr(camera, f.name)
         if isinstance(value, bool) or not isinstance(value, int | float | np.number):

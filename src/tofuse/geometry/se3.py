@@ -3,7 +3,7 @@
 Twists are (..., 6) vectors (tx, ty, tz, rx, ry, rz) in metres and radians. Perturbations act on
 the right, ``T * exp(xi)``, that is in the source frame of ``T_target_source``. The exponential is
 the full one (Barfoot, State Estimation for Robotics, eqs 7.86 to 7.95), not the pseudo-exponential
-that leaves the translation alone.
+that leaves the translation unchanged.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _coefficients(angle: Float64) -> tuple[Float64, Float64, Float64]:
     s1 = np.where(small, 1 - a2 / 6, np.sin(a) / a)
     s2 = np.where(small, 0.5 - a2 / 24, 2 * half * half / (a * a))
     s3 = np.where(small, 1 / 6 - a2 / 120, (a - np.sin(a)) / a**3)
-    # (a - sin a) / a^3 cancels below about 0.02 rad; the series carries on to there.
+    # (a - sin a) / a^3 cancels below about 0.02 rad; the series is used up to there.
     middle = (~small) & (angle < 0.02)
     s3 = np.where(middle, 1 / 6 - a2 / 120 + a2 * a2 / 5040, s3)
     return s1, s2, s3
@@ -191,7 +191,7 @@ def transform(T: ArrayLike, points: ArrayLike) -> Float64:
 
 
 def about(centre: ArrayLike, T: ArrayLike) -> Float64:
-    """Return the motions (..., 4, 4) that move things about a centre (3,) as T does the origin."""
+    """Return the motions (..., 4, 4) that act about a centre (3,) as T does about the origin."""
     to, back = np.eye(4), np.eye(4)
     to[:3, 3], back[:3, 3] = centre, -np.asarray(centre, float)
     return np.asarray(to @ np.asarray(T, float) @ back)
@@ -211,7 +211,7 @@ def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: ArrayLike) -> Float64:
 
 
 def orthonormalise(T: ArrayLike) -> Float64:
-    """Replace the rotation by the nearest one (SVD), against the drift of long products."""
+    """Replace the rotation by the nearest orthogonal one (SVD), after long products of motions."""
     T = np.array(T, float)
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]

@@ -30,7 +30,7 @@ class DepthCorrection:
     range_m
         (K,) float64 ascending knots of measured radial range in m.
     bias_m
-        (K,) float64 bias there in m; linear in between, held constant outside.
+        (K,) float64 bias there in m; linear in between, constant outside.
     pixel_bias_m
         (H, W) float32 offset of each pixel in m, or None.
 
@@ -70,9 +70,9 @@ class DepthCorrection:
             object.__setattr__(self, "pixel_bias_m", pixel.astype(np.float32))
 
     def correct(self, radial_range: ArrayLike) -> Float32:
-        """Return corrected radial range (H, W) in m of the measured one; 0 stays 0.
+        """Return the corrected radial range (H, W) in m of the measured one; 0 stays 0.
 
-        A pixel that the correction would push to zero or behind the camera becomes invalid (0).
+        Pixels whose corrected range is not positive become invalid (0).
 
         Raises
         ------
@@ -109,7 +109,7 @@ class DepthCorrection:
         Raises
         ------
         InputError
-            If the file can't be read, or a key is missing or holds no fit array.
+            If the file can't be read, or a key is missing or has an invalid array.
         """
         try:
             arrays = read_npz(path, limit=_MAX_BYTES, only=frozenset(KEYS))

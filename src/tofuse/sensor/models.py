@@ -1,8 +1,8 @@
-"""Cameras by name: lens, modulation and noise, as far as they are known.
+"""Models of ToF cameras: lens, modulation, electronics and noise.
 
 The SR4000's gain, noise, falloff and confidence thresholds are fitted to a real recording (see
 docs/simulator.md). The others follow data sheets and published lens parameters; their noise is
-set to the scale that the makers state.
+scaled to that stated by their makers.
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ class CameraModel:
     camera
         Resolution, intrinsics and lens.
     modulation_hz
-        Frequency that decides the precision.
+        Frequency that determines the precision.
     unwrap_hz
-        Frequency that tells the periods of the former apart (the beat of a camera with several
+        Frequency that unwraps the phase of the former (the beat of a camera with several
         frequencies), or None.
     frame_rate_hz, integration_s
-        Frames a second; time from the begin of the first phase image to the end of the last.
+        Frames per second; time from the start of the first phase image to the end of the last.
     depth_unit_m, depth_kind
         Of the recorded images.
     signal_electrons
-        Electrons in one phase image of a white wall (albedo 1) at 1 m, in the image's centre.
+        Electrons in one phase image of a white wall (albedo 1) at 1 m on the optical axis.
     modulation_contrast
         Demodulation contrast, 0 to 1.
     ambient_electrons
         Electrons of ambient light in one phase image of a white wall in a bright office.
     read_noise_electrons
-        Standard deviation of reading one bucket.
+        Standard deviation of the read noise of one bucket.
     full_well_electrons
-        What one bucket holds.
+        Capacity of one bucket.
     counts_per_electron
         Of the amplitude image.
     falloff
-        Light in a pixel falls as the cosine of its angle to the axis to this power (lens and
-        illumination, half each).
+        Exponent of the cosine to the optical axis by which light falls off (lens and illumination,
+        half each).
     blur_px
-        Standard deviation of the lens's sharp image of a point, in pixels.
+        Standard deviation of the lens's point spread function, in pixels.
     amplitude_kind
         "raw", "ir", or "range_compensated": multiplied by the square of the measured range and
         divided by the falloff, as the SR4000 does.
@@ -71,9 +71,10 @@ class CameraModel:
         Range offset from the first to the last column along the read-out chain (and a quarter of
         it over the rows), and standard deviation from pixel to pixel.
     compression
-        Share by which a signal that fills the wells is measured too weak.
+        Relative loss of a signal that fills the wells.
     drift_m, drift_time_s
-        Range offset of a warm camera that was switched on at time 0, and its time constant.
+        Range offset of a warm camera relative to time 0, when it is switched on, and the time
+        constant.
     """
 
     name: str
@@ -105,12 +106,12 @@ class CameraModel:
 
     @property
     def period_m(self) -> float:
-        """Range over which the phase of the fine frequency repeats."""
+        """Ambiguity range of the fine frequency, m."""
         return SPEED_OF_LIGHT / (2 * self.modulation_hz)
 
     @property
     def ambiguity_m(self) -> float:
-        """Range after which the measurement repeats."""
+        """Ambiguity range of the camera, m."""
         return SPEED_OF_LIGHT / (2 * (self.unwrap_hz or self.modulation_hz))
 
     @property
@@ -132,7 +133,7 @@ class CameraModel:
 
     @cached_property
     def transmission(self) -> Float64:
-        """(H, W) light in each pixel relative to the axis; 0 where the lens shows nothing."""
+        """Return the light (H, W) in each pixel relative to the axis; 0 outside the valid area."""
         rays = self.camera.rays().astype(float)
         cosine = 1 / np.sqrt(1 + (rays * rays).sum(-1))
         return np.where(np.isfinite(cosine), cosine**self.falloff, 0.0)

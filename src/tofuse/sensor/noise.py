@@ -1,8 +1,8 @@
-"""How far the range of a pixel can be trusted: its standard deviation, camera by camera.
+"""Noise models of cameras: the standard deviation of the range of each pixel.
 
-The phase of a modulated camera is the angle of a phasor of amplitude A, whose two components
-carry the same noise: shot noise of the signal itself, which grows as the root of A, and noise that
-doesn't depend on it (ambient light, read-out). Their ratio gives
+The phase of a modulated camera is the angle of a phasor of amplitude A, whose two components have
+the same noise: shot noise of the signal, which grows as the root of A, and noise that doesn't
+depend on it (ambient light, read-out). Their ratio gives
 
     sigma_r^2 = floor^2 + shot^2 / A + dark^2 / A^2,    A in raw counts
 
@@ -41,15 +41,15 @@ _CODES = {
     "confidence": kernels.BY_CONFIDENCE,
     "camera": kernels.BY_CAMERA,
 }
-# A metre of noise is a number in millimetres.
+# Upper limit of noise in m; larger values are probably in millimetres.
 _LARGEST_M = 5.0
-# Share of a bright office's light on a half white wall: what cameras indoors work in.
+# Typical ambient light indoors, as a fraction of that on a white wall in a bright office.
 _USUAL_AMBIENT = 0.15
 _NONE = np.empty((0, 0), np.float32)
 
 
 class NoisyImage(Protocol):
-    """What of a range image its noise is told from; a `RangeFrame` is one."""
+    """The properties of a range image that determine its noise; a `RangeFrame` has them."""
 
     @property
     def camera(self) -> Camera: ...  # noqa: D102
@@ -80,10 +80,9 @@ class AmplitudeLaw:
     dark
         m times a count: noise that doesn't depend on the signal.
     floor
-        m: what no light helps against (rounding, jitter).
+        m: noise that doesn't decrease with the amplitude (rounding, jitter).
     falloff
-        A range-compensated amplitude was divided by the cosine of the pixel's angle to the axis to
-        this power, besides being multiplied by the squared range.
+        Exponent of the cosine to the optical axis by which range-compensated amplitude was divided.
     """
 
     shot: float
@@ -101,14 +100,14 @@ class AmplitudeLaw:
 
 @dataclass(frozen=True)
 class ConfidenceLaw:
-    """``sigma = sigma_m[level] * r^power``, a table over the levels of confidence.
+    """``sigma = sigma_m[level] * r^power``, with a table over the levels of confidence.
 
     Attributes
     ----------
     sigma_m
-        m at 1 m, of the levels 0, 1, ...; must not grow. Higher levels count as the last.
+        In m, at 1 m, of the levels 0, 1, ...; must not increase. Higher levels count as the last.
     power
-        How sigma grows with the range at one level; 0 where the level says it all.
+        Exponent of the range; 0 if sigma depends on the level only.
     """
 
     sigma_m: tuple[float, ...]
@@ -142,24 +141,23 @@ class RangeLaw:
 class NoiseModel:
     """Standard deviation of the radial range of one camera, in m.
 
-    A frame that brings its camera's own sigma keeps it. Else the first law decides that the model
-    has and the frame has the channel for: amplitude, confidence, range.
+    A frame with a sigma stated by the camera keeps it. Otherwise the first law applies that the
+    model contains and the frame has the channel for: amplitude, confidence, range.
 
     Attributes
     ----------
     name
         Of the camera.
     range
-        Always there, for frames with nothing but depth.
+        Required, for frames with depth only.
     amplitude, confidence
         Or None.
     ceiling_m
-        Noise of a pixel that saw nothing: the period's length over the root of 12. Pixels without
-        amplitude, and saturated ones, get this.
+        Sigma of a pixel without signal: the ambiguity range divided by the root of 12. Applies to
+        pixels without amplitude, and to saturated ones.
     footprint
-        A surface at an angle changes its range inside a pixel; this share of the change counts as
-        noise, if the incidence is known. The standard deviation of a uniform distribution is
-        0.29.
+        Noise due to the change of range of an oblique surface within a pixel, as a fraction of this
+        change, if the incidence is known; 0.29 for a uniform distribution.
     """
 
     name: str
@@ -176,7 +174,7 @@ class NoiseModel:
             raise ValueError("ceiling_m is 0")
 
     def law(self, frame: NoisyImage) -> Law:
-        """Which law decides for this frame; "camera" where it brings its own sigma."""
+        """Return the law that applies to a frame; "camera" if it states its own sigma."""
         if frame.sigma_image is not None:
             return "camera"
         if self.amplitude is not None and frame.amplitude_image is not None:
@@ -186,15 +184,15 @@ class NoiseModel:
         return "range"
 
     def sigma(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
-        """Standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
+        """Return the standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
 
         Parameters
         ----------
         frame
-            Its channels.
+            The image.
         incidence
-            (H, W) cosine between normal and ray, NaN where unknown. Taken from the frame's normals
-            if not given; without either, surfaces count as seen head-on.
+            (H, W) cosine between normal and ray, NaN where unknown. By default from the frame's
+            normals; without either, perpendicular incidence is assumed.
         """
         law = self.law(frame)
         channel: Float32 | None = None
@@ -222,7 +220,10 @@ class NoiseModel:
         return out
 
     def sigma_z(self, frame: NoisyImage, incidence: Float32 | None = None) -> Float32:
-        """Standard deviation (H, W) float32 in m of the z depth; 0 where invalid."""
+        """Return the standard deviation (H, W) float32 in m of the z depth; 0 where invalid.
+
+        The parameters are those of `sigma`.
+        """
         sigma = self.sigma(frame, incidence)
         return np.where(sigma > 0, sigma / ray_lengths(frame.camera), np.float32(0))
 
@@ -238,18 +239,18 @@ class NoiseModel:
         return np.array((0.0,) if self.confidence is None else self.confidence.sigma_m, float)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what noise.json holds."""
+        """Return the content of noise.json."""
         out: dict[str, Any] = {"schema": SCHEMA, **to_dict(self)}
         return {key: value for key, value in out.items() if value is not None}
 
     @classmethod
     def from_dict(cls, data: Any, *, where: str = "noise") -> Self:
-        """Build a model of what noise.json holds.
+        """Build a model from the content of noise.json.
 
         Raises
         ------
         InputError
-            Naming the field, for anything that makes no sense.
+            Naming the field, for invalid content.
         """
         if not isinstance(data, dict):
             raise InputError("holds no JSON object", where=where, remedy="write {...}")
@@ -276,7 +277,7 @@ class NoiseModel:
         Raises
         ------
         InputError
-            If it can't be read, or makes no sense.
+            If it can't be read, or is invalid.
         """
         try:
             data = json.loads(read_text(path, limit=1 << 20))
@@ -288,7 +289,7 @@ class NoiseModel:
 
 
 def incidence_cosine(frame: NoisyImage) -> Float32 | None:
-    """Cosine (H, W) between ray and normal, NaN where unknown; None without normals."""
+    """Return the cosine (H, W) between ray and normal, NaN where unknown; None without normals."""
     normals = frame.normal_image
     if normals is None:
         return None
@@ -312,10 +313,10 @@ def _check_finite(model: Any, where: str) -> None:
 
 
 def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
-    """Noise of a modulated camera of known electronics.
+    """Derive the noise model of a modulated camera from its electronics.
 
     From the phasor ``((D_0 - D_2) + i (D_1 - D_3)) / 2`` of bucket differences D, each with the
-    variance of all its electrons: ``sigma_phase^2 = (S / m + E + 2 R^2) / (2 S^2)`` for amplitude
+    variance of its electrons: ``sigma_phase^2 = (S / m + E + 2 R^2) / (2 S^2)`` for amplitude
     S, contrast m, ambient electrons E and read noise R; ``sigma_r = sigma_phase period / (2 pi)``.
 
     Parameters
@@ -323,7 +324,7 @@ def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
     model
         The camera.
     far
-        Law over the range alone; that of a grey wall (albedo 0.4) if not given.
+        Law over the range alone; by default that of a grey wall (albedo 0.4).
     """
     per_rad, gain = model.period_m / (2 * math.pi), model.counts_per_electron
     ambient = _USUAL_AMBIENT * model.ambient_electrons
@@ -340,9 +341,9 @@ def of_camera(model: CameraModel, far: RangeLaw | None = None) -> NoiseModel:
     )
 
 
-# Noise of each family of cameras. Those of modulated cameras follow from their electronics (see
-# `sensor.models`: the SR4000's is fitted to a real recording, the others have the scale that the
-# makers state); docs/noise.md says where the other numbers are from.
+# Noise of each family of cameras. That of modulated cameras follows from their electronics (see
+# `sensor.models`: the SR4000's is fitted to a real recording, the others have the scale stated by
+# their makers); docs/noise.md states the sources of the other numbers.
 NOISE: dict[str, NoiseModel] = {
     model.name: model
     for model in (

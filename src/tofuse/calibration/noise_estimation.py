@@ -1,4 +1,4 @@
-"""A camera's noise, estimated from a recording in which nothing moves."""
+"""Estimation of a camera's noise model from a static recording."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from tofuse.recordings.recording import Recording
 from tofuse.recordings.still import stationary_intervals
 from tofuse.sensor.noise import AmplitudeLaw, ConfidenceLaw, Law, NoiseModel, RangeLaw
 
-LEAST_FRAMES = 3
-_LEAST_PIXELS = 40  # in a bin
+MIN_FRAMES = 3
+_MIN_PIXELS = 40  # in a bin
 _BINS = 30
-_LINEAR = 0.25  # of the ceiling: beyond it the phase wraps and the law bends
-_FARTHEST_M = 200.0
-_LARGEST_M = 5.0
-_WORSE = 1.03  # than the best law: still as good
+_LINEAR = 0.25  # fraction of the ceiling up to which the law is valid without phase wrapping
+_MAX_RANGE_M = 200.0
+_MAX_NOISE_M = 5.0
+_WORSE = 1.03  # ratio to the best law's misfit up to which a law is equivalent
 _GOOD = 0.2
 _MOST = (0.02, 0.98)
 
 
 @dataclass(frozen=True)
 class NoiseBin:
-    """Pixels alike in what a law looks at.
+    """A bin of pixels with similar amplitude, confidence or range.
 
     Attributes
     ----------
     low, high
         Raw amplitude in counts, level of confidence, or range in m.
     pixels
-        How many.
+        Number of pixels.
     measured_m, predicted_m
         Standard deviation of the radial range.
     """
@@ -54,25 +54,24 @@ class NoiseBin:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """A noise model and how well it describes what it was fitted to.
+    """A fitted noise model and its goodness of fit.
 
     Attributes
     ----------
     model
-        Holds only laws that describe the camera as well as any other.
+        Contains only laws that describe the camera as well as the best one.
     law
-        The one that decides for frames like these.
+        The law that applies to frames of this recording.
     frames, stretches, pixels
-        What was used: frames in still stretches, stretches, pixels of all stretches.
+        Numbers of frames in static stretches, of stretches, and of pixels in all stretches.
     rms_log_error
-        Root mean square, over the bins, of the log ratio of predicted to measured deviation: 0.1
-        is about 10 %.
+        Rms, over the bins, of the log ratio of predicted to measured sigma: 0.1 is about 10 %.
     before
-        The same of the model that would have been chosen without a fit.
+        The same of the model that is used without a fit.
     bins
-        Of the deciding law.
+        Of the law that applies.
     warnings
-        What a person should know, one line each.
+        For the user, one line each.
     """
 
     model: NoiseModel
@@ -102,7 +101,7 @@ class NoiseFit:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Pixels that were measured in every frame of a still stretch; (N,) each.
+    """Pixels that are valid in every frame of a static stretch; (N,) each.
 
     Attributes
     ----------
@@ -113,13 +112,13 @@ class _Samples:
     range_m
         Mean over the stretch.
     counts
-        Mean raw amplitude, but for the falloff; NaN where there is none.
+        Mean raw amplitude, before division by the falloff; NaN where there is none.
     level
         Mean confidence, rounded; NaN where there is none.
     slant
-        Length of the ray over its z.
+        Ratio of the ray's length to its z.
     before
-        Variance that the model so far predicts, in m^2.
+        Variance predicted by the model without a fit, in m^2.
     """
 
     variance: Float64
@@ -131,53 +130,53 @@ class _Samples:
     before: Float64
 
     def typical(self) -> Float64:
-        """Variances of which the median over alike pixels, not the mean, is unbiased."""
+        """Return variances scaled so that their median, not their mean, is unbiased."""
         values, where = np.unique(self.freedom, return_inverse=True)
         return self.variance / (chi2.median(values) / values)[where]
 
 
 def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
-    """Fit a noise model to the still stretches of a recording.
+    """Fit a noise model to the static stretches of a recording.
 
-    In each stretch of at least three frames the variance over time of each pixel's range is taken,
-    and their medians in bins of raw amplitude, confidence and range, which no flickering edge
-    disturbs. The laws are fitted to the bins by least squares of relative errors, with weights
-    that fall for outliers.
+    In each stretch of at least three frames the variance over time of each pixel's range is
+    computed, and the medians of these over bins of raw amplitude, confidence and range, which are
+    robust to flickering edges. The laws are fitted to the bins by robust least squares of relative
+    errors.
 
     Parameters
     ----------
     recording
-        Images; three frames at one place do, ten or more at several distances are better.
+        Images; at least three frames at one place, better ten or more at several distances.
     name
-        Of the model; that of the camera's family if not given.
+        Of the model; by default that of the camera's family.
 
     Raises
     ------
     InputError
-        If nothing is still for three frames, the frames are copies, or the depths make no sense.
+        If no three frames are static, the frames are copies, or the depths are implausible.
     """
     if not isinstance(_first_frame(recording), RangeFrame):
         raise InputError(
             "holds clouds", where=recording.path, remedy="give a recording of depth images"
         )
     prior = noise_model_for(recording)
-    stretches = [(a, b) for a, b in stationary_intervals(recording, prior) if b - a >= LEAST_FRAMES]
+    stretches = [(a, b) for a, b in stationary_intervals(recording, prior) if b - a >= MIN_FRAMES]
     if not stretches:
         raise _not_still(recording)
-    samples = _joined([_pixels(recording, a, b, prior) for a, b in stretches])
-    if len(samples.variance) < 10 * _LEAST_PIXELS:
+    samples = _concatenate([_pixels(recording, a, b, prior) for a, b in stretches])
+    if len(samples.variance) < 10 * _MIN_PIXELS:
         raise InputError(
-            f"has {len(samples.variance)} pixels that are valid throughout a still stretch",
+            f"has {len(samples.variance)} pixels that are valid throughout a static stretch",
             where=recording.path,
             remedy="record a scene within the camera's range",
         )
     if not (samples.variance > 0).mean() > 0.05:
         raise InputError(
-            "repeats the same image, or has no noise to see in its depth unit",
+            "repeats the same image, or its depth unit is coarser than the noise",
             where=recording.path,
             remedy="record with a live camera, in a finer unit",
         )
-    if not np.median(samples.range_m) < _FARTHEST_M:
+    if not np.median(samples.range_m) < _MAX_RANGE_M:
         raise InputError(
             f"has a median range of {np.median(samples.range_m):.0f} m",
             where=recording.path,
@@ -194,21 +193,21 @@ def _first_frame(recording: Recording) -> Frame:
 
 
 def _not_still(recording: Recording) -> InputError:
-    if len(recording) < LEAST_FRAMES:
+    if len(recording) < MIN_FRAMES:
         return InputError(
-            f"has {len(recording)} frames, and noise shows in {LEAST_FRAMES} or more",
+            f"has {len(recording)} frames; at least {MIN_FRAMES} are needed",
             where=recording.path,
             remedy="record ten frames or more with the camera on a stand",
         )
     return InputError(
-        f"is nowhere still for {LEAST_FRAMES} frames",
+        f"is nowhere static for {MIN_FRAMES} frames",
         where=recording.path,
         remedy="record ten frames or more with the camera on a stand, nothing moving",
     )
 
 
 class _Moments:
-    """Mean and variance of each pixel over the frames of a stretch, one by one (Welford 1962)."""
+    """Incremental mean and variance of each pixel over the frames of a stretch (Welford 1962)."""
 
     def __init__(self, first: RangeFrame) -> None:
         shape = first.depth.shape
@@ -216,11 +215,11 @@ class _Moments:
         self.frames = 0
         self.mean, self.moment, self.before = (np.zeros(shape) for _ in range(3))
         self.counts, self.level = np.zeros(shape), np.zeros(shape)
-        # Pixels that come and go are at the limit of what the camera measures, or at edges.
+        # Intermittently valid pixels are at the detection limit or at edges, and are left out.
         self.always = np.isfinite(self.slant)
 
     def add(self, frame: RangeFrame, prior: NoiseModel) -> None:
-        """Take in the next frame."""
+        """Add the next frame."""
         self.frames += 1
         self.always &= frame.valid
         distance = frame.radial_range.astype(float)
@@ -233,7 +232,7 @@ class _Moments:
         self.level += np.nan if level is None else level
 
     def samples(self) -> _Samples:
-        """Return the pixels that were always there."""
+        """Return the pixels that were valid in all frames."""
         n, ok = self.frames, self.always
         return _Samples(
             self.moment[ok] / (n - 1),
@@ -256,13 +255,13 @@ def _pixels(recording: Recording, start: int, stop: int, prior: NoiseModel) -> _
     return moments.samples()
 
 
-def _joined(parts: Sequence[_Samples]) -> _Samples:
+def _concatenate(parts: Sequence[_Samples]) -> _Samples:
     names = [f.name for f in fields(_Samples)]
     return _Samples(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
 
 
 def _raw_counts(frame: RangeFrame) -> Float64:
-    """Amplitude (H, W) in raw counts but for the falloff, NaN where none or saturated."""
+    """Return the amplitude (H, W) in raw counts, up to the falloff; NaN if missing or saturated."""
     if frame.amplitude_image is None:
         return np.full(frame.depth.shape, np.nan)
     counts = frame.amplitude_image.astype(float)
@@ -274,7 +273,7 @@ def _raw_counts(frame: RangeFrame) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class _Binned:
-    """Medians over bins of alike pixels; (K,) each, `edges` (K, 2)."""
+    """Medians over bins; (K,) each, `edges` (K, 2)."""
 
     edges: Float64
     centre: Float64
@@ -283,14 +282,14 @@ class _Binned:
     before: Float64
 
 
-def _binned(key: Float64, samples: _Samples, edges: Float64) -> _Binned:
-    """Take medians of the pixels whose key lies between consecutive edges."""
+def _bin(key: Float64, samples: _Samples, edges: Float64) -> _Binned:
+    """Return the medians of the pixels whose key lies between consecutive edges."""
     typical = samples.typical()
     place = np.searchsorted(edges, key, side="right") - 1
     rows = []
     for k in range(len(edges) - 1):
         inside = place == k
-        if inside.sum() < _LEAST_PIXELS:
+        if inside.sum() < _MIN_PIXELS:
             continue
         variance = float(np.median(typical[inside]))
         if (typical[inside] > 0).mean() < 0.9:  # depth so coarse that many pixels never change
@@ -310,12 +309,12 @@ def _quantile_edges(key: Float64, *, log: bool) -> Float64:
 
 
 def _nonnegative(columns: Float64, target: Float64, pixels: Float64) -> Float64:
-    """Non-negative x for which ``columns @ x`` is near `target` (K,), in relative terms.
+    """Fit ``columns @ x`` to `target` (K,) with non-negative x, minimising relative errors.
 
-    Least squares with Huber's weights on the log of the ratio; bins count by their pixels, but
-    none more than twenty times the smallest that is allowed.
+    Least squares with Huber weights on the log ratio; bins are weighted by their pixels, up to
+    twenty times the smallest permitted number.
     """
-    base = np.sqrt(np.minimum(pixels, 20 * _LEAST_PIXELS))
+    base = np.sqrt(np.minimum(pixels, 20 * _MIN_PIXELS))
     scale = np.maximum(np.abs(columns).max(0), 1e-300)
     weights = np.ones(len(target))
     x = np.zeros(columns.shape[1])
@@ -335,10 +334,10 @@ def _fit_amplitude(
     with np.errstate(invalid="ignore"):
         key = samples.counts * samples.slant**-falloff
     lit = np.isfinite(key) & (key > 0)
-    if lit.sum() < 10 * _LEAST_PIXELS:
+    if lit.sum() < 10 * _MIN_PIXELS:
         return None
-    bins = _binned(np.where(lit, key, -1), samples, _quantile_edges(key[lit], log=True))
-    bins = _where(bins, bins.variance < (_LINEAR * ceiling) ** 2)
+    bins = _bin(np.where(lit, key, -1), samples, _quantile_edges(key[lit], log=True))
+    bins = _select(bins, bins.variance < (_LINEAR * ceiling) ** 2)
     if len(bins.centre) < 3:
         return None
     light = bins.centre
@@ -352,21 +351,21 @@ def _fit_amplitude(
 
 def _fit_confidence(samples: _Samples) -> tuple[ConfidenceLaw, _Binned] | None:
     known = np.isfinite(samples.level)
-    if known.sum() < 10 * _LEAST_PIXELS:
+    if known.sum() < 10 * _MIN_PIXELS:
         return None
     top = int(samples.level[known].max())
     edges: Float64 = np.arange(top + 2, dtype=float) - 0.5
     key = np.where(known, samples.level, -1)
     best: tuple[float, ConfidenceLaw] | None = None
-    bins = _binned(key, samples, edges)
+    bins = _bin(key, samples, edges)
     if len(bins.centre) < 2:
         return None
     for power in (0.0, 1.0, 2.0):
         at_one = replace(samples, variance=samples.variance / samples.range_m ** (2 * power))
-        found = _binned(key, at_one, edges)
+        found = _bin(key, at_one, edges)
         table = np.interp(np.arange(top + 1), found.centre, np.sqrt(found.variance))
-        # Better levels are better, whatever a few pixels say.
-        table = np.minimum(np.minimum.accumulate(table), _LARGEST_M)
+        # Enforce monotony: higher levels have less noise.
+        table = np.minimum(np.minimum.accumulate(table), _MAX_NOISE_M)
         law = ConfidenceLaw(tuple(float(f"{v:.4g}") for v in table), power)
         sigma = table[np.clip(np.nan_to_num(samples.level), 0, top).astype(int)]
         score = _misfit(samples, (sigma * samples.range_m**power) ** 2, known)
@@ -377,26 +376,26 @@ def _fit_confidence(samples: _Samples) -> tuple[ConfidenceLaw, _Binned] | None:
 
 
 def _fit_range(samples: _Samples) -> tuple[RangeLaw, _Binned]:
-    bins = _binned(samples.range_m, samples, _quantile_edges(samples.range_m, log=False))
+    bins = _bin(samples.range_m, samples, _quantile_edges(samples.range_m, log=False))
     if len(bins.centre) == 0:
         everything = np.array([samples.range_m.min(), np.nextafter(samples.range_m.max(), np.inf)])
-        bins = _binned(samples.range_m, samples, everything)
+        bins = _bin(samples.range_m, samples, everything)
     columns = np.stack([np.ones_like(bins.centre), bins.centre**2], 1)
-    if not _spread(samples):
-        # Nothing tells a from b; that of surfaces alike is the more careful for those beyond.
+    if not _has_range_variation(samples):
+        # a and b are not separable; the quadratic law is conservative for farther surfaces.
         columns[:, 0] = 0
     a, b = _nonnegative(columns, np.sqrt(bins.variance), bins.pixels)
-    return RangeLaw(min(float(a), _LARGEST_M), min(float(b), 1.0)), bins
+    return RangeLaw(min(float(a), _MAX_NOISE_M), min(float(b), 1.0)), bins
 
 
-def _where(bins: _Binned, mask: Bool) -> _Binned:
+def _select(bins: _Binned, mask: Bool) -> _Binned:
     return _Binned(**{f.name: getattr(bins, f.name)[mask] for f in fields(_Binned)})
 
 
 def _misfit(samples: _Samples, predicted: Float64, where: Bool) -> float:
-    """Median distance of the log variances of single pixels from those predicted.
+    """Return the median absolute difference between pixels' log variances and the prediction.
 
-    Even a perfect law leaves what so few frames say about a variance; less is better.
+    It is above 0 even for a perfect law, due to the small number of frames.
     """
     ok = where & (samples.variance > 0) & (predicted > 0)
     if not ok.any():
@@ -413,7 +412,7 @@ def _fit(
 ) -> NoiseFit:
     ceiling = prior.ceiling_m
     period = recording.metadata.get("ambiguity_m")
-    if isinstance(period, int | float) and 0 < period <= _FARTHEST_M:
+    if isinstance(period, int | float) and 0 < period <= _MAX_RANGE_M:
         ceiling = float(period) / math.sqrt(12)
     range_law, range_bins = _fit_range(samples)
     everywhere = np.ones(len(samples.variance), bool)
@@ -448,11 +447,11 @@ def _fit(
         counts = samples.counts * samples.slant**-falloff
         seen = np.isfinite(counts) & (counts > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            score = _misfit(samples, _of_light(light[0], counts), seen)
+            score = _misfit(samples, _signal_part(light[0], counts), seen)
         if score <= (_WORSE if amplitude is None else 0.99) * least:
             least, law, bins = min(least, score), "amplitude", light[1]
             amplitude = light[0]
-            predicted = _of_light(amplitude, bins.centre)
+            predicted = _signal_part(amplitude, bins.centre)
 
     model = NoiseModel(
         name,
@@ -483,18 +482,18 @@ def _fit(
 
 
 def _falloffs(recording: Recording, prior: NoiseModel) -> list[float]:
-    """Powers of the cosine that a range-compensated amplitude may have been divided by."""
+    """Return candidate exponents of the falloff compensated in range-compensated amplitude."""
     if recording.metadata.get("amplitude_kind") != "range_compensated":
         return [0.0]
     return [4.0 if prior.amplitude is None else prior.amplitude.falloff, 0.0]
 
 
-def _of_light(law: AmplitudeLaw, counts: Float64) -> Float64:
+def _signal_part(law: AmplitudeLaw, counts: Float64) -> Float64:
     return law.floor**2 + law.shot**2 / counts + (law.dark / counts) ** 2
 
 
-def _spread(samples: _Samples) -> bool:
-    """Whether the pixels' ranges differ enough to tell how noise grows with range."""
+def _has_range_variation(samples: _Samples) -> bool:
+    """Whether the pixels' ranges vary enough to determine how noise grows with range."""
     low, high = np.quantile(samples.range_m, _MOST)
     return bool(high >= 1.5 * low)
 
@@ -506,12 +505,10 @@ def _log_error(predicted: Float64, bins: _Binned) -> float:
 def _warnings(recording: Recording, samples: _Samples, frames: int, error: float) -> list[str]:
     out = []
     if frames < len(recording):
-        out.append(f"{frames} of {len(recording)} frames are in still stretches")
-    if not _spread(samples):
+        out.append(f"{frames} of {len(recording)} frames are in static stretches")
+    if not _has_range_variation(samples):
         low, high = np.quantile(samples.range_m, _MOST)
-        out.append(
-            f"ranges of {low:.2f} to {high:.2f} m only: what is said of others is extrapolated"
-        )
+        out.append(f"ranges of {low:.2f} to {high:.2f} m only: the noise at others is extrapolated")
     if error > _GOOD:
         out.append(f"the law describes the noise to {100 * (math.exp(error) - 1):.0f} % only")
     return out
