@@ -220,7 +220,7 @@ def test_real_sr4000_from_two_places_is_refused(shared_data: Path) -> None:
 def test_no_board_and_no_frames_with_amplitude(views: Recording) -> None:
     bare = [replace(frame, amplitude_image=None) for frame in views.select(0, 2)]
     recording = Recording.of(ArraySource(bare), "bare", "simulated")
-    with pytest.raises(InputError, match="leave --board out"):
+    with pytest.raises(InputError, match="omit --board"):
         board_planes(recording, BOARD, "amplitude", wall=False)
     with pytest.raises(InputError, match="no board of 9 x 7"):
         board_planes(views.select(0, 1), Board(9, 7, 0.1), "amplitude", wall=False)

@@ -207,7 +207,7 @@ def test_ros_camera_info(tmp_path: Path, model: str, values: list[float], expect
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.yaml", "nothing: here\n", "holds no lens that is known"),
+        ("a.yaml", "nothing: here\n", "contains no known lens"),
         ("a.m", BOUGUET.format(skew="0").replace("nx = 640;", ""), "gives no nx"),
         ("a.m", BOUGUET.format(skew="0").replace("657.44", "-657.44"), "fx"),
         ("a.cal", CALLAB.format(origin="center", more="").replace("=2", "=1"), "version 1"),

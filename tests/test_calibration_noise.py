@@ -184,7 +184,7 @@ def test_several_stretches_are_one_estimate() -> None:
             lambda: [
                 f.keep(np.indices((60, 80)).sum(0) < 12) for f in plain_frames(np.full(80, 0.01))
             ],
-            "still",
+            "static",
         ),
     ],
 )

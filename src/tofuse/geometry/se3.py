@@ -134,7 +134,7 @@ def jacobian(xi: ArrayLike) -> Float64:
 
 
 def _coupling(xi: Float64) -> Float64:
-    """Block Q (..., 3, 3) of the left Jacobian, by which a rotation moves a translation."""
+    """Block Q (..., 3, 3) of the left Jacobian, which couples rotation and translation."""
     V, W = hat(xi[..., :3]), hat(xi[..., 3:])
     angle = np.linalg.norm(xi[..., 3:], axis=-1)
     _, s2, s3 = _coefficients(angle)
