@@ -189,6 +189,10 @@ class Projection:
     frame: Float64
     _subsampled: dict[int, Projection] = field(default_factory=dict, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        # Read-only like a camera's own rays, so that each kernel is compiled for one type of them.
+        self.rays.flags.writeable = False
+
     @cached_property
     def unknown(self) -> Bool | None:
         """(H, W) mask of pixels whose ray is unknown; None if there are none."""
